@@ -98,7 +98,7 @@ FEATURES: dict[str, Feature] = {
 def scene(feature: Feature, quick: bool, device: str) -> tuple[dv.Model, Callable[[], list[Tensor]]]:
     """A Model, and one step of it with its backward if gradients are asked for."""
     n = 4 if quick else 10
-    half = dv.mesh.box((n, n, n // 2), (1.0, 1.0, 0.5))
+    half = dv.mesh.box((n, n, n // 2), (1.0, 1.0, 0.5), split="kuhn")
     mesh = dv.mesh.join([half, half.translate((0.0, 0.0, 20.0))])
     pinned = mesh.points[:, 0] < 1e-9 if feature.pinned else None
     model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(), *feature.energies), device=device,

@@ -37,12 +37,14 @@ def _body(rng: np.random.Generator) -> tuple[str, dv.TetMesh]:
     kind = ("beam", "sheet", "blob", "box")[rng.integers(4)]
     if kind == "beam":
         n = int(rng.integers(2, 4))
-        return kind, mesh.beam(int(rng.integers(5, 12)), n, n, size=(float(rng.uniform(0.2, 0.8)), 0.1, 0.1))
+        return kind, mesh.beam(
+            int(rng.integers(5, 12)), n, n, size=(float(rng.uniform(0.2, 0.8)), 0.1, 0.1), split="kuhn"
+        )
     if kind == "sheet":
         return kind, mesh.sheet(8, 8, (0.3, 0.3), float(rng.uniform(0.01, 0.04)))
     if kind == "blob":
         return kind, mesh.blob(5, int(rng.integers(100)), 0.1)
-    return kind, mesh.box(int(rng.integers(2, 5)), 0.1)
+    return kind, mesh.box(int(rng.integers(2, 5)), 0.1, split="kuhn")
 
 
 def _kappa(rng: np.random.Generator, body: dv.TetMesh, speed: float) -> float:

@@ -1,8 +1,8 @@
 """Hashes of outputs and gradients: what a change that must change no result is held against.
 
 `python -m bench bits --out BEFORE`, the same after the change, and compare the two files: equal hashes are equal bits
-on that machine. Scenes are those of the tests: all energies, contact, both dtypes, both tapes, batches, solvers. A hash
-does not tell 0 from -0.
+on that machine. Scenes are those of the tests: all energies, contact, both dtypes, both tapes, batches, solvers; and
+the rollouts of `bench.bits_rollouts`. A hash does not tell 0 from -0.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench import generality
+from bench import bits_rollouts, generality
 from diffvbd import testing
 from diffvbd.solvers import XPBD, ProjectiveDynamics
 from diffvbd.testing import contact_scenes
@@ -40,6 +40,8 @@ def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
             found, _ = contact_scenes.compiled(scene, STEPS, SWEEPS, tape, scene.model.to(device))
             rows[f"contact: {name}, {tape} tape"] = digest(found)
     rows |= {name: of_solver(make, device) for name, make in ({} if quick else SOLVERS).items()}
+    rollouts = bits_rollouts.rows(device).items()
+    rows |= {name: digest(work()) for name, work in list(rollouts)[: 4 if quick else None]}
     return {"sweeps": SWEEPS, "steps": STEPS, "hashes": rows}
 
 
@@ -58,7 +60,8 @@ def of_case(name: str, device: str, dtype: torch.dtype = torch.float64, tape: st
 
 def of_vertices(device: str) -> str:
     """The hash of one step of a box whose only energies are those of single vertices."""
-    box, near = dv.mesh.box((3, 4, 3), (0.2, 0.3, 0.2)), dv.FloorBarrier(height=-0.01, kappa=2e4, dhat=0.05)
+    box = dv.mesh.box((3, 4, 3), (0.2, 0.3, 0.2), split="kuhn")
+    near = dv.FloorBarrier(height=-0.01, kappa=2e4, dhat=0.05)
     model = dv.Model(box, energies=(near, dv.Anchor(50.0)), device=device)
     x = model.rest_points
     inputs = {"x": x + 0.004 * torch.sin(9 * x.flip(-1)), "v": torch.cos(7 * x), "time_step": 1 / 60}
@@ -67,7 +70,7 @@ def of_vertices(device: str) -> str:
 
 def of_solver(make: Callable[..., Any], device: str) -> str:
     """The hash of one step of another block solver on a box, loaded as in `generality`."""
-    mesh = dv.mesh.box((3, 4, 3), (0.2, 0.3, 0.2))
+    mesh = dv.mesh.box((3, 4, 3), (0.2, 0.3, 0.2), split="kuhn")
     solver = make(mesh, pinned=mesh.points[:, 1] < 0.01, device=device)
     inputs = testing.on_device(generality.scene(mesh, make(mesh, pinned=mesh.points[:, 1] < 0.01)), device)
     return digest(testing.evaluate(lambda **given: solver.step(**given, sweeps=SWEEPS), inputs))

@@ -99,7 +99,7 @@ def torus(radius: float, tube: float, spacing: float) -> dv.TetMesh:
 
 
 def boxes_collide() -> Start:
-    box = mesh.box(4, 0.2)
+    box = mesh.box(4, 0.2, split="kuhn")
     return moving([(box, (25, 0, 0)), (box.translate([0.25, 0.05, 0.03]), (-25, 0, 0))])
 
 
@@ -110,7 +110,7 @@ def blobs_collide() -> Start:
 
 def edge_hits_edge() -> Start:
     """Two bars that cross, and meet with edges alone."""
-    bar, rng = mesh.box((7, 2, 2), (0.6, 0.04, 0.04)), np.random.default_rng(1)
+    bar, rng = mesh.box((7, 2, 2), (0.6, 0.04, 0.04), split="kuhn"), np.random.default_rng(1)
     other = dv.TetMesh(turned(bar, rng).points, bar.tets)
     low, high = other.points.min(0)[1], bar.points.max(0)[1]
     return moving([(bar.translate([-0.3, 0, -0.02]), (0, 25, 0)),
@@ -118,12 +118,12 @@ def edge_hits_edge() -> Start:
 
 
 def box_hits_ground() -> Start:
-    box = turned(mesh.box(4, 0.2), np.random.default_rng(3))
+    box = turned(mesh.box(4, 0.2, split="kuhn"), np.random.default_rng(3))
     return moving([(box.translate([0, 0.3, 0]), (10, -50, 0))], walls=ground())
 
 
 def box_and_box_hit_ground() -> Start:
-    box = mesh.box(3, 0.2)
+    box = mesh.box(3, 0.2, split="kuhn")
     return moving([(box.translate([0, 0.05, 0]), (0, -50, 0)), (box.translate([0.05, 0.3, 0.03]), (15, -50, 0))],
                   walls=ground())  # fmt: skip
 
@@ -143,7 +143,7 @@ def blob_hits_wedge() -> Start:
 def tower() -> Start:
     """Ten boxes, a millimetre apart and a little askew; flat ones, as a slender tower of so soft a material buckles."""
     rng, height = np.random.default_rng(0), 0.06
-    box = mesh.box(2, (0.2, height, 0.2))
+    box = mesh.box(2, (0.2, height, 0.2), split="kuhn")
     return moving([(box.translate([x, 1e-3 + k * (height + 1e-3), z]), (0, 0, 0))
                    for k, (x, z) in enumerate(rng.uniform(-0.005, 0.005, (10, 2)))], walls=ground())  # fmt: skip
 
@@ -202,7 +202,7 @@ def crowd(per_side: int, layers: int) -> Start:
     rng, pitch, bodies = np.random.default_rng(7), 0.15, []
     for i, j, k in itertools.product(range(per_side), range(layers), range(per_side)):
         kind, size = rng.integers(4), rng.uniform(0.04, 0.07)
-        body = (mesh.box(2, size) if kind < 2 else mesh.sheet(3, 3, (size, size), 0.2 * size) if kind == 2
+        body = (mesh.box(2, size, split="kuhn") if kind < 2 else mesh.sheet(3, 3, (size, size), 0.2 * size) if kind == 2
                 else mesh.blob(4, int(rng.integers(100)), 0.5 * size))  # fmt: skip
         place = pitch * np.array([i + 0.5, j + 0.5, k + 0.5])
         bodies.append((turned(body, rng).translate(place), tuple(rng.uniform(-5, 5, 3))))
@@ -214,7 +214,7 @@ def crowd(per_side: int, layers: int) -> Start:
 
 def free_fall() -> Start:
     """Twenty-seven boxes, a millimetre apart, all at 10 m/s."""
-    box = mesh.box(3, 0.1)
+    box = mesh.box(3, 0.1, split="kuhn")
     places = 0.101 * np.array(list(itertools.product(range(3), repeat=3)))
     return moving([(box.translate(place), (6, -8, 0)) for place in places])
 
@@ -231,7 +231,7 @@ def deviation_from_fall(case: Case, start: Start, states: list[Tensor]) -> str:
 
 def drop() -> Start:
     """A box and a blob dropped at 3 m/s onto a box on the ground: what the parameters are varied in."""
-    box = mesh.box(3, 0.2)
+    box = mesh.box(3, 0.2, split="kuhn")
     return moving([(box.translate([0, 0.02, 0]), (0, 0, 0)),
                    (turned(box, np.random.default_rng(5)).translate([0.1, 0.45, 0.08]), (0, -3, 0)),
                    (mesh.blob(4, 3, 0.09).translate([0.25, 0.75, 0.1]), (0, -3, 0))], walls=ground())  # fmt: skip

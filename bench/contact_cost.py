@@ -29,7 +29,7 @@ FRAME = 1e3 * TIME_STEP  # [ms] that a step at real time may take
 
 def piles(count: int, n: int, close: int) -> dv.TetMesh:
     """`count` pairs of boxes of n^3 vertices and 0.1 m, one above the other; the first `close` pairs touch."""
-    box, side = mesh.box(n, 0.1), int(np.ceil(np.sqrt(count)))
+    box, side = mesh.box(n, 0.1, split="kuhn"), int(np.ceil(np.sqrt(count)))
     offsets = []
     for k in range(count):
         place = np.array([(k % side) * (0.1 + FAR), 0.0, (k // side) * (0.1 + FAR)])

@@ -27,7 +27,7 @@ INTEGRATORS = {1: dv.SDIRK2(), 4: dv.BDF2()}  # by seed modulo 7
 
 def _bodies(rng: np.random.Generator) -> list[dv.TetMesh]:
     kinds = (
-        lambda: mesh.box(int(rng.integers(2, 4)), 0.1),
+        lambda: mesh.box(int(rng.integers(2, 4)), 0.1, split="kuhn"),
         lambda: mesh.sheet(5, 5, (0.14, 0.14), float(rng.uniform(0.01, 0.03))),
         lambda: mesh.blob(4, int(rng.integers(100)), 0.06),
     )

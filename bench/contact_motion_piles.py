@@ -47,11 +47,11 @@ def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, de
     supports = ("Plane", "pinned box", "box")
     if support not in supports:
         raise ValueError(f"support: expected one of {', '.join(supports)}, got {support}")
-    body, pinned, colliders = mesh.box(3, BOX).translate((0, 0.5 * DHAT, 0)), None, (Plane(),)
+    body, pinned, colliders = mesh.box(3, BOX, split="kuhn").translate((0, 0.5 * DHAT, 0)), None, (Plane(),)
     size = body.num_vertices
     if support != "Plane":
         # askew, so that closest points are not at ties
-        lower = mesh.box((4, 3, 4), (0.3, 0.2, 0.3)).translate((-0.053, -0.2, -0.047))
+        lower = mesh.box((4, 3, 4), (0.3, 0.2, 0.3), split="kuhn").translate((-0.053, -0.2, -0.047))
         body, colliders = mesh.join([body, lower]), ()
         pinned = torch.from_numpy(body.points[:, 1] < (1e-9 if support == "pinned box" else -0.2 + 1e-9))
     energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False))
@@ -71,7 +71,7 @@ def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, de
 def tower(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float = 0.5, time_step: float = 1 / 100,
           device: str = "cpu", barrier: Options = None) -> Scene:  # fmt: skip
     """Boxes 0.2 m wide on each other, not quite in line."""
-    box, gap, rng = mesh.box(2, (BOX[0], height, BOX[2])), 0.3 * DHAT, np.random.default_rng(0)
+    box, gap, rng = mesh.box(2, (BOX[0], height, BOX[2]), split="kuhn"), 0.3 * DHAT, np.random.default_rng(0)
     lifts = gap + np.arange(count) * (height + gap)
     body = mesh.join([box.translate((x, y, z)) for y, (x, z) in zip(lifts, rng.uniform(-0.005, 0.005, (count, 2)),
                       strict=True)])  # fmt: skip
@@ -190,7 +190,7 @@ def _fine_crowd(per_side: int, layers: int, rate: int, steps: int, device: str) 
 def fall(side_by_side: bool = True, sweeps: int = 5, steps: int = 60, time_step: float = 1 / 100, device: str = "cpu",
          barrier: Options = None) -> Row:  # fmt: skip
     """How far centers of mass are off x0 + n h v0 + n (n + 1) / 2 h^2 g, which is exact for free fall."""
-    box, velocity = mesh.box(3, BOX), torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64)
+    box, velocity = mesh.box(3, BOX, split="kuhn"), torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64)
     body = mesh.join([box, box.translate((BOX[0] + 1e-3, 0.01, 0.02))]) if side_by_side else box
     model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier, dhat=5e-4)), device=device)
     x = model.rest_points
@@ -231,7 +231,7 @@ def struck(count: int, gap: float, speed: float, time_step: float = 1 / 100, swe
            barrier: Options = None) -> Row:  # fmt: skip
     """The most momentum that a row of cubes of 0.1 m gains or loses in a step, of which the first is thrown at the
     others: over what it had."""
-    cube = mesh.cube(2, size=0.1)
+    cube = mesh.cube(2, size=0.1, split="kuhn")
     body = mesh.join([cube.translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)])
     model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier, dhat=1e-3)), device=device)
     v = torch.zeros_like(model.rest_points)
@@ -250,7 +250,10 @@ def throws(count: int = 150, steps: int = 12, detections: int | None = None, dev
     courses, lost, gained = [], 0, 0
     for seed in range(count):
         rng = np.random.default_rng(seed)
-        cubes = [mesh.cube(int(rng.integers(2, 4)), size=rng.uniform(0.05, 0.12)) for _ in range(rng.integers(2, 7))]
+        cubes = [
+            mesh.cube(int(rng.integers(2, 4)), size=rng.uniform(0.05, 0.12), split="kuhn")
+            for _ in range(rng.integers(2, 7))
+        ]
         places = [(0.16 * (i % 3), 0.16 * (i // 3), 0.0) + rng.uniform(-0.015, 0.015, 3) for i in range(len(cubes))]
         body = mesh.join([c.translate(p) for c, p in zip(cubes, places, strict=True)])
         barrier = pairs({"detections": detections}, dhat=2e-3, self_contact=False)
@@ -287,7 +290,7 @@ def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds
     its mean over the last 0.1 s. faster: arguments of the Model.
     """
     size, thick, dhat = 0.05, 0.02, 2e-3
-    cube, plate = mesh.box(3, size), mesh.box((2, 3, 3), (thick, 0.06, 0.06))
+    cube, plate = mesh.box(3, size, split="kuhn"), mesh.box((2, 3, 3), (thick, 0.06, 0.06), split="kuhn")
     left = plate.translate((-thick - dhat, -0.0052, -0.0047))
     right = plate.translate((size + dhat, -0.0049, -0.0051))
     body = mesh.join([cube, left, right])

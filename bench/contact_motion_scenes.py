@@ -71,7 +71,7 @@ def sheet(sweeps: int = 20, time_step: float = 1 / 60, device: str = "cpu", barr
 
 def spun(gap: float | None, sweeps: int, time_step: float, device: str, barrier: Options, rate: float = 20.0) -> Scene:
     """Two cubes of 0.2 m, the upper one spinning about y, without gravity; one alone and without contact if no gap."""
-    box = mesh.box(3, 0.2).translate((-0.1, 0, -0.1))
+    box = mesh.box(3, 0.2, split="kuhn").translate((-0.1, 0, -0.1))
     body = box if gap is None else mesh.join([box, box.translate((0, -0.2 - gap, 0))])
     energies = (dv.StableNeoHookean(),) if gap is None else (dv.StableNeoHookean(), pairs(barrier))
     model = dv.Model(body, energies=energies, device=device, rigid=False)
@@ -118,7 +118,7 @@ def block(surface: str, friction: float, sweeps: int, time_step: float, device: 
     """A block at rest on a surface through the origin that rises toward -x by an angle [rad]."""
     turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     normal = tuple(float(n) for n in turn[:, 1])
-    body = mesh.box((3, 2, 3), BLOCK).translate((-0.1, 0.5 * DHAT, -0.1))
+    body = mesh.box((3, 2, 3), BLOCK, split="kuhn").translate((-0.1, 0.5 * DHAT, -0.1))
     body = dv.TetMesh(body.points @ turn.T, body.tets)
     rubbing = (dv.Friction(friction),) if friction else ()
     if surface == "FloorBarrier":

@@ -91,7 +91,7 @@ def draw_tower(axes: Any, frames: Array, at: int) -> None:
     low, high = np.array([-0.72, 0.0, -0.08]), np.array([0.42, 1.05, 0.75])
     ground, view = viz.floor((low[0], low[2]), (high[0], high[2])), (10.0, 14.0)
     viz.draw(axes, ground.points, ground.triangles, ground.color, (low, high), view=view)
-    box = mesh.box(2, 0.2)
+    box = mesh.box(2, 0.2, split="kuhn")
     size = box.num_vertices
     count = frames.shape[1] // size
     for edge in edges_of_box(frames[0].min(0), frames[0].max(0)):
@@ -154,7 +154,7 @@ def tip(frames: Array) -> float:
 
 
 def tower_words(found: States) -> tuple[str, bool]:
-    size = len(mesh.box(2, 0.2).points)
+    size = len(mesh.box(2, 0.2, split="kuhn").points)
     centers = found["tower"].reshape(len(found["tower"]), -1, size, 3).mean(2)
     away = float(np.linalg.norm((centers[-1] - centers[0])[:, [0, 2]], axis=-1).max())
     fallen = centers[-1, -1, 1] < 0.9 * centers[0, -1, 1]

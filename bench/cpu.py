@@ -131,7 +131,7 @@ def scaling(n: int, threads: int, quick: bool) -> list[dict[str, Any]]:
 def _beam_rollout(route: str, steps: int, threads: int) -> tuple[float, float]:
     """Seconds of forward + backward, and growth of the peak resident memory [bytes], in a process of its own."""
     torch.set_num_threads(threads)
-    mesh = dv.mesh.beam(21, 7, 7, size=(0.5, 0.2, 0.2))
+    mesh = dv.mesh.beam(21, 7, 7, size=(0.5, 0.2, 0.2), split="kuhn")
     model = dv.Model(mesh, pinned=torch.from_numpy(mesh.points[:, 0] < 1e-9))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 
@@ -205,11 +205,11 @@ def unrolled(quick: bool, threads: int) -> list[dict[str, Any]]:
 def building(quick: bool) -> list[dict[str, Any]]:
     rows = []
     for n in (10, 20) if quick else (15, 30, 59):
-        mesh = dv.mesh.beam(n, n, n, size=(1.0, 1.0, 1.0))
+        mesh = dv.mesh.beam(n, n, n, size=(1.0, 1.0, 1.0), split="kuhn")
         start = time.perf_counter()
         model = dv.Model(mesh)
         rows.append(_built(f"grid, {mesh.num_vertices} v / {mesh.num_tets} t", model, start, 2.0 if n == 59 else None))
-    cube = dv.mesh.cube(size=0.003)
+    cube = dv.mesh.cube(size=0.003, split="kuhn")
     for count in (1_000,) if quick else (10_000, 100_000, 1_000_000):
         i = np.arange(count)
         offsets = np.stack([i % 100, i // 100 % 100, i // 10_000], -1) * 0.01

@@ -118,12 +118,12 @@ def bodies(case: Extreme) -> dv.TetMesh:
     """Of length 1: a bar, a block above y = 0, two of them above each other, or a horseshoe that opens upwards."""
     kind = FEATURES[case.feature][0]
     if kind in ("pinned", "free"):
-        return _with_slivers(mesh.box((6, 3, 3), (1.0, 0.3, 0.3)), case.sliver)
-    block = _with_slivers(mesh.box(3, 0.4), case.sliver)
+        return _with_slivers(mesh.box((6, 3, 3), (1.0, 0.3, 0.3), split="kuhn"), case.sliver)
+    block = _with_slivers(mesh.box(3, 0.4, split="kuhn"), case.sliver)
     if kind == "pairs":
         return mesh.join([block, block.translate((0.07, 0.5, 0.04))])
     if kind == "horseshoe":
-        whole = mesh.box((6, 4, 2), (1.0, 0.6, 0.2))
+        whole = mesh.box((6, 4, 2), (1.0, 0.6, 0.2), split="kuhn")
         center = whole.points[whole.tets].mean(1)
         tets = whole.tets[(np.abs(center[:, 0] - 0.5) > 0.1) | (center[:, 1] < 0.2)]
         used, numbers = np.unique(tets, return_inverse=True)

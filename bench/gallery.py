@@ -52,7 +52,7 @@ def still(model: dv.Model) -> tuple[torch.Tensor, torch.Tensor]:
 
 def twisted_beam(path: Path) -> None:
     """A twisted beam with the first guess of its shear modulus, the observed one and the identified one."""
-    mesh = dv.mesh.beam(17, 6, 6, size=beam_mu.SIZE)
+    mesh = dv.mesh.beam(17, 6, 6, size=beam_mu.SIZE, split="kuhn")
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=beam_mu.RELAXATION, coarse="auto")
     x = beam_mu.twisted(model.rest_points, beam_mu.TWIST)
 
@@ -93,7 +93,7 @@ def controller(path: Path) -> None:
 def many_cubes(path: Path) -> None:
     """Soft cubes that fall in a heap."""
     random, edge = np.random.default_rng(0), 0.1
-    one, cubes = dv.mesh.cube(2, edge).translate((-edge / 2,) * 3), []
+    one, cubes = dv.mesh.cube(2, edge, split="kuhn").translate((-edge / 2,) * 3), []
     for i, j, k in itertools.product(range(4), range(6), range(4)):
         turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
         turn *= np.sign(np.linalg.det(turn))
@@ -131,7 +131,7 @@ def stacked_boxes(path: Path) -> None:
     side, gap = 0.2, 0.004
     places = [(0.0, k) for k in (-1.0, 0.0, 1.0)] + [(1.0, -0.5), (1.0, 0.5), (2.0, 0.0)]
     centers = [(1.04 * side * k, 0.5 * side + level * (side + 0.05) + 0.08, 0.02 * level) for level, k in places]
-    box = dv.mesh.cube(4, side).translate((-side / 2,) * 3)
+    box = dv.mesh.cube(4, side, split="kuhn").translate((-side / 2,) * 3)
     mesh = dv.mesh.join([box.translate(center) for center in centers])
     energies = (
         dv.StableNeoHookean(),

@@ -74,7 +74,7 @@ def steps(card: Card, rate: float) -> list[Row]:
         (dv.mesh.cube(11, split="five"), (0.35, None)),
         (dv.mesh.cube(31, split="five"), (0.6, None)),
         (dv.mesh.cube(58, split="five"), large),
-        (dv.mesh.box((58, 58, 60)), large),
+        (dv.mesh.box((58, 58, 60), split="kuhn"), large),
     ]
     if card.quick:
         cases = [(dv.mesh.cube(4, split="five"), (None, None))]
@@ -163,7 +163,7 @@ def cubes(card: Card, rate: float) -> list[Row]:
 
 def _cubes(card: Card, rate: float, note: str, sweeps: int = 5, **options: Any) -> list[Row]:
     scenes, count = (100, 2) if card.quick else (1_000_000, 10)
-    model = model_of(dv.mesh.cube(size=0.003), card, pinned=False, **options)
+    model = model_of(dv.mesh.cube(size=0.003, split="kuhn"), card, pinned=False, **options)
     scene = scene_of(model, scenes, "per scene", noise=1e-5)
     vertices = scenes * model.num_vertices
     about = {"name": f"{scenes} scenes of {label(model, sweeps)}{note}", "material": "per scene", "steps": count}

@@ -31,7 +31,11 @@ def run(quick: bool) -> dict[str, Any]:
 def beam(quick: bool) -> list[dict[str, Any]]:
     """A cantilever of 0.6 m released from rest: error of its end state over its motion after 0.4 s, and the time that
     takes, of ladders of steps. Sweeps fall with the step, so that each ladder does about the same number of them."""
-    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15)) if quick else dv.mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15))
+    mesh = (
+        dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15), split="kuhn")
+        if quick
+        else dv.mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    )
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, relaxation=1.6)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 
@@ -81,7 +85,7 @@ def impacts(quick: bool) -> list[dict[str, Any]]:
     """Cubes of 0.2 m, a scene each, that turn and fall on a plane at some 4 m/s, at any phase of a step: by how much
     the energy of the worst of them exceeds that at its start, what the median has left, and the lowest gap."""
     count, mu, lam, out = (40 if quick else 1000), 1e5, 1e5, []
-    cube = dv.mesh.cube(2, size=0.2)
+    cube = dv.mesh.cube(2, size=0.2, split="kuhn")
     plane, body = colliders.Plane((0.0, -0.3, 0.0), (0.0, 1.0, 0.0)), dv.Model(cube)
     models = {}
     for name, own, rubbing in (("rubbing", False, (dv.Friction(0.3),)), ("rubbing, self-contact", True,

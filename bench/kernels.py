@@ -84,7 +84,7 @@ def _plain(axis: int) -> Callable[[Card], Work]:
 
 
 def _cubes(card: Card) -> Work:
-    model = model_of(dv.mesh.cube(size=0.003), card, pinned=False)
+    model = model_of(dv.mesh.cube(size=0.003, split="kuhn"), card, pinned=False)
     scene = scene_of(model, 1_000_000, "per scene", noise=1e-5).requiring("x", "v", "mu")
     return forward_reverse(scene, 5, 1, "recompute")
 

@@ -149,7 +149,7 @@ def conditioning(quick: bool) -> list[dict[str, Any]]:
 
 def relaxation(quick: bool) -> list[dict[str, Any]]:
     """How many of 24 violent rollouts grow without bound, for each relaxation."""
-    mesh = dv.mesh.beam(5, 3, 3, size=(1.0, 0.5, 0.5))
+    mesh = dv.mesh.beam(5, 3, 3, size=(1.0, 0.5, 0.5), split="kuhn")
     points = torch.from_numpy(mesh.points.copy())
     turned, stretched = points.clone(), points * torch.tensor([3.0, 1.0, 1.0])
     turned[:, 0] *= -1.0
@@ -182,7 +182,7 @@ def paper_preset(quick: bool) -> list[dict[str, Any]]:
     """Error of one step after 20 sweeps relative to the converged one, for the preset and for the default."""
     out = []
     for size in (3e-3, 1.0) if quick else (1e-3, 3e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3):
-        mesh = dv.mesh.cube(3, size=size)
+        mesh = dv.mesh.cube(3, size=size, split="kuhn")
         pinned = mesh.points[:, 0] < 1e-9 * size
         models = {"paper": dv.Model.paper(mesh, pinned=pinned), "exact": dv.Model(mesh, pinned=pinned)}
         points = models["exact"].rest_points
@@ -207,7 +207,7 @@ def paper_preset(quick: bool) -> list[dict[str, Any]]:
 def momentum(quick: bool) -> list[dict[str, Any]]:
     """What unconverged sweeps of a free body add to its momentum in one step without the rigid correction. (Converged,
     or with it: nothing.)"""
-    mesh = dv.mesh.cube(4)
+    mesh = dv.mesh.cube(4, split="kuhn")
     model = dv.Model(mesh, rigid=False)
     noise = torch.from_numpy(testing.generator("momentum").uniform(-1, 1, (2, mesh.num_vertices, 3)))
     x, v = model.rest_points + 0.03 * noise[0], noise[1]

@@ -34,7 +34,7 @@ class Scene(NamedTuple):
 def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
     """A cube of 8 vertices, 1 m and 1000 kg, with a vertex `gap` above planes; the predictor moves along them, and
     away by a hundredth of the gap, so that rounding does not decide whether the start has an approach to remove."""
-    mesh = dv.mesh.cube(2)
+    mesh = dv.mesh.cube(2, split="kuhn")
     points = mesh.points + PLACE
     planes = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
     height = (points @ planes.T).min(0) - gap
@@ -59,7 +59,7 @@ def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
 
 def volumetric(ratio: float, block: str = "exact") -> Scene:
     """A cube of 8 vertices, 1 m, one face pinned, strained by some per cent, with lam = ratio mu."""
-    mesh = dv.mesh.cube(2)
+    mesh = dv.mesh.cube(2, split="kuhn")
     rng = testing.generator("volumetric")
     points = torch.from_numpy(mesh.points.copy())
     pinned = mesh.points[:, 0] < 1e-9

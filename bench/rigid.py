@@ -15,16 +15,18 @@ from bench.common import markdown_table
 def run(quick: bool, device: str = "cpu") -> list[dict[str, Any]]:
     out = []
     sizes: list[tuple[str, Callable[[], dv.TetMesh], int, int]] = [
-        ("cube of 27", lambda: dv.mesh.cube(3, size=0.2), 20, 1),
-        ("cube of 1,331", lambda: dv.mesh.cube(11), 20, 1),
+        ("cube of 27", lambda: dv.mesh.cube(3, size=0.2, split="kuhn"), 20, 1),
+        ("cube of 1,331", lambda: dv.mesh.cube(11, split="kuhn"), 20, 1),
     ]
     if not quick:
         sizes += [
-            ("cube of 195,112", lambda: dv.mesh.cube(58), 20, 1),
+            ("cube of 195,112", lambda: dv.mesh.cube(58, split="kuhn"), 20, 1),
             ("10,000 cubes of 8, one mesh", lambda: _cubes(10_000), 5, 1),
         ]
         if device != "cpu":
-            sizes.append(("1,000,000 cubes of 8, a scene each", lambda: dv.mesh.cube(2, size=0.2), 5, 1_000_000))
+            sizes.append(
+                ("1,000,000 cubes of 8, a scene each", lambda: dv.mesh.cube(2, size=0.2, split="kuhn"), 5, 1_000_000)
+            )
     for name, make, sweeps, scenes in sizes:
         mesh = make()
         for energies in ("none", "floor, in contact"):
@@ -52,7 +54,7 @@ def _cubes(count: int) -> dv.TetMesh:
     side = round(count ** (1 / 2))
     offsets = torch.cartesian_prod(torch.arange(side), torch.arange(-(-count // side)))[:count].double()
     place = torch.stack([offsets[:, 0], torch.zeros(count, dtype=torch.float64), offsets[:, 1]], -1) * 0.3
-    return dv.mesh.replicate(dv.mesh.cube(2, size=0.2), place.numpy())
+    return dv.mesh.replicate(dv.mesh.cube(2, size=0.2, split="kuhn"), place.numpy())
 
 
 def _seconds(model: dv.Model, scenes: int, sweeps: int, backward: bool, quick: bool) -> float:

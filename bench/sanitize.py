@@ -46,7 +46,7 @@ def _free(regime: str | None, energies: tuple[Any, ...] = (), **options: Any) ->
     """Scenes without pairs: a beam that is held at one end, bent by its weight, and one that flies."""
 
     def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
-        body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1))
+        body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
         both = mesh.join([body, body.translate((0.0, 0.3, 0.0))])
         held = torch.tensor((both.points[:, 0] < 1e-9) & (both.body == 0))
         model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, **options)
@@ -59,7 +59,7 @@ def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, 
     """Three cubes that fly into one another, on what else there is."""
 
     def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
-        cube = mesh.box(size, 0.1)
+        cube = mesh.box(size, 0.1, split="kuhn")
         bodies = mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
         model = dv.Model(bodies, energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=2e-3), *energies),
                          colliders=colliders, device=DEVICE, **options)  # fmt: skip

@@ -55,7 +55,7 @@ def take(viewer: dv.viz.Viewer, page: Any, path: Path) -> None:
 
 def scene() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
     """Three bodies that fall on a floor and a ball, their positions and velocities."""
-    bodies = [dv.mesh.cube(5, 0.2), dv.mesh.capsule(0.09, 0.15, 5), dv.mesh.cube(5, 0.16)]
+    bodies = [dv.mesh.cube(5, 0.2, split="kuhn"), dv.mesh.capsule(0.09, 0.15, 5), dv.mesh.cube(5, 0.16, split="kuhn")]
     places = [(-0.2, 0.35, -0.1), (0.1, 0.45, 0.0), (0.05, 0.75, 0.02)]
     mesh = dv.mesh.join([body.translate(place) for body, place in zip(bodies, places, strict=True)])
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(0.0, damping=2.0), dv.PairBarrier(damping=2.0))
@@ -75,7 +75,7 @@ def motion(picture: Callable[[dv.viz.Viewer], None]) -> None:
 
 def optimisation(picture: Callable[[dv.viz.Viewer], None]) -> None:
     """A beam's shear modulus while it is looked for."""
-    mesh = dv.mesh.beam(11, 5, 5, size=(0.5, 0.2, 0.2))
+    mesh = dv.mesh.beam(11, 5, 5, size=(0.5, 0.2, 0.2), split="kuhn")
     model = dv.Model(mesh, pinned=mesh.points[:, 0] == 0.0)
     x0 = model.rest_points
 

@@ -27,7 +27,11 @@ SCHEMES: dict[str, Any] = {"ImplicitEuler": dv.ImplicitEuler(), "BDF2": dv.BDF2(
 
 
 def _meshes() -> list[dv.TetMesh]:
-    return [mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1)), mesh.cube(4, size=0.2), mesh.beam(6, 3, 3, size=(0.5, 0.2, 0.2))]
+    return [
+        mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1), split="kuhn"),
+        mesh.cube(4, size=0.2, split="kuhn"),
+        mesh.beam(6, 3, 3, size=(0.5, 0.2, 0.2), split="kuhn"),
+    ]
 
 
 def stiffness(body: dv.TetMesh, lam: float) -> np.ndarray:

@@ -95,7 +95,7 @@ def kicked_beam(quick: bool) -> Motion:
 
 
 def _beam(quick: bool) -> tuple[dv.TetMesh, np.ndarray]:
-    mesh = dv.mesh.beam(*((6, 3, 3) if quick else (21, 7, 7)), size=beam_mu.SIZE)
+    mesh = dv.mesh.beam(*((6, 3, 3) if quick else (21, 7, 7)), size=beam_mu.SIZE, split="kuhn")
     return mesh, mesh.points[:, 0] < 1e-9
 
 
@@ -242,7 +242,7 @@ def turning(points: Tensor, rate: float) -> Tensor:
 
 def bodies(quick: bool) -> list[Body]:
     """Bars of 1 m: free and turning, free and thrown so that they bend, held at one end; soft and stiff."""
-    mesh = dv.mesh.beam(*((5, 3, 3) if quick else (13, 5, 5)), size=(1.0, 0.2, 0.2))
+    mesh = dv.mesh.beam(*((5, 3, 3) if quick else (13, 5, 5)), size=(1.0, 0.2, 0.2), split="kuhn")
     points = torch.from_numpy(mesh.points.copy())
     bent = torch.zeros_like(points)
     bent[:, 1] = 2.0 * torch.cos(2 * torch.pi * points[:, 0])
@@ -258,10 +258,12 @@ def bodies(quick: bool) -> list[Body]:
 
 def easy_bodies(quick: bool) -> list[Body]:
     """Scenes that plain sweeps settle quickly: soft, compact, short steps."""
-    cube, rabbit = dv.mesh.cube(3 if quick else 6, size=0.5), dv.mesh.bunny(8)
+    cube, rabbit = dv.mesh.cube(3 if quick else 6, size=0.5, split="kuhn"), dv.mesh.bunny(8)
     standing = cube.translate([0.0, 0.03 - cube.points[:, 1].min(), 0.0])
     rabbit = rabbit.translate([0.0, 0.03 - rabbit.points[:, 1].min(), 0.0])
-    many = dv.mesh.replicate(dv.mesh.cube(3, size=0.1), [[0.2 * i, 0.03, 0.2 * j] for i in range(6) for j in range(6)])
+    many = dv.mesh.replicate(
+        dv.mesh.cube(3, size=0.1, split="kuhn"), [[0.2 * i, 0.03, 0.2 * j] for i in range(6) for j in range(6)]
+    )
     floor = (dv.StableNeoHookean(), dv.FloorBarrier(height=0.0, kappa=1e3, dhat=0.01))
     factors = torch.tensor([1.0, 1.3, 1.0], dtype=torch.float64)
 

@@ -21,7 +21,7 @@ ELASTIC = dv.StableNeoHookean()
 def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, speed: float = 0.0, name: str = "") -> Scene:
     """A beam of 0.6 m held at one end, some swings of it. contrast: of its two halves' stiffness, in layers; speed:
     of its free end at first [m/s], where it would hardly sag."""
-    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15))
+    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
     model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
     lam = 2 * mu * poisson / (1 - 2 * poisson)
     share = np.where(body.points[body.tets].mean(1)[:, 1] > 0.075, 1.0, 1 / contrast)
@@ -45,7 +45,7 @@ def cloth() -> Scene:
 
 def twist() -> Scene:
     """A bar whose ends are turned against each other by half a turn in 0.3 s."""
-    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15))
+    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
     rest = torch.tensor(body.points)
     left, right = rest[:, 0] < 1e-9, rest[:, 0] > 0.6 - 1e-9
     model = dv.Model(body, pinned=left | right)
@@ -77,7 +77,7 @@ def drop() -> Scene:
 
 def pile(**barrier: Any) -> Scene:
     """Three boxes that fall on each other and on a floor, with friction."""
-    rng, box = np.random.default_rng(1), mesh.box(3, 0.1)
+    rng, box = np.random.default_rng(1), mesh.box(3, 0.1, split="kuhn")
     shifts = [(float(x), 0.005 + 0.105 * n, float(z)) for n, (x, z) in enumerate(rng.uniform(-0.01, 0.01, (3, 2)))]
     pairs = dv.PairBarrier(**{"kappa": 1e4, "dhat": DHAT, "self_contact": False} | barrier)
     energies = (ELASTIC, pairs, dv.Friction(0.4), dv.FloorBarrier(kappa=1e4, dhat=DHAT))
@@ -92,7 +92,7 @@ def gripper(n: int = 3, plates: tuple[int, int, int] = (2, 3, 3), **barrier: Any
         n, plates: Vertices along the edges of the cube and of the plates.
     """
     size, thick = 0.05, 0.02
-    cube, plate = mesh.box(n, size), mesh.box(plates, (thick, 0.06, 0.06))
+    cube, plate = mesh.box(n, size, split="kuhn"), mesh.box(plates, (thick, 0.06, 0.06), split="kuhn")
     sides = [plate.translate((x, y, -0.005)) for x, y in ((-thick - DHAT, -0.0052), (size + DHAT, -0.0049))]
     body = mesh.join([cube, *sides])
     x = torch.tensor(body.points)

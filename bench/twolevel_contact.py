@@ -57,7 +57,7 @@ class Scene:
 
 def beam(ratio: float, points: tuple[int, int, int] = (14, 4, 7)) -> Scene:
     size, mu, dhat = (1.0, 0.15, 0.4), 1e6, 0.01
-    mesh = dv.mesh.box(points, size)
+    mesh = dv.mesh.box(points, size, split="kuhn")
     kappa = ratio * 3 * mu * 0.06 / BARRIER_CURVATURE
     energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa, dhat, self_contact=False))
     plane = (dv.colliders.Plane((0, -0.9 * dhat, 0), (0, 1, 0)),)
@@ -72,7 +72,7 @@ def beam(ratio: float, points: tuple[int, int, int] = (14, 4, 7)) -> Scene:
 
 
 def sheet(points: int = 31) -> Scene:
-    mesh = dv.mesh.box((points, 2, points), (1.0, 0.01, 1.0))
+    mesh = dv.mesh.box((points, 2, points), (1.0, 0.01, 1.0), split="kuhn")
     x, z = mesh.points[:, 0], mesh.points[:, 2]
     corners = (x < 1e-9) & ((z < 1e-9) | (z > 1 - 1e-9))
     energies = (dv.StableNeoHookean(), dv.PairBarrier(1e4, 0.004))
@@ -82,7 +82,7 @@ def sheet(points: int = 31) -> Scene:
 
 def boxes(count: int = 5, points: int = 5) -> Scene:
     dhat, kappa = 0.005, 1e5
-    one = dv.mesh.box((points,) * 3, (0.2, 0.2, 0.2))
+    one = dv.mesh.box((points,) * 3, (0.2, 0.2, 0.2), split="kuhn")
     mesh = dv.mesh.join([one.translate((0.01 * (i % 2), i * (0.2 + 0.7 * dhat), 0.013 * (i % 3)))
                          for i in range(count)])  # fmt: skip
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.7 * dhat, kappa=kappa, dhat=dhat),

@@ -29,7 +29,7 @@ def run(quick: bool) -> dict[str, Any]:
 def cost(quick: bool) -> list[dict[str, Any]]:
     """One correction in sweeps' time, by differences over K; `reverse` the backward to state and material alone."""
     beam = cantilever((5, 3, 3) if quick else (21, 7, 7))
-    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075))
+    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075), split="kuhn")
     side = 2 if quick else 100
     grid = np.stack(np.meshgrid(range(side), [0], range(side)), -1).reshape(-1, 3)
     out = [_cost(beam, 31, 61, 3 if quick else 40)]

@@ -109,14 +109,14 @@ def on(card: Card, scene: Scene) -> dict[str, Any]:
 
 
 def cost(card: Card) -> list[dict[str, Any]]:
-    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075))
+    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075), split="kuhn")
     side = 2 if card.quick else 100
     grid = np.stack(np.meshgrid(range(side), [0], range(side)), -1).reshape(-1, 3)
     stiff = {"mu": 1e7, "lam": 1e7}
     crowd = Scene(f"{len(grid)} bodies of {small.num_vertices} vertices", dv.mesh.replicate(small, 0.2 * grid),
                   np.tile(small.points[:, 0] < 1e-9, len(grid)), stiff)  # fmt: skip
     cells = 3 if card.quick else 11
-    cube = dv.mesh.beam(cells, cells, cells, size=(0.5, 0.5, 0.5))
+    cube = dv.mesh.beam(cells, cells, cells, size=(0.5, 0.5, 0.5), split="kuhn")
     scenes = 2 if card.quick else 1024
     batch = Scene(f"{scenes} scenes of {cube.num_vertices} vertices", cube, cube.points[:, 0] < 1e-9, stiff)
     beams = [cantilever((5, 3, 3))] if card.quick else [cantilever((21, 7, 7)), cantilever((101, 45, 45))]

@@ -60,7 +60,7 @@ def scenes(quick: bool) -> list[Scene]:
 
 
 def cantilever(counts: tuple[int, int, int]) -> Scene:
-    mesh = dv.mesh.beam(*counts, size=(1.0, 0.2, 0.2))
+    mesh = dv.mesh.beam(*counts, size=(1.0, 0.2, 0.2), split="kuhn")
     name = f"cantilever, {mesh.num_vertices} vertices"
     return Scene(name, mesh, mesh.points[:, 0] < 1e-9, {"mu": 1e7, "lam": 1e7}, targets=(16, 30))
 
@@ -72,7 +72,7 @@ def hanging_bar() -> Scene:
 
 def sheet(ratio: float, target: float, cells: int = 20) -> Scene:
     """1 m square of one layer, held at one edge; ratio: thickness over the width of a cell."""
-    mesh = dv.mesh.beam(cells + 1, 2, cells + 1, size=(1.0, ratio / cells, 1.0))
+    mesh = dv.mesh.beam(cells + 1, 2, cells + 1, size=(1.0, ratio / cells, 1.0), split="kuhn")
     name = f"sheet, thickness 1/{round(1 / ratio)} cell"
     return Scene(name, mesh, mesh.points[:, 0] < 1e-9, {"mu": 1e6, "lam": 1.5e6}, targets=(target, None))
 
@@ -107,7 +107,7 @@ def blob(contrast: float, count: int = 1000) -> Scene:
 
 def violent_scenes(quick: bool) -> list[Scene]:
     """A bar of 0.5 m, held at x = 0, that begins far from where it would rest."""
-    mesh = dv.mesh.beam(*((5, 3, 3) if quick else (21, 7, 7)), size=(0.5, 0.2, 0.2))
+    mesh = dv.mesh.beam(*((5, 3, 3) if quick else (21, 7, 7)), size=(0.5, 0.2, 0.2), split="kuhn")
     points = torch.from_numpy(mesh.points.copy())
     pinned = mesh.points[:, 0] < 1e-9
     cell = 0.5 / (4 if quick else 20)

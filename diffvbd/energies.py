@@ -106,6 +106,7 @@ class VertexEnergy:
     def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         """h^2 dE/dx [kg m] of every vertex, from the packed ``data``; what GlobalAdjoint differentiates.
 
+        data: Of a scene [1 | B, n], or the same for each vertex [B, V, n], where it is differentiated.
         x, x_prev: State and start of the step [m], relative to origin where there is one, [B, V, 3].
         """
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
@@ -234,28 +235,33 @@ class FloorBarrier(VertexEnergy):
         return (size[..., None] * normal).sum(-2)
 
     def slopes(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The gradient along each plane's normal, h^2 dE/dx.n [kg m], [B, V, P], and the normals [1 | B, 1, P, 3]."""
+        """The gradient along each plane's normal, h^2 dE/dx.n [kg m], [B, V, P], and the normals
+        [1 | B, 1 | V, P, 3]."""
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         damping = damping * _share(before, kappa, dhat)
         return h * h * _barrier_slope(gap, kappa, dhat) + h * damping * _approach(normal, x, x_prev), normal
 
     def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Normal [1 | B, 1, P, 3], kappa, dhat, damping [1 | B, 1, P]."""
-        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        """Normal [1 | B, 1 | V, P, 3], kappa, dhat, damping [1 | B, 1 | V, P]."""
+        planes = self._planes(data)
         kappa, dhat, damping = planes[..., 4:].unbind(-1)
         return planes[..., :3], kappa, dhat, damping
 
+    def _planes(self, data: Tensor) -> Tensor:
+        """[1 | B, 1 | V, P, 7], from data of a scene or of each vertex."""
+        return (data if data.dim() == 3 else data[:, None]).unflatten(-1, (self.planes, 7))
+
     def _gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
         """[B, V, P]"""
-        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        planes = self._planes(data)
         normal, height = planes[..., :3], planes[..., 3]
         if origin is not None:
             height = height - (normal * origin[:, :, None]).sum(-1)
         return (normal * x[:, :, None]).sum(-1) - height
 
     def gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gaps [m], [B, V, P], normals [1 | B, 1, P, 3], kappa [N/m] and dhat [m], [1 | B, 1, P]."""
+        """Gaps [m], [B, V, P], normals [1 | B, 1 | V, P, 3], kappa [N/m] and dhat [m], [1 | B, 1 | V, P]."""
         normal, kappa, dhat, _ = self._columns(data)
         return self._gaps(x, data, origin), normal, kappa, dhat
 
@@ -266,13 +272,9 @@ class FloorBarrier(VertexEnergy):
         return (size[..., None, None] * normal[..., None] * normal[..., None, :]).sum(2)
 
     def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, planes, 3]."""
-        planes = data.reshape(data.shape[0], self.planes, 7)
-        normal, (height, kappa, dhat, _) = planes[..., :3], planes[:, None, :, 3:].unbind(-1)
-        if origin is not None:
-            height = height - (normal[:, None] * origin[:, :, None]).sum(-1)
-        gap = (normal[:, None] * x[:, :, None]).sum(-1) - height
-        return -_barrier_slope(gap, kappa, dhat), normal
+        """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, 1 | V, planes, 3]."""
+        normal, kappa, dhat, _ = self._columns(data)
+        return -_barrier_slope(self._gaps(x, data, origin), kappa, dhat), normal
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ SCENE = ["--steps", "12", "--time-step", "0.01", "--sweeps", "8", "--pin", "x-"]
 @pytest.fixture
 def mesh_file(tmp_path: Path) -> Path:
     path = tmp_path / "part.msh"
-    dv.mesh.beam(5, 3, 3, size=(0.4, 0.1, 0.1)).save(path)
+    dv.mesh.beam(5, 3, 3, size=(0.4, 0.1, 0.1), split="kuhn").save(path)
     return path
 
 

@@ -159,7 +159,7 @@ def sum_of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
     """Sums of values of pairs [pairs] over those of each scene [B], in a fixed order; values are zero in rows that no
     pair fills."""
     if scenes <= 1:
-        return values.sum(0, keepdim=True)[:scenes]
+        return ops.sum_to(values, (1,))[:scenes]
     ptr = listed.ptr  # pairs are sorted by scene, with four entries each
     first = (ptr[:: (ptr.shape[0] - 1) // scenes] // 4).contiguous()
     order = torch.arange(values.shape[0], dtype=torch.int32, device=ptr.device)

@@ -131,7 +131,7 @@ class StepContact:
         start = start[:, : x.shape[1]]
         force, normal = floor.normal_force(start, self.planes, None)
         lagged = self._number("friction.coefficient")[:, None, None] * force
-        travel, normal = (x - start)[:, :, None], normal[:, None]
+        travel = (x - start)[:, :, None]
         slip = travel - (travel * normal).sum(-1, keepdim=True) * normal
         return lagged, slip, smoothed(slip.movedim(-1, -2), self.reach)[1]
 

@@ -144,7 +144,7 @@ class Conjugate(NamedTuple):
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum((-2, -1), keepdim=True)
+    return ops.sum_to(a * b, (len(a), 1, 1))
 
 
 def conjugate_gradients(

@@ -105,7 +105,7 @@ class IncrementalPotential:
         """The part of product() that is that of the tets."""
         f = self._edges_of(w)
         turned = _cross(_rolled(f, 1), self._last) + _cross(self._next, _rolled(f, 2))
-        stretched = self._bulk * (self.normals * f).sum((0, 1))
+        stretched = self._bulk * (self.normals * f).sum(0).sum(0)
         return self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
 
     def vertex_blocks(self) -> Tensor | None:
@@ -127,7 +127,7 @@ class IncrementalPotential:
 
     def diagonal(self) -> Tensor:
         """The 3x3 blocks on the diagonal, [B, V, 3, 3]: positive definite wherever mu >= 0 and mu + lam >= 0."""
-        shear = torch.cat([self._shear.sum((0, 1))[None], self._shear.diagonal().movedim(-1, 0)])  # [4, 1 | B, T]
+        shear = torch.cat([self._shear.sum(0).sum(0)[None], self._shear.diagonal().movedim(-1, 0)])  # [4, 1 | B, T]
         normals = self._corner_normals()
         eye = torch.eye(3, dtype=shear.dtype, device=shear.device)
         blocks = self._bulk * normals[:, :, None] * normals[:, None] + shear[:, None, None] * eye[..., None, None]
@@ -169,7 +169,7 @@ class IncrementalPotential:
         h2 = self.h * self.h
         out: list[Tensor | None] = [None] * 8
         f = self._edges_of(w)
-        bent = (self.normals * f).sum((0, 1)) / 6  # d(V J) along w, over c6 V = 1/6
+        bent = (self.normals * f).sum(0).sum(0) / 6  # d(V J) along w, over c6 V = 1/6
         if wants[2]:
             out[2] = self.mass * w
         if wants[5]:
@@ -201,4 +201,12 @@ class IncrementalPotential:
         """Each energy of single vertices with its part of the data [1 | B, n]."""
         energies = self.model.vertex_energies
         sizes = [e.count() * (self.model.num_vertices if e.per_vertex else 1) for e in energies]
-        return list(zip(energies, data.split(sizes, -1), strict=True)) if energies else []
+        parts = data.split(sizes, -1) if energies else ()
+        return [
+            (e, part if e.per_vertex else of_vertices(part, self.x)) for e, part in zip(energies, parts, strict=True)
+        ]
+
+
+def of_vertices(data: Tensor, x: Tensor) -> Tensor:
+    """Data of a scene [1 | B, n] for each vertex of x [B, V, 3], [B, V, n]; its gradient is summed in a fixed order."""
+    return ops.broadcast(data[:, None], (*x.shape[:2], data.shape[-1]))

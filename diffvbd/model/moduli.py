@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..checks import NUMBERS, check_broadcast, check_dense, check_tensor, fail, name_value, to_float
 from ..scopes import looks_at
 from .model import Model
@@ -32,6 +33,7 @@ def lame(young: float | Tensor, poisson: float | Tensor) -> tuple[Any, Any]:
     young, poisson = _values(young=young, poisson=poisson)
     _check("young", young, "finite numbers >= 0 Pa", young >= 0)
     _check("poisson", poisson, "numbers above -1 and below 0.5", (poisson > -1) & (poisson < 0.5))
+    young, poisson = _alike(young, poisson)
     mu = young / (2 * (1 + poisson))
     return mu, 2 * mu * poisson / (1 - 2 * poisson)
 
@@ -53,6 +55,7 @@ def young_poisson(mu: float | Tensor, lam: float | Tensor) -> tuple[Any, Any]:
     """
     mu, lam = _values(mu=mu, lam=lam)
     _check("mu", mu, "finite numbers >= 0 Pa", mu >= 0)
+    mu, lam = _alike(mu, lam)
     total = lam + mu
     _check("lam", total, "mu + lam > 0 Pa, finite", total > 0)
     return mu * (3 * lam + 2 * mu) / total, lam / (2 * total)
@@ -90,6 +93,14 @@ def _values(**given: Any) -> list[Any]:
             (first, one), (name, other) = zip(given, values, strict=True)
             fail(name, f"a shape that broadcasts with {list(one.shape)}, that of {first}", f"shape {list(other.shape)}")
     return values
+
+
+def _alike(*values: Any) -> tuple[Any, ...]:
+    """Tensors of one shape, whose gradients are summed in a fixed order; numbers as they are."""
+    if not all(isinstance(value, Tensor) for value in values):
+        return values
+    shape = torch.broadcast_shapes(*(value.shape for value in values))
+    return tuple(ops.broadcast(value, shape) for value in values)
 
 
 def _value(name: str, value: Any) -> Any:

@@ -3,8 +3,9 @@
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -32,6 +33,20 @@ def _(values):
 
 for _name in ("tet_gather", "star_sum", "row_sum"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
+
+
+@contextlib.contextmanager
+def one_thread(like: Tensor) -> Iterator[None]:
+    """On the CPU, dense algebra of torch in one thread: MKL splits products and factors by their number."""
+    threads = torch.get_num_threads()
+    if like.is_cuda or threads == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class _RowSum(Function):

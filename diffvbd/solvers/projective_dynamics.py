@@ -12,6 +12,7 @@ from torch import Tensor
 from ..checks import check_time_step, fail
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
+from ..ops.sums import one_thread
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import GRAVITY, ParticleSolver, all_finite, checked_edges, checked_mesh, mesh_edges, mesh_mass
 from .projections import Springs, Tets
@@ -273,7 +274,8 @@ class ProjectiveDynamics(ParticleSolver):
         with torch.no_grad():
             matrix = h * h * (self.springs.matrix(k) + self.tets.matrix(stiff * self.tets.volume))
             matrix = matrix[..., self.free[:, None], self.free] + torch.diag_embed(masses[..., self.free])
-            lower, failed = torch.linalg.cholesky_ex(matrix)
+            with one_thread(matrix):
+                lower, failed = torch.linalg.cholesky_ex(matrix)
             if bool(failed.any()) or not (lower.is_cuda or all_finite(lower)):
                 self._fail_scale(h, k, stiff, masses)
         # Here and not in each step: compose looks at the rows, for which it waits on CUDA.
@@ -355,8 +357,9 @@ class ProjectiveDynamics(ParticleSolver):
 
 def _solve(lower: Tensor, rhs: Tensor) -> Tensor:
     """A^-1 rhs for rhs [..., n, 3]; scenes that share a factor are columns of one solve."""
-    if lower.dim() > 2:
-        return torch.cholesky_solve(rhs, lower)
-    # By hand, because broadcasting would copy the factor for each scene.
-    columns = rhs.movedim(-2, 0)
-    return torch.cholesky_solve(columns.flatten(1), lower).reshape(columns.shape).movedim(0, -2)
+    with one_thread(lower):
+        if lower.dim() > 2:
+            return torch.cholesky_solve(rhs, lower)
+        # By hand, because broadcasting would copy the factor for each scene.
+        columns = rhs.movedim(-2, 0)
+        return torch.cholesky_solve(columns.flatten(1), lower).reshape(columns.shape).movedim(0, -2)

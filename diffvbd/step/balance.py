@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..adjoint.contact_potential import ContactPotential, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..model.model import Model
@@ -46,7 +47,7 @@ def potential_of_step(
 
 def of_scenes(values: Tensor) -> Tensor:
     """2-norms over a scene, [B, V, n] -> [B, 1]."""
-    return values.square().sum((-2, -1)).sqrt()[:, None]
+    return ops.sum_to(values.square(), (len(values), 1, 1))[..., 0].sqrt()
 
 
 def of_bodies(model: Model) -> Norm:

@@ -43,8 +43,8 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
         least = torch.maximum(lam, mu * (-2 / 3))
         if corners is None and mu.shape[-1] == 1 and lam.shape[-1] == 1:
             unit = model.derived("coarse_unit", lambda: _unit_stiffness(model))
-            shape = (-1, 1, 1, 1, 1, 1)
-            stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
+            of_mu, of_lam = (ops.broadcast(m.reshape(-1, *[1] * 5), (len(m), *unit.shape[1:])) for m in (mu, least))
+            stiffness = torch.addcmul(of_mu * unit[:1], of_lam, unit[1:])
         else:
             own = corners is None
             shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)

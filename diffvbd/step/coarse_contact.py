@@ -19,7 +19,8 @@ from .. import ops
 from ..adjoint.contact_lag import sum_at_corners
 from ..adjoint.potential import IncrementalPotential
 from ..model.model import Model
-from ..ops.segments import sum_by
+from ..ops.segments import Order, of_segments, sum_by, sum_segments
+from ..ops.sums import one_thread
 from ..tuples import replaced
 from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
 from .trials import Trials
@@ -32,6 +33,8 @@ class Space(NamedTuple):
 
     vertex: Tensor  # int64 [entries]
     function: Tensor  # int64 [entries]
+    by_vertex: Order  # of the entries
+    by_function: Order
     weight: Tensor  # [entries]
     body: Tensor  # int64 [F], of those that move; their number where a function only fills up
     of_coarse: Tensor  # int64 [coarse bodies], the moving body of each
@@ -40,14 +43,11 @@ class Space(NamedTuple):
 
     def restricted(self, g: Tensor) -> Tensor:
         """P' g: [B, V, 3] -> [B, F, 3]."""
-        return sum_by((self.weight[:, None] * g[:, self.vertex]).movedim(1, 0), self.function, self.functions).movedim(
-            0, 1
-        )
+        return sum_segments(self.weight[:, None] * of_segments(g, *self.by_vertex), *self.by_function)
 
-    def prolonged(self, a: Tensor, vertices: int) -> Tensor:
+    def prolonged(self, a: Tensor) -> Tensor:
         """P a: [B, F, 3] -> [B, V, 3]."""
-        rows = (self.weight[:, None] * a[:, self.function]).movedim(1, 0)
-        return sum_by(rows, self.vertex, vertices).movedim(0, 1)
+        return sum_segments(self.weight[:, None] * of_segments(a, *self.by_function), *self.by_vertex)
 
 
 def space_of(model: Model) -> Space:
@@ -65,7 +65,16 @@ def _space(model: Model) -> Space:
     for first, last in zip(g.function_ptr[:-1].tolist(), g.function_ptr[1:].tolist(), strict=True):
         rows = torch.arange(3 * first, 3 * last)
         dense.append((3 * g.functions * rows[:, None] + rows).reshape(-1))
-    return Space(vertex, function, weight, body, body[ptr[:-1]], torch.cat(dense).to(model.device), g.functions)
+    orders = (_order(vertex, model.num_vertices), _order(function, g.functions))
+    return Space(
+        vertex, function, *orders, weight, body, body[ptr[:-1]], torch.cat(dense).to(model.device), g.functions
+    )
+
+
+def _order(index: Tensor, count: int) -> Order:
+    ordered, order = torch.sort(index, stable=True)
+    ptr = torch.searchsorted(ordered, torch.arange(count + 1, device=index.device))
+    return order.to(torch.int32), ptr.to(torch.int32), index
 
 
 class Corrections:
@@ -89,12 +98,12 @@ class Corrections:
         r, presses = self._gradient(x)
         with torch.no_grad():
             a = self._solved(presses, r)
-            way = -self.space.prolonged(a, x.shape[1])
+            way = -self.space.prolonged(a)
             slope = sum_by(-(r * a).sum(-1).reshape(-1, 1).double(), self.set_of.reshape(-1), over.shape[1] + 1)[:-1, 0]
             length = torch.where(over | self._lost(), 0.0, self.trials.lengths(x, way, slope))
             self.refused = self.refused + (length == 0)
         if torch.is_grad_enabled():
-            way = -self.space.prolonged(self._differentiable(a, r, presses), x.shape[1])
+            way = -self.space.prolonged(self._differentiable(a, r, presses))
         of_vertex = torch.cat([length, length.new_zeros((1, 1))], 1)[0][self.trials.bodies.of].reshape(*x.shape[:2], 1)
         return torch.where(of_vertex > 0, x + of_vertex * way, x), self._of_bodies(length)
 
@@ -128,7 +137,8 @@ class Corrections:
         matrix = self.matrix.expand(scenes, unknowns, unknowns).double()
         for press in presses:
             matrix = matrix + press.assembled(self.space, scenes, self.scenes.fields.x_prev.shape[1])
-        factor = torch.linalg.cholesky_ex(matrix)[0]
+        with one_thread(matrix):
+            factor = torch.linalg.cholesky_ex(matrix)[0]
         # of a matrix that is not positive definite no correction comes, and nothing goes back through it
         self.solved = torch.isfinite(factor).flatten(1).all(1)[:, None, None]
         self.cholesky = torch.where(self.solved, factor, torch.eye(unknowns, dtype=factor.dtype, device=r.device))
@@ -141,15 +151,13 @@ class Corrections:
 
     def _back(self, r: Tensor) -> Tensor:
         right = torch.where(self.solved, r, 0.0).double().reshape(r.shape[0], -1, 1)
-        half = torch.linalg.solve_triangular(self.cholesky, right, upper=False)
-        return torch.linalg.solve_triangular(self.cholesky.mT, half, upper=True).reshape(r.shape).to(r.dtype)
+        return _Back.apply(self.cholesky, right).reshape(r.shape).to(r.dtype)
 
     def _differentiable(self, a: Tensor, r: Tensor, presses: list[_Press]) -> Tensor:
         """a with its derivatives: one more step, r - A a being zero, with the matrix as it was. It has no length, even
         where it would have one, because the matrix is nearly singular: what was judged is what is done."""
-        vertices = self.scenes.fields.x_prev.shape[1]
         pushed = _Product.apply(self.packed, a, self.space)
-        way = self.space.prolonged(a, vertices)
+        way = self.space.prolonged(a)
         for press in presses:
             pushed = pushed + self.space.restricted(press.product(way))
         step = self._back(r - pushed)
@@ -179,7 +187,8 @@ class _Press(NamedTuple):
         scene, out = self.rows[:, 0] // vertices, []
         for n in range(scenes):
             own = torch.where((scene == n)[:, None], moved, 0.0) if scenes > 1 else moved
-            upper = {(i, j): own.mT @ (self.stiffness[:, i, j, None] * own) for i in range(3) for j in range(i, 3)}
+            with one_thread(own):
+                upper = {(i, j): own.mT @ (self.stiffness[:, i, j, None] * own) for i in range(3) for j in range(i, 3)}
             blocks = [torch.stack([upper[min(i, j), max(i, j)] for j in range(3)], -1) for i in range(3)]
             out.append(torch.stack(blocks, 1).reshape(3 * space.functions, -1))
         return torch.stack(out)
@@ -203,12 +212,32 @@ def _dense(packed: Tensor, space: Space) -> Tensor:
     return out.reshape(-1, unknowns, unknowns)
 
 
+class _Back(Function):
+    """(L L')^-1 b of a factor that is a constant."""
+
+    @staticmethod
+    def forward(factor: Tensor, right: Tensor) -> Tensor:
+        with one_thread(factor):
+            half = torch.linalg.solve_triangular(factor, right, upper=False)
+            return torch.linalg.solve_triangular(factor.mT, half, upper=True)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        return None, _Back.apply(*ctx.saved_tensors, grads[0])
+
+
 class _Product(Function):
     """A a [B, F, 3] of the matrices without presses."""
 
     @staticmethod
     def forward(packed: Tensor, a: Tensor, space: Space) -> Tensor:
-        return (_dense(packed, space) @ a.reshape(len(a), -1, 1)).reshape(a.shape)
+        matrix = _dense(packed, space)
+        with one_thread(matrix):
+            return (matrix @ a.reshape(len(a), -1, 1)).reshape(a.shape)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -249,4 +278,4 @@ class _Elastic(Function):
         return potential.elastic_product(w) if needs[0] else None, *bars, None, None, None
 
 
-ops.ready_signature(_Product, _Elastic)
+ops.ready_signature(_Back, _Product, _Elastic)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs, no_pairs, rubbing, some_of
+from ..adjoint.potential import of_vertices
 from ..adjoint.rise import RiseParts, rise_parts
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
@@ -90,9 +91,9 @@ class ContactStep:
         floor, x = self.model.floor, self.begun.x_prev
         if floor is None or self.floor_data is None or self.model.friction is None:
             return x.new_zeros((0,))
-        force, normal = floor.normal_force(x, self.floor_data, self.begun.origin)
-        size = self._parameter("friction.coefficient")[:, None, None] * force
-        normal = broadcast(normal[:, None], (*size.shape, 3))
+        force, normal = floor.normal_force(x, of_vertices(self.floor_data, x), self.begun.origin)
+        size = broadcast(self._parameter("friction.coefficient")[:, None, None], force.shape) * force
+        normal = broadcast(normal, (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
     def _rub(self, listed: Pairs, collider: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.contact_lag import Pairs, at_corners, of_scene, pair_lag, some_of
+from ..adjoint.potential import of_vertices
 from ..ops import broadcast
 
 RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
@@ -79,7 +80,9 @@ def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor |
     out, first, origin = [], 0, f.origin if f.origin.numel() else None
     for energy in s.model.vertex_energies:
         size = energy.count() * (s.model.num_vertices if energy.per_vertex else 1)
-        out.append((energy, (f.energy_data[:, first : first + size], s.time_step, origin)))
+        own = f.energy_data[:, first : first + size]
+        own = broadcast(own, (len(f.x), size)) if energy.per_vertex else of_vertices(own, f.x)
+        out.append((energy, (own, s.time_step, origin)))
         first += size
     return out
 
@@ -151,7 +154,7 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
         gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
         b, _, curvature = log_barrier(gap, torch.where(near, dhat, 1.0))
-        kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
+        kappa = broadcast(f.kappa, near.shape) if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
         e, by_corners = _mollifier(at, listed)
         turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * by_corners
         stiffness = torch.where(near, h2 * kappa * e * curvature, 0.0)[:, None, None] * outer(n)

@@ -36,7 +36,7 @@ RELAXATION = 1.5
 
 def problem(settings: Settings) -> Problem:
     vertices, steps, iterations = ((6, 3, 3), 15, 60) if settings.quick else ((21, 7, 7), 100, 76)
-    mesh = dv.mesh.beam(*vertices, size=SIZE)
+    mesh = dv.mesh.beam(*vertices, size=SIZE, split="kuhn")
     clamped = mesh.points[:, 0] < mesh.points[:, 0].min() + 1e-9
     model = dv.Model(mesh, density=DENSITY, pinned=clamped, relaxation=RELAXATION, coarse="auto")
     model = model.to(settings.device)

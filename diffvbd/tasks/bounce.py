@@ -170,5 +170,5 @@ def moments(squared: Tensor) -> tuple[int, int]:
 
 def target(scene: Bounce) -> viz.Scenery:
     """The voxel about the target, for pictures."""
-    cube = dv.mesh.cube(2, VOXEL)
+    cube = dv.mesh.cube(2, VOXEL, split="kuhn")
     return viz.Scenery(cube.points - cube.points.mean(0) + scene.target, cube.surface, viz.COLORS["target"])

@@ -35,7 +35,7 @@ LEARNING_RATE, CLIP = 0.03, 0.5  # [m] and [m/s]; [m] and [m s]
 
 def scene(settings: Settings, sweeps: int = SWEEPS) -> Bounce:
     """The cube above the floor, and its target."""
-    cube = dv.mesh.cube(2, SIZE)
+    cube = dv.mesh.cube(2, SIZE, split="kuhn")
     z, x = TILT
     about_z = np.array([[math.cos(z), -math.sin(z), 0.0], [math.sin(z), math.cos(z), 0.0], [0.0, 0.0, 1.0]])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, math.cos(x), -math.sin(x)], [0.0, math.sin(x), math.cos(x)]])

@@ -93,7 +93,7 @@ class Arm:
     """The column on its cart, and its motion under a policy."""
 
     def __init__(self, device: str) -> None:
-        self.mesh = dv.mesh.box((2, 7, 2), SIZE).translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
+        self.mesh = dv.mesh.box((2, 7, 2), SIZE, split="kuhn").translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
         height = self.mesh.points[:, 1]
         self.model = dv.Model(self.mesh, density=DENSITY, pinned=height == 0.0, start="predictor").to(device)
         self.like = {"dtype": self.model.dtype, "device": self.model.device}

@@ -151,7 +151,7 @@ class Cubes:
     def __init__(self, settings: Settings, version: Version) -> None:
         self.version, bodies = version, version.bodies
         place = matched(ring(bodies, version.height), np.random.default_rng(settings.seed))
-        self.cube = cube = dv.mesh.cube(2, EDGE).translate((-EDGE / 2,) * 3)
+        self.cube = cube = dv.mesh.cube(2, EDGE, split="kuhn").translate((-EDGE / 2,) * 3)
         # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
         self.group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, version.group)
         self.scenes = bodies // self.group

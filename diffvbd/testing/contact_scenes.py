@@ -47,7 +47,7 @@ def noise(*key: Any, shape: Sequence[int], size: float) -> Tensor:
 
 
 def boxes(*offsets: tuple[float, float, float], points: Any = 3, size: Any = 0.2) -> mesh.TetMesh:
-    return mesh.join([mesh.box(points, size).translate(offset) for offset in offsets])
+    return mesh.join([mesh.box(points, size, split="kuhn").translate(offset) for offset in offsets])
 
 
 def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float = 0.1, **options: Any) -> Scene:
@@ -84,8 +84,9 @@ def stacked() -> Scene:
 
 def crossed() -> Scene:
     """Two beams that cross like the sticks of a fire: edges meet edges, inside a short motion."""
-    tets = mesh.join([mesh.box((5, 2, 2), (0.4, 0.08, 0.08)),
-                      mesh.box((2, 2, 5), (0.08, 0.08, 0.4)).translate((0.163, 0.094, -0.157))])  # fmt: skip
+    under, over = (mesh.box(n, size, split="kuhn") for n, size in (((5, 2, 2), (0.4, 0.08, 0.08)),
+                                                                  ((2, 2, 5), (0.08, 0.08, 0.4))))  # fmt: skip
+    tets = mesh.join([under, over.translate((0.163, 0.094, -0.157))])
     scene = build("crossed", tets, (PairBarrier(kappa=1e4, dhat=0.03, damping=1.0), Friction(0.3, 0.1)),
                   jitter=4e-3)  # fmt: skip
     scene.v[:, 1] += torch.where(scene.model.body == 0, 1.5, -1.5)
@@ -107,7 +108,7 @@ def fast() -> Scene:
 
 def folded() -> Scene:
     """A thin strip folded over itself: self-contact, and pairs that are closer than dhat at rest."""
-    tets = mesh.box((9, 2, 3), (0.8, 0.02, 0.2))
+    tets = mesh.box((9, 2, 3), (0.8, 0.02, 0.2), split="kuhn")
     scene = build("folded", tets, (PairBarrier(kappa=5e3, dhat=0.03, damping=0.5),), jitter=0.0)
     points = scene.x.clone()
     radius, bend = 0.02, torch.pi

@@ -11,7 +11,7 @@ from torch import Tensor
 import diffvbd as dv
 
 NAN, INF = float("nan"), float("inf")
-MESH = dv.mesh.cube()  # 8 vertices, 6 tets
+MESH = dv.mesh.cube(split="kuhn")  # 8 vertices, 6 tets
 STEP = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 1}
 
 

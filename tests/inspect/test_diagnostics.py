@@ -13,7 +13,7 @@ MATERIAL = {"mu": 1e5, "lam": 1.5e5}
 
 
 def cube(size: float = 1.0, **options) -> dv.Model:
-    mesh = dv.mesh.cube(3, size=size)
+    mesh = dv.mesh.cube(3, size=size, split="kuhn")
     return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9 * size, **options)
 
 
@@ -65,17 +65,17 @@ def test_strain_and_nonfinite_positions() -> None:
 
 def test_float32_far_from_the_origin() -> None:
     far = torch.tensor([1e3, 0.0, 0.0])
-    mesh = dv.TetMesh(dv.mesh.cube(3).points + far.numpy(), dv.mesh.cube(3).tets)
+    mesh = dv.TetMesh(dv.mesh.cube(3, split="kuhn").points + far.numpy(), dv.mesh.cube(3, split="kuhn").tets)
     single, double = dv.Model(mesh, dtype=torch.float32), dv.Model(mesh)
     only(diagnose(single, single.rest_points, warn=False, **MATERIAL).messages, "rounded")
     assert diagnose(double, double.rest_points, warn=False, **MATERIAL).ok
 
 
 def test_paper_preset_on_a_small_body() -> None:
-    mesh = dv.mesh.cube(3, size=3e-3)
+    mesh = dv.mesh.cube(3, size=3e-3, split="kuhn")
     messages = diagnose(model := dv.Model.paper(mesh), model.rest_points, mu=1e5, lam=1.5e5, warn=False).messages
     assert any("saturation" in m for m in messages) and any("regularization" in m for m in messages)
-    large = dv.Model.paper(dv.mesh.cube(3, size=0.5))
+    large = dv.Model.paper(dv.mesh.cube(3, size=0.5, split="kuhn"))
     assert diagnose(large, large.rest_points, mu=1e5, lam=1.5e5, warn=False).ok
 
 
@@ -93,7 +93,7 @@ def test_settings_that_do_not_promise_descent() -> None:
 
 
 def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
-    mesh = dv.mesh.cube(3)
+    mesh = dv.mesh.cube(3, split="kuhn")
     floor = dv.FloorBarrier(height=-0.01, kappa=1e4)
     model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor, dv.Anchor(100.0)))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
@@ -116,7 +116,7 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_free_fall_leaves_no_force(dtype: torch.dtype) -> None:
-    model = dv.Model(dv.mesh.cube(3, size=0.1), dtype=dtype)
+    model = dv.Model(dv.mesh.cube(3, size=0.1, split="kuhn"), dtype=dtype)
     given = {"mu": 1e5, "lam": 1e5, "time_step": 0.01}
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     motion = dv.rollout(model, x, v, steps=20, sweeps=10, **given)

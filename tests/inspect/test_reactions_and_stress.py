@@ -110,7 +110,7 @@ def test_stress_is_work_conjugate_to_the_nodal_forces() -> None:
 
 
 def test_gradients_of_stress_agree_with_differences_and_rest_has_finite_ones() -> None:
-    model = dv.Model(box(2, 0.2))
+    model = dv.Model(box(2, 0.2, split="kuhn"))
     arguments = {
         "x": model.rest_points + noise("sx", shape=(2, 8, 3), size=1e-2),
         "mu": 2e4 * torch.exp(noise("smu", shape=(2, 6), size=0.1)),
@@ -176,7 +176,7 @@ def test_bad_input(run: Any, message: str) -> None:
 
 @pytest.mark.parametrize("bad", (float("nan"), float("inf")))
 def test_a_stress_that_is_no_number_is_none(bad: float) -> None:
-    model = dv.Model(dv.mesh.cube(2))
+    model = dv.Model(dv.mesh.cube(2, split="kuhn"))
     x = model.rest_points.clone()
     x[3, 1] = bad
     found = dv.stress(model, x, mu=1e4, lam=1e4)

@@ -110,7 +110,7 @@ def test_masses_sum_to_density_times_volume(kind: str) -> None:
      np.isin(np.arange(8), (0, 3)), torch.tensor([True, False, False, True, False, False, False, False])],
 )  # fmt: skip
 def test_pins_by_mask_or_indices(pinned: Any) -> None:
-    model = dv.Model(dv.mesh.cube(), pinned=pinned)
+    model = dv.Model(dv.mesh.cube(split="kuhn"), pinned=pinned)
     assert model.pinned.dtype == torch.bool
     assert model.pinned.nonzero().reshape(-1).tolist() == [0, 3]
     x, _ = dv.step(model, model.rest_points, torch.ones(8, 3, dtype=torch.float64), **STEP)
@@ -121,7 +121,7 @@ def test_pins_by_mask_or_indices(pinned: Any) -> None:
 def test_a_models_mask_is_its_own() -> None:
     mask = torch.zeros(8, dtype=torch.bool)
     density = torch.full((6,), 500.0, dtype=torch.float64)
-    model = dv.Model(dv.mesh.cube(), density=density, pinned=mask)
+    model = dv.Model(dv.mesh.cube(split="kuhn"), density=density, pinned=mask)
     mask[:] = True
     density[:] = 1.0
     assert not model.pinned.any() and (model.density == 500.0).all()
@@ -132,22 +132,22 @@ def test_a_models_mask_is_its_own() -> None:
 
 def test_repr_says_what_it_is() -> None:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(damping=3.0), dv.Anchor(2.0))
-    model = dv.Model(dv.mesh.beam(5, 3, 3), pinned=[0, 1], energies=energies, saturation=0.25, regularization=1e-3,
-                     relaxation=1.5)  # fmt: skip
+    model = dv.Model(dv.mesh.beam(5, 3, 3, split="kuhn"), pinned=[0, 1], energies=energies, saturation=0.25,
+                     regularization=1e-3, relaxation=1.5)  # fmt: skip
     text = repr(model)
     for part in ("45 vertices", "96 tets", "2 pinned", f"{model.num_colors} colors", "20 kg", "StableNeoHookean",
                  "FloorBarrier", "damping=3.0", "Anchor", "stiffness=2.0", "saturation=0.25 m",
                  "regularization=0.001 kg", "relaxation=1.5", "float64", "cpu"):  # fmt: skip
         assert part in text, part
     assert "\n" not in text and len(text) < 700
-    plain = repr(dv.Model(dv.mesh.cube(), dtype=torch.float32))
+    plain = repr(dv.Model(dv.mesh.cube(split="kuhn"), dtype=torch.float32))
     assert "float32" in plain and "saturation" not in plain and "relaxation" not in plain
 
 
 def test_repr_shows_no_tensors() -> None:
     stiffness, points = torch.rand(45), torch.rand(45, 3)
     anchor = dv.Anchor(stiffness, points, vertices=[1, 4, 7])
-    text = repr(dv.Model(dv.mesh.beam(5, 3, 3), energies=(dv.StableNeoHookean(), anchor)))
+    text = repr(dv.Model(dv.mesh.beam(5, 3, 3, split="kuhn"), energies=(dv.StableNeoHookean(), anchor)))
     for shown in (text, repr(anchor)):
         assert "stiffness=[45]" in shown and "points=[45, 3]" in shown
         assert "tensor" not in shown and "\n" not in shown and len(shown) < 700
@@ -156,7 +156,7 @@ def test_repr_shows_no_tensors() -> None:
 
 
 def test_surface_and_geometry_are_the_meshes() -> None:
-    mesh = dv.mesh.box((4, 3, 2))
+    mesh = dv.mesh.box((4, 3, 2), split="kuhn")
     model = dv.Model(mesh)
     assert torch.equal(model.surface, torch.from_numpy(mesh.surface.copy()))
     assert torch.equal(model.rest_points, torch.from_numpy(mesh.points.copy()))
@@ -168,7 +168,7 @@ def test_surface_and_geometry_are_the_meshes() -> None:
 
 
 def test_paper_preset() -> None:
-    mesh = dv.mesh.cube()
+    mesh = dv.mesh.cube(split="kuhn")
     model = dv.Model.paper(mesh, density=700.0, pinned=[0])
     assert [e.block for e in model.energies] == ["paper"]
     assert (model.saturation, model.regularization, model.relaxation) == (0.1, 1e-6, 1.0)
@@ -192,7 +192,7 @@ def tensors_of(model: dv.Model) -> dict[str, Tensor]:
 
 def test_to_returns_a_new_model_and_keeps_the_old() -> None:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1 / 3), dv.Anchor(0.1))
-    model = dv.Model(dv.mesh.box((3, 3, 2), 0.1), density=123.4, pinned=[1], energies=energies)
+    model = dv.Model(dv.mesh.box((3, 3, 2), 0.1, split="kuhn"), density=123.4, pinned=[1], energies=energies)
     before = {k: t.clone() for k, t in tensors_of(model).items()}
     single = model.to(dtype=torch.float32)
     assert single is not model and single.dtype == torch.float32 and model.dtype == torch.float64
@@ -206,19 +206,19 @@ def test_to_returns_a_new_model_and_keeps_the_old() -> None:
     for name, t in tensors_of(again).items():
         assert torch.equal(t, before[name]), name
     assert torch.equal(model.to("cpu").mass, model.mass) and model.to("cpu") is not model
-    direct = dv.Model(dv.mesh.box((3, 3, 2), 0.1), 123.4, [1], energies, dtype=torch.float32)
+    direct = dv.Model(dv.mesh.box((3, 3, 2), 0.1, split="kuhn"), 123.4, [1], energies, dtype=torch.float32)
     for name, t in tensors_of(direct).items():
         assert torch.equal(t, tensors_of(single)[name]), name
 
 
 def test_a_device_without_kernels_raises() -> None:
     """Moves to CUDA are in test_cuda_device.py."""
-    model = dv.Model(dv.mesh.cube())
+    model = dv.Model(dv.mesh.cube(split="kuhn"))
     for device in ("meta", torch.device("meta"), "xpu:1"):
         with pytest.raises(ValueError, match=r"device: .*cpu.*cuda.*, got '(meta|xpu:1)'"):
             model.to(device)
         with pytest.raises(ValueError, match="device: "):
-            dv.Model(dv.mesh.cube(), device=device)
+            dv.Model(dv.mesh.cube(split="kuhn"), device=device)
     assert model.device.type == "cpu" and all(t.device.type == "cpu" for t in tensors_of(model).values())
 
 
@@ -247,13 +247,13 @@ def test_an_empty_mesh_is_legal(batch: tuple[int, ...]) -> None:
 
 
 def test_a_batch_without_scenes_is_legal() -> None:
-    model = dv.Model(dv.mesh.cube())
+    model = dv.Model(dv.mesh.cube(split="kuhn"))
     new, by_x, _ = gradients(model, torch.zeros(0, 8, 3, dtype=torch.float64))
     assert new.shape == (0, 8, 3) and by_x.shape == (0, 8, 3)
 
 
 def test_all_vertices_pinned_is_legal() -> None:
-    mesh = dv.mesh.cube()
+    mesh = dv.mesh.cube(split="kuhn")
     model = dv.Model(mesh, pinned=range(8))
     assert model.num_colors == 0 and model.num_active == 0
     new, by_x, by_v = gradients(model, model.rest_points)
@@ -264,7 +264,7 @@ def test_all_vertices_pinned_is_legal() -> None:
 
 
 def test_vertices_without_tets_are_legal_when_pinned() -> None:
-    mesh = dv.mesh.cube()
+    mesh = dv.mesh.cube(split="kuhn")
     loose = dv.TetMesh(np.concatenate([mesh.points, [[5.0, 5.0, 5.0]]]), mesh.tets)
     model = dv.Model(loose, pinned=[8])
     force = torch.ones(9, 3, dtype=torch.float64).requires_grad_()
@@ -277,7 +277,7 @@ def test_vertices_without_tets_are_legal_when_pinned() -> None:
 
 
 def test_a_model_without_elastic_energy_falls_freely() -> None:
-    model = dv.Model(dv.mesh.cube(), energies=())
+    model = dv.Model(dv.mesh.cube(split="kuhn"), energies=())
     v = torch.full((8, 3), 2.0, dtype=torch.float64)
     x, _ = dv.step(model, model.rest_points, v, mu=0.0, lam=0.0, time_step=0.1, sweeps=3)
     expected = model.rest_points + 0.1 * v + 0.01 * torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
@@ -285,7 +285,7 @@ def test_a_model_without_elastic_energy_falls_freely() -> None:
 
 
 def test_safeguards_out_of_scale_warn() -> None:
-    small = dv.mesh.cube(size=0.003)
+    small = dv.mesh.cube(size=0.003, split="kuhn")
     with pytest.warns(UserWarning, match="regularization: 1e-06 kg is 0.44"):
         dv.Model.paper(small)
     with pytest.warns(UserWarning, match="relaxation: .* got 1.9"):
@@ -294,5 +294,5 @@ def test_safeguards_out_of_scale_warn() -> None:
         dv.Model(small, energies=(dv.StableNeoHookean("paper"),), relaxation=1.6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        dv.Model.paper(dv.mesh.cube())
+        dv.Model.paper(dv.mesh.cube(split="kuhn"))
         dv.Model(small, relaxation=1.6)

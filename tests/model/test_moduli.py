@@ -20,7 +20,7 @@ def scalar(value: float, device: str = "cpu", **options: Any) -> Tensor:
 
 
 def scene(device: str, lead: tuple[int, ...] = ()) -> tuple[dv.Model, Tensor, Tensor]:
-    model = dv.Model(dv.mesh.cube(3, size=0.2), pinned=[0, 1, 2], device=device)
+    model = dv.Model(dv.mesh.cube(3, size=0.2, split="kuhn"), pinned=[0, 1, 2], device=device)
     x = (1.1 * model.rest_points).repeat(*lead, 1, 1)
     return model, x, torch.zeros_like(x)
 

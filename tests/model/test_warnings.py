@@ -15,7 +15,9 @@ FLOOR = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1.0), dv.Friction(0.5))
 
 
 def scaled(size: float, bodies: int = 1) -> dv.TetMesh:
-    return dv.mesh.replicate(dv.mesh.cube(2, size=size), np.arange(bodies)[:, None] * [10.0 * size, 0.0, 0.0])
+    return dv.mesh.replicate(
+        dv.mesh.cube(2, size=size, split="kuhn"), np.arange(bodies)[:, None] * [10.0 * size, 0.0, 0.0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -116,7 +118,7 @@ def test_the_warning_is_right() -> None:
 def test_over_relaxation_of_nearly_incompressible_material(
     run: Callable[..., Any], relaxation: float, poisson: float, warned: int
 ) -> None:
-    model = dv.Model(dv.mesh.box(3, 0.1), relaxation=relaxation)
+    model = dv.Model(dv.mesh.box(3, 0.1, split="kuhn"), relaxation=relaxation)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         for _ in range(2):
@@ -127,7 +129,7 @@ def test_over_relaxation_of_nearly_incompressible_material(
 
 
 def test_a_fit_that_comes_to_be_nearly_incompressible_is_warned_of_once() -> None:
-    model = dv.Model(dv.mesh.box(3, 0.1), relaxation=1.5)
+    model = dv.Model(dv.mesh.box(3, 0.1, split="kuhn"), relaxation=1.5)
     said = []
     for poisson in (0.3, 0.499, 0.499, 0.499, 0.499):
         with warnings.catch_warnings(record=True) as found:
@@ -140,7 +142,7 @@ def test_a_fit_that_comes_to_be_nearly_incompressible_is_warned_of_once() -> Non
 
 
 def test_what_it_warns_of_grows_and_the_remedy_does_not() -> None:
-    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15))
+    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15), split="kuhn")
     fastest = {}
     for relaxation, coarse in ((1.6, None), (1.0, "auto")):
         model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=relaxation, coarse=coarse)
@@ -155,7 +157,7 @@ def test_what_it_warns_of_grows_and_the_remedy_does_not() -> None:
 
 def bent() -> tuple[dv.Model, torch.Tensor, dict[str, Any]]:
     """A stiff bar whose velocities bend it, and how it gains energy."""
-    model = dv.Model(dv.mesh.box((5, 2, 2), (0.4, 0.1, 0.1)))
+    model = dv.Model(dv.mesh.box((5, 2, 2), (0.4, 0.1, 0.1), split="kuhn"))
     v = torch.zeros_like(model.rest_points)
     v[:, 1] = 20 * model.rest_points[:, 0].square()
     return model, v, {"mu": 1e9, "lam": 1e9}

@@ -3,7 +3,11 @@
 Of CUDA see also test_cuda_regimes.py.
 """
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,3 +157,33 @@ def test_dot_product(device: str, case: str) -> None:
         assert min(errors) <= tolerance("finite_difference"), (name, errors)
         best = min(best, *errors)
     assert best < tolerance("best_difference")
+
+
+OF_SHEETS = """
+import torch
+import diffvbd as dv
+from diffvbd import testing
+sheet = dv.mesh.sheet(13, 10, size=(0.32, 0.24), thickness=0.005)
+mesh = dv.mesh.join([sheet, sheet.translate((0.011, 0.015, 0.007))])
+barrier = dv.PairBarrier(kappa=1e4, dhat=0.012, self_contact=False, detections=1)
+floor = dv.FloorBarrier(height=-0.01, kappa=1e3, dhat=0.02)
+model = dv.Model(mesh, energies=(dv.StableNeoHookean(), barrier, floor), coarse="auto")
+x, size = model.rest_points, torch.full((), 1e5, dtype=torch.float64)
+inputs = {"x": x, "v": -0.3 * torch.cos(7 * x), "mu": size, "lam": 2 * size, "time_step": 0.01}
+inputs["parameters"] = {"pair_barrier.kappa": 0.1 * size, "floor_barrier.kappa": 0.01 * size}
+found = testing.evaluate(lambda **given: dv.step(model, sweeps=4, **given), inputs)
+"""
+
+
+def test_sheets_that_touch_with_coarse_corrections(threads: None, tmp_path: Path) -> None:
+    """By torch's setting and by that of the process: dense algebra may take its order of sums from either."""
+    file = tmp_path / "found.pt"
+    code = f"{OF_SHEETS}\ntorch.save(found, {str(file)!r})"
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"OMP_NUM_THREADS": "2"})
+    other = torch.load(file)
+    assert all(value.any() for value in other.values())
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        here: dict[str, Any] = {}
+        exec(OF_SHEETS, here)
+        assert_same_bits(here["found"], other)

@@ -19,7 +19,7 @@ DURATION = 0.3
 
 
 def cantilever(modulus: float) -> tuple[dv.Model, dict[str, float]]:
-    body = mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
+    body = mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1), split="kuhn")
     return dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9)), {"mu": modulus, "lam": modulus}
 
 
@@ -223,7 +223,7 @@ def test_nothing_is_over_relaxed_where_a_tet_is_nearly_incompressible(poisson: f
 
 def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
     """In long steps a cube that meets another one loses its rebound, and runs of h and h/2 agree on that."""
-    one = mesh.box(2, 0.1)
+    one = mesh.box(2, 0.1, split="kuhn")
     model = dv.Model(mesh.join([one, one.translate((0.104, 0.007, 0.003))]),
                      energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3, dhat=2e-3)))  # fmt: skip
     v = torch.zeros_like(model.rest_points)
@@ -273,7 +273,7 @@ def test_auto_inside_refine() -> None:
 
 def test_a_bounce_that_steps_resolve() -> None:
     """Contact converges with the second power of h once steps resolve it: 1 % can be had, and is kept."""
-    body = mesh.box(2, 0.1).translate((0, 4e-3, 0))
+    body = mesh.box(2, 0.1, split="kuhn").translate((0, 4e-3, 0))
     model = dv.Model(body, energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e5, dhat=2e-3)))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     v[:, 1] = -1.0
@@ -348,7 +348,7 @@ def test_advice_leaves_warnings_to_the_rollouts_that_follow() -> None:
 
 def test_parameters_may_be_functions_of_time() -> None:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.01))
-    model = dv.Model(mesh.box(2, 0.1), energies=energies)
+    model = dv.Model(mesh.box(2, 0.1, split="kuhn"), energies=energies)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     given = {"duration": 0.04, "time_step": 0.01, "sweeps": 2, "mu": 1e4, "lam": 1e4}
     kappa = torch.tensor(1e3, dtype=x.dtype)
@@ -367,7 +367,7 @@ def test_parameters_may_be_functions_of_time() -> None:
 
 def test_gradients_by_moduli_that_have_no_part_in_the_motion_are_no_error() -> None:
     """Those of a body in free fall are rounding, which no time step makes smaller."""
-    model = dv.Model(mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)))
+    model = dv.Model(mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn"))
     x = model.rest_points
     settings = dv.advise(model, x, 0 * x, duration=0.05, gradient=True, patience=20.0, mu=1e5, lam=1e5)
     assert settings.predicted is not None and settings.predicted.reached and settings.steps(0.05) < 32
@@ -375,7 +375,7 @@ def test_gradients_by_moduli_that_have_no_part_in_the_motion_are_no_error() -> N
 
 def test_what_is_exact_in_the_ladder_says_nothing_absurd_of_others() -> None:
     """Free fall: SDIRK2 is exact, so errors of others are no multiple of its own. Implicit Euler is off by h / t."""
-    model = dv.Model(mesh.beam(3, 2, 2, size=(0.3, 0.1, 0.1)))
+    model = dv.Model(mesh.beam(3, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn"))
     x = model.rest_points
     told = dv.advise(model, x, torch.zeros_like(x), duration=0.3, error=0.01, mu=1e5, lam=1e5).predicted
     assert told is not None and told.reached

@@ -12,7 +12,7 @@ import torch
 import diffvbd as dv
 from diffvbd.solvers import XPBD, ProjectiveDynamics
 
-MESH = dv.mesh.cube()  # 8 vertices, 6 tets, 19 edges
+MESH = dv.mesh.cube(split="kuhn")  # 8 vertices, 6 tets, 19 edges
 X = torch.from_numpy(MESH.points.copy())
 NAN = torch.where(torch.arange(8)[:, None] == 2, torch.nan, X)
 INF = float("inf")

@@ -255,7 +255,7 @@ def test_values_that_are_not_read_are_not_checked(device: str, value_checks: Non
 
 
 def test_an_argument_that_is_not_read_is_not_blamed() -> None:
-    model = dv.Model(dv.mesh.cube())  # nothing is pinned
+    model = dv.Model(dv.mesh.cube(split="kuhn"))  # nothing is pinned
     x = model.rest_points
     raises(lambda: dv.step(model, x, x + 1e300, mu=1.0, lam=1.0, time_step=1e10, sweeps=1, prescribed=NAN),
            "predictor", "inf|nan")  # fmt: skip
@@ -263,7 +263,7 @@ def test_an_argument_that_is_not_read_is_not_blamed() -> None:
 
 def test_a_model_of_another_class_or_mesh() -> None:
     raises(lambda: step_with(MESH, "mu", 1.0), "model", "TetMesh")
-    other = dv.Model(dv.mesh.cube(3))
+    other = dv.Model(dv.mesh.cube(3, split="kuhn"))
     raises(lambda: step_with(other, "mu", 1.0), "x", r"\[8, 3\]")
 
 
@@ -314,7 +314,7 @@ def test_debug_checks_change_nothing_in_a_sound_step(device: str) -> None:
 
 @pytest.mark.parametrize("adjoint", ["full", {}, 0, dv.ReverseSweep])
 def test_a_rollout_refuses_what_is_no_adjoint(adjoint: Any) -> None:
-    model = dv.Model(dv.mesh.cube())
+    model = dv.Model(dv.mesh.cube(split="kuhn"))
     x = model.rest_points
     with pytest.raises(TypeError, match="adjoint: expected a diffvbd.ReverseSweep, Unrolled or GlobalAdjoint, got"):
         dv.rollout(model, x, 0 * x, steps=2, mu=1e4, lam=1e4, time_step=0.01, sweeps=1, adjoint=adjoint)

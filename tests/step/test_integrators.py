@@ -24,7 +24,7 @@ def random(*key: Any, shape: Any) -> Tensor:
 
 
 def beam(**options: Any) -> dv.Model:
-    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15))
+    mesh = dv.mesh.beam(7, 3, 3, (0.6, 0.15, 0.15), "kuhn")
     return dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, relaxation=1.5, **options)
 
 
@@ -67,7 +67,7 @@ def test_free_fall_is_exact(device: str, integrator: Any, rigid: bool) -> None:
 @pytest.mark.parametrize("integrator", EVERY, ids=str)
 def test_momentum_and_energy_of_a_free_body(integrator: Any) -> None:
     """A stretched cube vibrates: its momentum stays, and in 1,000 steps its energy never rises above its start."""
-    model = dv.Model(dv.mesh.cube(3, size=0.2), rigid=False)
+    model = dv.Model(dv.mesh.cube(3, 0.2, "kuhn"), rigid=False)
     x = model.rest_points * torch.tensor([1.1, 0.95, 0.97], dtype=torch.float64)
     v = 0.1 * random("momentum", shape=x.shape)
     options: dict[str, Any] = {"time_step": 0.004, "sweeps": 60, "gravity": (0.0, 0.0, 0.0), **MATERIAL}

@@ -40,7 +40,7 @@ def flown(model: dv.Model, mu: float, sweeps: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("mu", (1e5, 1e7))
 def test_free_flight(device: str, mu: float) -> None:
-    model = dv.Model(dv.mesh.cube(4, size=0.2), device=device)
+    model = dv.Model(dv.mesh.cube(4, size=0.2, split="kuhn"), device=device)
     for sweeps in (1, 2, 5, 20):
         lost, left = flown(model, mu, sweeps)
         assert lost <= tolerance("rigid_momentum")
@@ -52,7 +52,7 @@ def test_free_flight(device: str, mu: float) -> None:
 def test_spin_of_a_stiff_body_by_each_integrator() -> None:
     """Where a step does not resolve the vibrations that hold a body together, BDF2 keeps its order; SDIRK2 falls to the
     first, as it does for a rigid pendulum, and loses half of the spin that implicit Euler does."""
-    model = dv.Model(dv.mesh.cube(2, size=0.2))
+    model = dv.Model(dv.mesh.cube(2, size=0.2, split="kuhn"))
 
     def lost(mu: float, integrator: Any, steps: int) -> float:
         x, v = spinning(model)
@@ -71,7 +71,7 @@ def test_spin_of_a_stiff_body_by_each_integrator() -> None:
 @pytest.mark.parametrize("mu", (1e3, 1e9))
 def test_free_fall_is_exact(device: str, mu: float) -> None:
     """x_n = x_0 + g h^2 n (n + 1) / 2, of a stiff body too, which few sweeps from x + h v hardly move."""
-    model = dv.Model(dv.mesh.cube(3), device=device)
+    model = dv.Model(dv.mesh.cube(3, split="kuhn"), device=device)
     n, h = 20, 0.01
     for sweeps in SWEEPS:
         x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
@@ -83,7 +83,7 @@ def test_free_fall_is_exact(device: str, mu: float) -> None:
 
 def test_each_body_falls_by_itself(device: str) -> None:
     """Bodies are the connected sets of tets, whatever their labels; one with a pinned vertex is left to the sweeps."""
-    mesh = dv.mesh.replicate(dv.mesh.cube(2), [[0, 0, 0], [3, 0, 0], [6, 0, 0]])
+    mesh = dv.mesh.replicate(dv.mesh.cube(2, split="kuhn"), [[0, 0, 0], [3, 0, 0], [6, 0, 0]])
     mesh = dv.TetMesh(mesh.points, mesh.tets)  # one label
     model = dv.Model(mesh, pinned=[0], device=device)
     x = model.rest_points.clone()
@@ -97,7 +97,12 @@ def test_each_body_falls_by_itself(device: str) -> None:
 
 def test_a_body_of_thousands_among_small_ones(device: str) -> None:
     """Bodies of all sizes go together: on CUDA each size has its own team of threads."""
-    parts = [dv.mesh.cube(27), dv.mesh.cube(2), dv.mesh.cube(9), dv.mesh.cube(2)]  # 19,683, 8, 729 and 8 vertices
+    parts = [
+        dv.mesh.cube(27, split="kuhn"),
+        dv.mesh.cube(2, split="kuhn"),
+        dv.mesh.cube(9, split="kuhn"),
+        dv.mesh.cube(2, split="kuhn"),
+    ]  # 19,683, 8, 729 and 8 vertices
     mesh = dv.mesh.join([part.translate((2.0 * i, 0.0, 0.0)) for i, part in enumerate(parts)])
     model = dv.Model(mesh, device=device)
     x = model.rest_points.clone()
@@ -117,13 +122,13 @@ def test_a_body_of_thousands_among_small_ones(device: str) -> None:
 
 
 def test_float32_falls_and_flies(device: str) -> None:
-    model = dv.Model(dv.mesh.cube(4, size=0.2), dtype=torch.float32, device=device)
+    model = dv.Model(dv.mesh.cube(4, size=0.2, split="kuhn"), dtype=torch.float32, device=device)
     lost, left = flown(model, 1e5, 5)
     assert lost <= tolerance("rigid_momentum_float32") and abs(left - 0.7548) <= tolerance("rigid_spin")
 
 
 def test_it_can_be_left_out(device: str) -> None:
-    mesh = dv.mesh.cube(3)
+    mesh = dv.mesh.cube(3, split="kuhn")
     model = dv.Model(mesh, rigid=False, device=device)
     assert not model.corrects and dv.Model(mesh, device=device).corrects
     assert not dv.Model(mesh, pinned=[0], device=device).corrects  # there is no free body

@@ -15,7 +15,7 @@ import diffvbd as dv
 from diffvbd.viz import clock, motion, opened, values
 from diffvbd.viz.scenery import scenery_of
 
-MESH = dv.mesh.join([dv.mesh.cube(2, 0.2), dv.mesh.cube(2, 0.2).translate((0.0, 0.5, 0.0))])
+MESH = dv.mesh.join([dv.mesh.cube(2, 0.2, split="kuhn"), dv.mesh.cube(2, 0.2, split="kuhn").translate((0.0, 0.5, 0.0))])
 MODEL = dv.Model(MESH, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)))
 X = MODEL.rest_points
 STEP = 0.01

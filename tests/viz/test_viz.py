@@ -11,7 +11,7 @@ import torch
 import diffvbd as dv
 from diffvbd import losses, viz
 
-MESH = dv.mesh.cube(3, 0.1)
+MESH = dv.mesh.cube(3, 0.1, split="kuhn")
 MOTION = np.stack([MESH.points, MESH.points + 0.01])
 
 
