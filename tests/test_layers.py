@@ -63,6 +63,7 @@ OPTIONAL = {
     "scipy",
     "trimesh",
     "viser",
+    "websockets",
 }  # packages of extras
 # Both only when they are asked: Model.memory() for what a rollout would take, diffvbd.contact for what users call.
 UPWARD = {("model.model", "rollout.memory"), ("contact", "inspect.contact")}
