@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.mesh.write import replace
 from diffvbd.tasks import archive
 
 MOST_STEPS = 10**7  # beyond, a typing error is likelier than patience
@@ -120,8 +121,12 @@ class Observation:
         if s.coarse:
             values["coarse"] = 1.0
         values |= self.truth
-        with open(path, "wb") as file:
-            np.savez_compressed(file, **values)
+
+        def write(new: Path) -> None:
+            with new.open("wb") as file:  # numpy adds .npz to other names
+                np.savez_compressed(file, **values)
+
+        replace(Path(path), write)
 
     @classmethod
     def load(cls, path: str | Path, mesh: dv.TetMesh, **overrides: Any) -> "Observation":

@@ -267,6 +267,18 @@ def test_motions_of_a_run_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "log",
+    ["[" * 10**5, '{"history": 3}', '{"history": [3]}', '{"history": [{"loss": "x"}]}'],
+    ids=["nested too deep", "no rows", "no row", "no loss"],
+)
+def test_the_log_of_a_run_that_is_none_is_refused(log: str, tmp_path: Path) -> None:
+    motion.save_motions(tmp_path / opened.MOTION, MESH.surface, {"target": X[None]}, STEP)
+    (tmp_path / "log.json").write_text(log)
+    with pytest.raises(ValueError, match="log.json: expected the log of a run, got"):
+        opened.opened(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("name", "content", "kind", "expected"),
     [
         ("none.pvd", None, FileNotFoundError, "none.pvd does not exist: expected a .pvd, a mesh"),
