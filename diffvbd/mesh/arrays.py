@@ -19,6 +19,11 @@ def check_mesh(mesh: Any) -> None:
         raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
 
 
+def check_flag(name: str, value: Any) -> None:
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name}: expected a bool, got {type(value).__name__}")
+
+
 def to_path(name: str, path: Any) -> Path:
     """A file that a user names."""
     if not isinstance(path, (str, PathLike)):

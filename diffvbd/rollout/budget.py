@@ -301,7 +301,7 @@ def finer_mesh(p: Pilots) -> Pilots:
         fail("mesh", "False beside an Anchor, which holds single vertices", "True")
     tets, pinned = model.tets.cpu(), model.pinned.cpu()
     ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
-    options = {"pinned": torch.cat([pinned, pinned[ends].all(1)]), "energies": model.energies,
+    options = {"pinned": torch.cat([pinned, pinned[ends].all(1)]) if pinned.any() else None, "energies": model.energies,
                "saturation": model.saturation, "regularization": model.regularization,
                "colliders": model.colliders, "dtype": model.dtype, "device": model.device}  # fmt: skip
     fine = Model(subdivide(model.mesh), density=model.density.cpu().repeat_interleave(8), **options)

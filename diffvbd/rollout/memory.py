@@ -60,7 +60,10 @@ def predict(
         ValueError, TypeError: For what ReverseSweep or rollout would refuse; it names the argument.
     """
     item = model._mass.element_size()
-    steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
+    steps, scenes, sweeps = check_count("steps", steps), check_count("scenes", scenes), check_count("sweeps", sweeps)
+    for name, asked in (("material", material), ("rest", rest)):
+        if not isinstance(asked, bool):
+            raise TypeError(f"{name}: expected a bool, got {type(asked).__name__}")
     scheme = check_integrator(integrator)
     solves = solves_of(scheme)
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]

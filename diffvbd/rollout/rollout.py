@@ -15,6 +15,7 @@ from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_count, check_function, fail, is_word
 from ..model.model import Model
 from ..model.warnings import warn_of_inverted_bodies, warn_of_material
+from ..said import is_own
 from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, step_settings
@@ -212,7 +213,7 @@ def rollout(
             except (ValueError, TypeError) as error:
                 if type(error) not in (ValueError, TypeError):  # another one may take other arguments
                     raise
-                raise type(error)(f"{error} (in step {k})") from error
+                raise type(error)(f"{error} (in step {k})") from (None if is_own(error) else error)
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)

@@ -65,8 +65,9 @@ class Scene:
             energies += (dv.FloorBarrier(height=self.floor, kappa=self.kappa, dhat=self.dhat),)
         if self.friction is not None:
             energies += (dv.Friction(self.friction),)
-        options: dict[str, Any] = {"density": self.density, "pinned": self.pinned, "relaxation": self.relaxation}
+        options: dict[str, Any] = {"density": self.density, "relaxation": self.relaxation}
         options |= {"coarse": "auto"} if self.coarse else {}
+        options |= {"pinned": self.pinned} if self.pinned.any() else {}
         return dv.Model(self.mesh, energies=energies, **options).to(device)
 
     def simulate(
