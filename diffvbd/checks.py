@@ -31,6 +31,11 @@ def is_word(value: Any, *words: str) -> bool:
     return isinstance(value, str) and value in words
 
 
+def check_bool(name: str, value: Any) -> None:
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}: expected a bool, got {type(value).__name__}")
+
+
 def check_dtype(value: Any) -> None:
     """Raises unless ``value`` is a dtype that kernels compute in."""
     if not isinstance(value, torch.dtype) or value not in (torch.float64, torch.float32):

@@ -11,7 +11,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.anderson import combinations_of, cycles_of
 from ..adjoint.routes import ReverseSweep
-from ..checks import check_count, is_word
+from ..checks import check_bool, check_count, is_word
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
 from ..step.contact_cycles import sweeps_of_parts
@@ -62,8 +62,7 @@ def predict(
     item = model._mass.element_size()
     steps, scenes, sweeps = check_count("steps", steps), check_count("scenes", scenes), check_count("sweeps", sweeps)
     for name, asked in (("material", material), ("rest", rest)):
-        if not isinstance(asked, bool):
-            raise TypeError(f"{name}: expected a bool, got {type(asked).__name__}")
+        check_bool(name, asked)
     scheme = check_integrator(integrator)
     solves = solves_of(scheme)
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ from ..checks import (
     check_broadcast,
     check_count,
     check_kind,
+    check_readable,
     check_tensor,
     check_time_step,
     fail,
@@ -284,9 +285,10 @@ def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
     """Raises for the first tensor or number among arguments of a step that is, or holds, what is not finite."""
     for name, value in arguments.items():
         read = not name.startswith("prescribed") or model.num_active < model.num_vertices  # only where pinned
-        if isinstance(value, NUMBERS) and read and not math.isfinite(value):
+        if isinstance(value, NUMBERS) and read and not math.isfinite(to_float(name, value)):
             fail(name, "finite values", value)
         if isinstance(value, Tensor):
+            check_readable(name, value)
             good = torch.isfinite(value)
             if name.startswith("prescribed"):  # read only where pinned
                 value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]

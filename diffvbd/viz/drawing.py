@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from diffvbd.mesh.arrays import to_numpy
+
 COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
 OTHER = "#8c8c8c"
 BODIES = ("#4c78a8", "#e4704f", "#4f9d5b")
@@ -140,7 +142,10 @@ def as_array(values: Any) -> NDArray[np.float64]:
 
 def check_surface(surface: Any, vertices: int) -> None:
     """Raises ValueError for what is not a list of triangles of so many vertices."""
-    shape, last = list(np.shape(surface)), np.max(surface, initial=-1)
+    surface = to_numpy("surface", surface)
+    if surface.size and surface.dtype.kind not in "iu":
+        raise TypeError(f"surface: expected integers, got dtype {surface.dtype}")
+    shape, last = list(surface.shape), surface.max(initial=-1)
     if len(shape) != 2 or shape[1] != 3 or last >= vertices:
         raise ValueError(
             f"surface: expected triangles [F, 3] of {vertices} vertices, got shape {shape} with indices up to {last}"
@@ -155,6 +160,8 @@ def motions_as_arrays(
     Raises:
         ValueError: another shape, another N than there are times, or a surface of other vertices.
     """
+    if not isinstance(motions, Mapping):
+        raise TypeError(f"motions: expected positions by name, got {type(motions).__name__}")
     frames = {name: as_array(motion) for name, motion in motions.items()}
     for name, motion in frames.items():
         if motion.ndim != 3 or motion.shape[-1] != 3 or times not in (None, len(motion)):
