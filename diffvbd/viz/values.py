@@ -139,6 +139,8 @@ class Values:
         tets = self.model.num_tets if self.model is not None else int(self._tets_of(motion, what).max()) + 1
         if self.model is not None and len(values) not in (1, tets) or len(values) not in (1,) and len(values) < tets:
             fail(name, f"a number or one for each of {tets} tets", f"shape {list(as_array(value).shape)}")
+        if not np.isfinite(values).all():
+            fail(name, "finite numbers", float(values[~np.isfinite(values)][0]))
         return values
 
     def _stiffness(self, motion: Motion) -> NDArray[np.float64]:

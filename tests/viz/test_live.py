@@ -124,6 +124,7 @@ def test_levels_span_the_legend() -> None:
         ("stress", {}, r"color: stress needs a dv.Model, or a mesh with mu and lam \[Pa\], got neither"),
         ("stress", {"model": MODEL, "mu": 1.0}, r"color: stress needs lam \[Pa\], got None"),
         ("stiffness", {"model": MODEL}, r"color: stiffness needs mu \[Pa\]"),
+        ("stiffness", {"model": MODEL, "mu": float("nan")}, "mu: expected finite numbers, got nan"),
         ("stiffness", {"model": MODEL, "mu": np.ones(3)}, "mu: expected a number or one for each of 12 tets"),
         ("contact", {}, "color: contact needs a dv.Model"),
     ],
