@@ -44,8 +44,9 @@ def _numbers(name: str, value: Any) -> Tensor:
         fail(name, "numbers that a float can hold", "an integer beyond 1.8e308")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{name}: expected numbers, got {value!r}") from None
-    if not bool(torch.isfinite(out).all()):
-        fail(name, "finite numbers", value)
+    good = torch.isfinite(out)
+    if not bool(good.all()):
+        fail(name, "finite numbers", float(out[~good][0]) if isinstance(value, Tensor) else value)
     return out
 
 

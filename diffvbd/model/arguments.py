@@ -75,7 +75,7 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
     try:
         density = torch.as_tensor(density).detach().cpu()
     except TypeError:  # of numpy's objects and strings
-        raise TypeError(f"density: expected real numbers, got dtype {density.dtype}") from None
+        raise TypeError(f"density: expected real numbers, got {type(density).__name__}") from None
     if density.is_complex():
         raise TypeError(f"density: expected real numbers, got dtype {density.dtype}")
     density = density.to(torch.float64)

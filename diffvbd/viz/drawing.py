@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import to_numpy
+from diffvbd.checks import check_count, check_positive
+from diffvbd.mesh.arrays import float_array, to_numpy
 
 COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
 OTHER = "#8c8c8c"
@@ -80,8 +81,10 @@ def draw(
 
 def floor(low: Sequence[float], high: Sequence[float], height: float = 0.0, cells: int = 8) -> Scenery:
     """A floor: the rectangle from (low x, low z) to (high x, high z) [m] at a height [m]."""
-    x, z = np.linspace(low[0], high[0], cells + 1), np.linspace(low[-1], high[-1], cells + 1)
-    points = np.stack(np.meshgrid(x, [height], z, indexing="ij"), -1).reshape(-1, 3)
+    cells = check_count("cells", cells, 1, 10_000)
+    first, last = (float_array(name, value, (None,)) for name, value in (("low", low), ("high", high)))
+    x, z = (np.linspace(first[k], last[k], cells + 1) for k in (0, -1))
+    points = np.stack(np.meshgrid(x, float_array("height", height, ()), z, indexing="ij"), -1).reshape(-1, 3)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"))
     a = i * (cells + 1) + j
     b, c, d = a + 1, a + cells + 2, a + cells + 1
@@ -90,7 +93,8 @@ def floor(low: Sequence[float], high: Sequence[float], height: float = 0.0, cell
 
 def box(low: Sequence[float], high: Sequence[float], color: str = SCENERY) -> Scenery:
     """A box between two corners [m], open above."""
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
+    ends = float_array("low", low, (3,)), float_array("high", high, (3,))
+    corners = np.stack(np.meshgrid(*zip(*ends, strict=True), indexing="ij"), -1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
     return Scenery(corners, np.array(triangles), color)
@@ -98,7 +102,7 @@ def box(low: Sequence[float], high: Sequence[float], color: str = SCENERY) -> Sc
 
 def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = SCENERY) -> Scenery:
     """All points within a radius [m] of the segment from a to b [m]; a ball if a = b."""
-    start, end = as_array(a), as_array(b)
+    start, end, radius = float_array("a", a, (3,)), float_array("b", b, (3,)), check_positive("radius", radius, "m")
     along = end - start
     length = np.linalg.norm(along)
     axis = along / length if length > 0 else np.array([0.0, 1.0, 0.0])

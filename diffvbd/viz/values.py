@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..checks import fail
+from ..checks import fail, is_word
 from ..inspect.forces import forces, stress
 from ..model.model import Model
 from .drawing import as_array
@@ -85,7 +85,7 @@ class Values:
         Raises:
             ValueError: an unknown name, or a quantity that these arguments do not tell.
         """
-        if name not in QUANTITIES:
+        if not is_word(name, *QUANTITIES):
             fail("color", f"one of {', '.join(QUANTITIES)}", repr(name))
         kept = self._kept.get((id(motion), name))
         if kept is not None and kept[0] is motion:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from ..checks import check_count, fail
+from ..checks import check_count, fail, is_word
 from ..rollout.trajectory import Trajectory
 from ..scopes import record_to
 from .clock import DELAY, Clock, Rerun
@@ -91,7 +91,7 @@ class Viewer:
 
     @color.setter
     def color(self, name: str) -> None:
-        if name not in QUANTITIES:
+        if not is_word(name, *QUANTITIES):
             fail("color", f"one of {', '.join(QUANTITIES)}", repr(name))
         self._told("color", name)
 

@@ -142,7 +142,7 @@ def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype:
         assert sizes[1] - sizes[0] == tape_bytes
 
 
-@pytest.mark.parametrize(("name", "value"), [("sweeps", None), ("sweeps", 1.5), ("material", 1), ("rest", None)])
+@pytest.mark.parametrize(("name", "value"), [("sweeps", None), ("material", 1), ("rest", None)])
 def test_bad_arguments_are_named(name: str, value: Any) -> None:
     with pytest.raises(TypeError, match=f"^{name}: expected"):
         beam_model().memory(**{"sweeps": 3, name: value})
