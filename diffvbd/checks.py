@@ -17,7 +17,9 @@ NUMBERS = (int, float, np.floating, np.integer)  # bool, which python counts amo
 
 
 def fail(name: str, expected: str, got: Any) -> NoReturn:
-    raise ValueError(f"{name}: expected {expected}, got {got}")
+    first, *more = f"{got}".split("\n")  # an array may take many lines
+    # what was caught before this says no more
+    raise ValueError(f"{name}: expected {expected}, got {first}{' ...' if more else ''}") from None
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:
@@ -29,6 +31,11 @@ def check_kind(name: str, value: Any, kind: type) -> None:
 def is_word(value: Any, *words: str) -> bool:
     """Whether a value is one of some words. An array is none: == would compare its numbers, one by one."""
     return isinstance(value, str) and value in words
+
+
+def check_bool(name: str, value: Any) -> None:
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}: expected a bool, got {type(value).__name__}")
 
 
 def check_dtype(value: Any) -> None:
@@ -135,7 +142,8 @@ def check_count(name: str, value: Any, minimum: int = 0, maximum: int | None = N
     try:
         value = operator.index(value)
     except TypeError:
-        raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {value!r}") from None
+        number = "" if hasattr(value, "shape") else f" {value!r}"  # an array would take many lines
+        raise TypeError(f"{name}: expected an integer, got {type(value).__name__}{number}") from None
     if value < minimum:
         fail(name, f"an integer >= {minimum}", value)
     if maximum is not None and value > maximum:
@@ -241,4 +249,4 @@ def name_value(name: str, expected: str, value: Tensor, good: Tensor, axes: tupl
         at = (~good).nonzero()[0].tolist()
         got = float(value.detach()[tuple(at)])  # of a tensor that requires grad float() warns
         where = " of ".join(f"{axis} {k}" for axis, k in zip(axes[::-1], at[::-1], strict=True)) if axes else at
-        raise ValueError(f"{name}: expected {expected}, got {got:g} at {where}")
+        raise ValueError(f"{name}: expected {expected}, got {got:g} at {where}") from None

@@ -82,7 +82,7 @@ def given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
              "integrator", "coarse")  # fmt: skip
     values = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     for name, value in values.items():
-        if not isinstance(value, str) and not np.isfinite(value).all():
+        if not isinstance(value, (str, int)) and not np.isfinite(value).all():
             raise ValueError(f"--{name.replace('_', '-')}: expected finite numbers, got {value}")
     if options.pin:
         values["pinned"] = np.logical_or.reduce([side(mesh.points, text) for text in options.pin])

@@ -9,8 +9,8 @@ from typing import Any
 
 import diffvbd as dv
 from diffvbd.scopes import record_to
+from diffvbd.viz.server import require_viser
 from diffvbd.viz.values import QUANTITIES
-from diffvbd.viz.viewer import require_viser
 
 PORT = 8080
 

@@ -37,13 +37,16 @@ def _numbers(name: str, value: Any) -> Tensor:
         check_readable(name, value)
     try:
         given = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
+        if given.is_complex():  # whose real part is what .to() would take
+            raise TypeError
         out = given.detach().to(torch.float64)
     except OverflowError:
         fail(name, "numbers that a float can hold", "an integer beyond 1.8e308")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{name}: expected numbers, got {value!r}") from None
-    if not bool(torch.isfinite(out).all()):
-        fail(name, "finite numbers", value)
+    good = torch.isfinite(out)
+    if not bool(good.all()):
+        fail(name, "finite numbers", float(out[~good][0]) if isinstance(value, Tensor) else value)
     return out
 
 
@@ -112,9 +115,15 @@ class VertexEnergy:
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        """What it adds to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). The rigid
-        correction of bodies in contact solves with these."""
-        raise NotImplementedError(f"{type(self).__name__} has no blocks() for bodies in contact")
+        """What it adds to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). Coarse corrections in
+        contact solve with these. Here they are the derivative of gradient()."""
+        differentiated = torch.is_grad_enabled()
+        with torch.enable_grad():
+            at = x.view_as(x) if x.requires_grad else x.detach().requires_grad_()
+            force = self.gradient(at, x_prev, data, h, origin)
+            columns = [torch.autograd.grad(force[..., c].sum(), at, retain_graph=True, create_graph=differentiated)[0]
+                       for c in range(3)]  # fmt: skip
+        return torch.stack(columns, -1)
 
 
 def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import traceback
 import warnings
 from pathlib import Path
 
@@ -27,6 +28,12 @@ def page(name: str) -> str:
 def percent(share: float) -> str:
     """A share [-] with two digits, as "0.52 %", "17 %" or "220 %"."""
     return f"{100 * share:.2g} %" if 100 * share < 99.5 else f"{100 * share:.0f} %"
+
+
+def is_own(error: BaseException) -> bool:
+    """Whether an error, from where it was caught on, has come through this package and torch alone: through no
+    function of a user."""
+    return all(frame.f_code.co_filename.startswith(_INSIDE) for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from .. import ops
-from ..checks import check_count, check_positive, fail, is_word
+from ..checks import check_bool, check_count, check_positive, fail, is_word
 
 # Up to which bytes of a step's full tape "auto" keeps it: these, or on CUDA this share of the device's memory if that
 # is more.
@@ -112,8 +112,7 @@ class GlobalAdjoint:
     report: Callable[[LinearSolve], object] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.assembled, bool):
-            raise TypeError(f"assembled: expected a bool, got {type(self.assembled).__name__}")
+        check_bool("assembled", self.assembled)
         if self.tolerance is not None and check_positive("tolerance", self.tolerance) >= 1:
             fail("tolerance", "a number in (0, 1)", self.tolerance)
         if self.max_iterations is not None:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ..checks import check_count, check_number, check_positive, fail, refuse_gradients
+from ..checks import check_bool, check_count, check_number, check_positive, fail, refuse_gradients
 from ..mask import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
@@ -77,8 +77,7 @@ class PairBarrier:
         object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
         object.__setattr__(self, "damping", check_number("damping", self.damping))
         for name in ("self_contact", "between_bodies"):
-            if not isinstance(getattr(self, name), bool):
-                raise TypeError(f"{name}: expected a bool, got {type(getattr(self, name)).__name__}")
+            check_bool(name, getattr(self, name))
         if self.detections is not None:
             object.__setattr__(self, "detections", check_count("detections", self.detections, 1, 1000))
         if self.reach is not None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from ..checks import check_positive, fail
+from ..checks import check_bool, check_broadcast, check_positive, check_tensor, fail, name_value
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
@@ -154,7 +154,11 @@ def diagnose(
     |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
     """
     lead = check_state(model, x, x)
+    check_bool("warn", warn)
     mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    for name, value in (("mu", mu), ("lam", lam)):
+        value = check_broadcast(name, check_tensor(name, value, model._mass), (*lead, model.num_tets), len(lead))
+        name_value(name, "finite values", value, torch.isfinite(value))
     check_previous(model, previous, x, time_step)
     errors = unbalanced = residuals = friction = None
     if previous is None and sweeps is not None:

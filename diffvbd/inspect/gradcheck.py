@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_bool, check_count, check_number, check_positive, fail
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,15 @@ def check_gradients(
     """
     if not isinstance(arguments, dict):
         raise TypeError(f"arguments: expected a dict of tensors by name, got {type(arguments).__name__}")
+    if not all(isinstance(name, str) for name in arguments):
+        raise TypeError(f"arguments: expected a dict of tensors by name, got the keys {[*arguments]}")
+    if not callable(loss):
+        raise TypeError(f"loss: expected a function of {', '.join(arguments)}, got {type(loss).__name__}")
+    if isinstance(relative_steps, str) or not isinstance(relative_steps, Sequence) or not relative_steps:
+        raise TypeError(f"relative_steps: expected a sequence of numbers > 0, got {relative_steps!r}")
+    relative_steps = [check_positive("relative_steps", step) for step in relative_steps]
+    check_bool("verbose", verbose)
+    tolerance, seed = check_number("tolerance", tolerance), check_count("seed", seed, maximum=2**63 - 1)
     for name, value in arguments.items():
         if not isinstance(value, Tensor) or value.dtype != torch.float64:
             fail(name, "a float64 tensor", getattr(value, "dtype", type(value).__name__))

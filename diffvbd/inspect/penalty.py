@@ -168,7 +168,7 @@ def center_of_mass_penalty(
     scenes = math.prod(lead)
     if max_pairs is None:
         max_pairs = PAIRS_PER_BODY * (x.shape[-2] if bodies is None else bodies.count) * scenes
-    max_pairs = check_count("max_pairs", max_pairs)
+    max_pairs = check_count("max_pairs", max_pairs, maximum=2**62)
     centers = x.reshape(scenes, x.shape[-2], 3)
     if bodies is not None:
         centers = bodies.centers(centers)

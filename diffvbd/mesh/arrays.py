@@ -19,6 +19,11 @@ def check_mesh(mesh: Any) -> None:
         raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
 
 
+def check_flag(name: str, value: Any) -> None:
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name}: expected a bool, got {type(value).__name__}")
+
+
 def to_path(name: str, path: Any) -> Path:
     """A file that a user names."""
     if not isinstance(path, (str, PathLike)):
@@ -28,10 +33,10 @@ def to_path(name: str, path: Any) -> Path:
 
 def to_numpy(name: str, array: Any) -> NDArray[Any]:
     """`array` as a numpy array; torch tensors are detached and brought to the CPU first (torch is not imported)."""
-    if hasattr(array, "detach"):
-        array = array.detach().cpu()
     try:
-        return np.asarray(array)
+        return np.asarray(array.detach().cpu() if hasattr(array, "detach") else array)
+    except (TypeError, RuntimeError):  # of sparse tensors and those of the meta device
+        raise TypeError(f"{name}: expected numbers in a dense array, got {type(array).__name__}") from None
     except ValueError as failure:
         if "inhomogeneous" not in str(failure):
             raise

@@ -11,6 +11,7 @@ from diffvbd.mesh.arrays import IntArray, check_mesh, float_array
 from diffvbd.mesh.tet_mesh import TetMesh
 
 # Edges of a tet; edge k has its midpoint at slot 4 + k of the ten-node tet below.
+MOST_TETS = 10**9  # of a mesh that is refined
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 _CORNER_TETS = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
 # The inner octahedron has three diagonals, between midpoints of opposite edges. Each row: the four tets around one.
@@ -43,6 +44,8 @@ def subdivide(mesh: TetMesh, levels: int = 1) -> TetMesh:
         raise TypeError(f"levels: expected an integer, got {levels!r}")
     if levels < 0:
         raise ValueError(f"levels: expected 0 or more, got {levels}")
+    if mesh.num_tets * 8 ** min(levels, 11) > MOST_TETS:
+        raise ValueError(f"levels: expected at most {MOST_TETS} tets, got {mesh.num_tets} times 8^{levels}")
     for _ in range(levels):
         mesh = _refined(mesh)
     return mesh

@@ -10,7 +10,7 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import IntArray, float_array, to_path
+from diffvbd.mesh.arrays import IntArray, check_flag, float_array, to_path
 from diffvbd.mesh.tet_mesh import TetMesh, oriented
 from diffvbd.mesh.write import PREFERRED_FORMAT, quiet
 
@@ -46,6 +46,7 @@ def load(
         ValueError: unreadable or truncated file, unknown format, no tets in it, or tets that TetMesh refuses.
         ImportError: the format needs a package that is not installed.
     """
+    check_flag("return_vertices", return_vertices)
     _, mesh, vertices, _ = _tets_of(to_path("path", path), orient)
     return (mesh, vertices) if return_vertices else mesh
 
@@ -100,6 +101,7 @@ def _rows(path: Path, label: str, values: Any, rows: int) -> NDArray[Any]:
 
 def _tets_of(path: Path, orient: bool) -> tuple[meshio.Mesh, TetMesh, IntArray, list[int]]:
     """A file's content, its mesh, the index in the file of each vertex [V], and the blocks of tets."""
+    check_flag("orient", orient)
     content = _read(path)
     blocks = [k for k, cells in enumerate(content.cells) if cells.type in ("tetra", "tetra10")]
     found = [content.cells[k].data[:, :4] for k in blocks]

@@ -95,7 +95,7 @@ def repair(
 
     Source: Dawson-Haggerty et al., trimesh, https://trimesh.org.
     """
-    if up not in _TO_Y:
+    if not isinstance(up, str) or up not in _TO_Y:
         raise ValueError(f"up: expected one of {', '.join(_TO_Y)}, got {up!r}")
     if size is not None and scale is not None:
         raise ValueError(f"size: expected none beside scale = {scale!r}, got {size!r}")

@@ -16,7 +16,7 @@ from diffvbd.mesh.gltf import write_gltf
 from diffvbd.mesh.parts import parts_of
 from diffvbd.mesh.tet_mesh import TetMesh
 from diffvbd.mesh.usd import require_usd, write_usd
-from diffvbd.mesh.write import checked_fields, content_of, quiet, vtu_names
+from diffvbd.mesh.write import checked_fields, content_of, quiet, replace, vtu_names
 
 USD = (".usd", ".usda", ".usdc")
 GLTF = (".glb", ".gltf")
@@ -83,11 +83,11 @@ def write_series(
     if (np.diff(moments) <= 0).any():
         raise ValueError(f"times: expected increasing times for {extension}, got two that are equal")
     if extension in USD:
-        write_usd(path, parts_of(mesh), positions, moments, of_vertices)
+        replace(path, lambda new: write_usd(new, parts_of(mesh), positions, moments, of_vertices))
         return
     if of_vertices:
         raise ValueError(f"point_data: expected none, because {extension} files hold no values that change in time")
-    write_gltf(path, parts_of(mesh), positions, moments)
+    replace(path, lambda new: write_gltf(new, parts_of(mesh), positions, moments))
 
 
 def check_extension(path: Path, name: str = "path") -> str:
@@ -117,11 +117,11 @@ def _write_pvd(
         )
         content = content_of(mesh, points, of_vertices, of_tets)
         target = path.with_name(name)
-        quiet(lambda content=content, target=target: content.write(target), f"write {target}")
+        quiet(lambda content=content, target=target: replace(target, content.write), f"write {target}")
         entries.append(f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>\n')
-    path.write_text(
+    collection = (
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
         + "".join(entries)
-        + "  </Collection>\n</VTKFile>\n",
-        encoding="utf-8",
+        + "  </Collection>\n</VTKFile>\n"
     )
+    replace(path, lambda new: new.write_text(collection, encoding="utf-8"))

@@ -14,6 +14,7 @@ from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array
 from diffvbd.mesh.tet_mesh import TetMesh
 
 Split = Literal["kuhn", "five"]
+MOST = 10**6  # vertices in a row
 
 # Corner k of a cell lies at ((k >> 2) & 1, (k >> 1) & 1, k & 1). Kuhn: one tet per order of walking the axes from
 # corner 0 to corner 7. Five: one regular tet and four corners; odd cells are mirrored so that faces match.
@@ -26,8 +27,9 @@ def count(name: str, value: Any, least: int) -> int:
     """`value` as an int of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"{name}: expected an integer, got {value!r}")
-    if value < least:
-        raise ValueError(f"{name}: expected at least {least}, got {value}")
+    if not least <= value <= MOST:
+        bound = f"at least {least}" if value < least else f"at most {MOST}"
+        raise ValueError(f"{name}: expected {bound}, got {value}")
     return int(value)
 
 
@@ -63,7 +65,7 @@ def box(n: int | Sequence[int] = 2, size: float | Sequence[float] = 1.0, split: 
     if len(counts) != 3:
         raise ValueError(f"n: expected one number or three, got {len(counts)}")
     lengths = _lengths("size", size if np.ndim(size) else [size] * 3, 3)
-    if split not in ("kuhn", "five"):
+    if not isinstance(split, str) or split not in ("kuhn", "five"):
         raise ValueError(f'split: expected "kuhn" or "five", got {split!r}')
     axes = [np.linspace(0.0, extent, k) for extent, k in zip(lengths, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -84,7 +86,8 @@ def beam(
     nx: int = 21, ny: int = 7, nz: int = 7, size: Sequence[float] = (0.5, 0.2, 0.2), split: Split = "five"
 ) -> TetMesh:
     """Beam along x: a box of nx, ny, nz vertices per axis. Arguments and errors as for `box`."""
-    return box((nx, ny, nz), size, split)
+    counts = [count(name, n, 2) for name, n in (("nx", nx), ("ny", ny), ("nz", nz))]
+    return box(counts, size, split)
 
 
 def cube(n: int = 2, size: float = 1.0, split: Split = "five") -> TetMesh:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array, listed, to_numpy
+from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, float_array, int_array, listed, to_numpy
 from diffvbd.mesh.write import save
 
 # Faces of a positively oriented tet, wound so that their normals point out of it.
@@ -98,6 +98,7 @@ class TetMesh:
     """
 
     def __init__(self, points: Any, tets: Any, body: Any = None, *, orient: bool = False) -> None:
+        check_flag("orient", orient)
         points = points if to_numpy("points", points).size else np.empty((0, 3))
         tets = tets if to_numpy("tets", tets).size else np.empty((0, 4))
         self._points, self._tets = float_array("points", points, (None, 3)), int_array("tets", tets, (None, 4))

@@ -4,6 +4,8 @@
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,7 @@ def write_usd(
         ImportError: usd-core is not installed.
     """
     require_usd(path.suffix)
-    from pxr import Sdf, Usd, UsdGeom, Vt
+    from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
     velocities = point_data.get("velocities")
     if velocities is not None and velocities.shape != frames.shape:
@@ -73,8 +75,12 @@ def write_usd(
                 rows = values[k, part.vertices]
                 flat = np.ascontiguousarray(rows.ravel(), dtype=np.float32)
                 primvar.Set(vectors(rows) if is_vector else Vt.FloatArray.FromNumpy(flat), code)
-    if not stage.GetRootLayer().Export(str(path)):
-        raise OSError(f"cannot write {path}")
+    try:
+        written = stage.GetRootLayer().Export(str(path))
+    except Tf.ErrorException:
+        written = False
+    if not written:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))  # USD does not say which error it was
 
 
 def require_usd(extension: str) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from xml.sax.saxutils import escape
 
@@ -24,8 +26,8 @@ Result = TypeVar("Result")
 PREFERRED_FORMAT = {".msh": "gmsh"}
 # meshio would write these without a word, and without the tets.
 _NO_TETS = (".obj", ".off", ".ply", ".stl", ".svg", ".wkt")
-
-
+# meshio writes another file beside these, whose name follows from theirs.
+_OF_TWO_FILES = (".xdmf", ".xmf", ".node", ".ele")
 # What meshio writes values per vertex and per tet to. Into other formats it would write the mesh without them.
 _WITH_FIELDS = (".msh", ".vtk", ".vtu", ".xdmf")
 # How many columns values may have where not any number comes back: .vtk makes three of two.
@@ -80,7 +82,34 @@ def save(
         if extension == ".vtu":
             fields[kind] = vtu_names(values)
     content = content_of(mesh, mesh.points, **fields)
-    quiet(lambda: content.write(path, file_format=PREFERRED_FORMAT.get(extension)), f"write {path}")
+
+    def write(new: Path) -> None:
+        content.write(new, file_format=PREFERRED_FORMAT.get(extension))
+
+    quiet(lambda: write(path) if extension in _OF_TWO_FILES else replace(path, write), f"write {path}")
+
+
+def replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file as a whole: after an error, and after a crash, what was there before is still there.
+
+    Args:
+        path: The file.
+        write: Called with another path in the same folder, of the same extension, that takes the file's place.
+
+    Raises:
+        OSError: the disk is full, or the like; it names the file.
+    """
+    path = path.resolve()  # what a link points to is written, not the link
+    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        write(unfinished)
+        os.replace(unfinished, path)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def content_of(

@@ -21,7 +21,7 @@ def checked_device(device: torch.device | str) -> torch.device:
     """A device that there is an object for; "cuda" is the current one."""
     try:
         device = torch.device(device)
-    except (RuntimeError, TypeError):
+    except (RuntimeError, TypeError, ValueError):
         fail("device", '"cpu" or "cuda"', repr(device))
     if device.type not in ops.LANES:
         fail("device", '"cpu" or "cuda"', repr(str(device)))
@@ -72,7 +72,13 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
         check_readable("density", density)
     elif isinstance(density, int):
         density = to_float("density", density)
-    density = torch.as_tensor(density).detach().cpu().to(torch.float64)
+    try:
+        density = torch.as_tensor(density).detach().cpu()
+    except TypeError:  # of numpy's objects and strings
+        raise TypeError(f"density: expected real numbers, got {type(density).__name__}") from None
+    if density.is_complex():
+        raise TypeError(f"density: expected real numbers, got dtype {density.dtype}")
+    density = density.to(torch.float64)
     if density.shape not in ((), (1,), (num_tets,)):
         fail("density", f"a number or shape [{num_tets}]", f"shape {list(density.shape)}")
     if not bool((torch.isfinite(density) & (density > 0)).all()):

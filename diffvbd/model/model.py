@@ -134,7 +134,7 @@ class Model:
         self._arrange(points, tets, device)
         self._measure(points)
         self._arrange_coarse(device)
-        warn_of(self)
+        warn_of(self, pinned)
         self._place(dtype, device)
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:

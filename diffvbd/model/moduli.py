@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import NUMBERS, check_broadcast, check_dense, check_tensor, fail, name_value, to_float
+from ..checks import NUMBERS, check_broadcast, check_readable, check_tensor, fail, name_value, to_float
 from ..scopes import looks_at
 from .model import Model
 
@@ -106,7 +106,7 @@ def _alike(*values: Any) -> tuple[Any, ...]:
 def _value(name: str, value: Any) -> Any:
     """A number as a float, a tensor as it is."""
     if isinstance(value, Tensor):
-        check_dense(name, value)
+        check_readable(name, value)
         if not value.is_floating_point():
             raise TypeError(f"{name}: expected a number or a tensor of floating point, got {value.dtype}")
         return value

@@ -16,8 +16,8 @@ def replaced_arguments(model: Any, changes: dict[str, Any]) -> dict[str, Any]:
     same = ("saturation", "regularization", "relaxation", "start", "colliders", "coarse", "acceleration", "dtype",
             "device")  # fmt: skip
     own = {name: getattr(model, name) for name in same}
-    own |= {"density": model._density.cpu(), "pinned": model._pinned.cpu(), "energies": energies,
-            "rigid": model._asked_rigid}  # fmt: skip
+    pinned = model._pinned.cpu() if model._pinned.any() else None
+    own |= {"density": model._density.cpu(), "pinned": pinned, "energies": energies, "rigid": model._asked_rigid}
     if unknown := sorted(set(changes) - set(own)):
         raise TypeError(f"replace: expected arguments of Model ({', '.join(sorted(own))}), got {', '.join(unknown)}")
     return own | changes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -28,6 +28,8 @@ HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
+SOFTEST = 10.0  # [Pa] Young's modulus; soft gels have 100 Pa or more
+LONGEST_STEP = 1.0  # [s]
 
 # of a Model's _derived: what is said once, or ever more seldom
 THIN_SEEN, OVER_RELAXED, CONTACT_SEEN = "thin", "over-relaxed", "contact of rollouts"
@@ -35,10 +37,14 @@ HELD_UP, HELD_UP_SEEN, ERRATIC = "held up", "steps held up", "erratic gradients"
 ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, CONTACT_SEEN, HELD_UP, HELD_UP_SEEN, ERRATIC)
 
 
-def warn_of(model: Model) -> None:
-    """Warns (UserWarning) of what is legal and seldom meant."""
+def warn_of(model: Model, pinned: Any) -> None:
+    """Warns (UserWarning) of what is legal and seldom meant. ``pinned``: as it was given."""
     if size := _size_message(model.mesh):
         warn(size)
+    if pinned is not None and model.num_vertices and not bool(model._pinned.any()):
+        warn(f"pinned: none of {model.num_vertices} vertices is pinned, so all are free, as with pinned=None")
+    if model.num_vertices and bool(model._pinned.all()):
+        warn(f"pinned: all {model.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
     if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
         warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
     if model.relaxation > STABLE_RELAXATION:
@@ -110,6 +116,7 @@ def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sw
     """
     if sweeps == 0 or not model.mesh.num_tets:
         return
+    _warn_of_units(model, mu, lam, time_step)
     _warn_of_thin_tets(model, mu, lam, time_step, sweeps)
     _warn_of_over_relaxation(model, mu, lam)
     if model._derived.get(OVER_RELAXED) == 0:  # it has warned, of the same
@@ -140,6 +147,18 @@ def _with_settings(model: Model) -> list[Model]:
 def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
     """Whether over-relaxed sweeps of some tet may gain energy from step to step."""
     return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
+
+
+def _warn_of_units(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> None:
+    """Warns, in each call, of moduli and of a step that look as if they were in other units."""
+    if time_step >= LONGEST_STEP:
+        warn(f"time_step: {time_step:.4g} s is long for a step; times are in seconds: one of 1 ms is 0.001")
+    most = float(mu.detach().max()) if mu.numel() else 0.0
+    if not 0 < 2 * most < SOFTEST or not any(isinstance(e, StableNeoHookean) for e in model.energies):
+        return  # Young's modulus is 2 mu or more, unless Poisson's ratio is negative
+    young = float((mu * (3 * lam + 2 * mu) / (mu + lam)).detach().nan_to_num(0.0).max())
+    if young < SOFTEST:
+        warn(f"mu: Young's modulus is at most {young:.4g} Pa, softer than any gel; moduli are in Pa: 1 MPa is 1e6")
 
 
 def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:

@@ -153,14 +153,15 @@ class _Converging:
         self.count, self.residual, self.converged = 0, 0.0, True
 
     def __call__(self, model: Model, x: Tensor, v: Tensor, prepared: Prepared, **loads: Any) -> tuple[Tensor, Tensor]:
+        loads["gravity"] = acceleration_of(loads["gravity"], x)
         where = collider_state(model, x, loads["colliders"], loads["colliders_before"])
-        begun = begin(model, x, v, prepared, loads["force"], acceleration_of(loads["gravity"], x), loads["prescribed"])
+        begun = begin(model, x, v, prepared, loads["force"], loads["gravity"], loads["prescribed"])
         with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
             swept_only = replaced(prepared, unrolled=None)
             done = _Sweeping(model, begun.detached(), swept_only, {"x": x, "v": v, **loads}, where, self.tolerance)
             done.run(*self.most)
             if not math.isfinite(done.residual):
-                refuse_non_finite(model, {"x": x, "v": v, **loads})
+                refuse_non_finite(model, {"x": x, "v": v, **loads, "mu": prepared.mu, "lam": prepared.lam})
         _judge(done, self.tolerance, self.on_failure)
         if isinstance(self.adjoint, GlobalAdjoint):
             # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph

@@ -41,7 +41,7 @@ def _halved(model: Model) -> Halved:
     tets, pinned = model.tets.cpu(), model.pinned.cpu()
     ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
     density = model.density.cpu().repeat_interleave(TETS)
-    changes = {"density": density, "pinned": torch.cat([pinned, pinned[ends].all(1)])}
+    changes = {"density": density, "pinned": torch.cat([pinned, pinned[ends].all(1)]) if pinned.any() else None}
     fine = Model(subdivide(model.mesh), **replaced_arguments(model, changes))
     return Halved(fine, ends.to(model.device), model.num_vertices)
 

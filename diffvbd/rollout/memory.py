@@ -11,7 +11,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.anderson import combinations_of, cycles_of
 from ..adjoint.routes import ReverseSweep
-from ..checks import check_count, is_word
+from ..checks import check_bool, check_count, is_word
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
 from ..step.contact_cycles import sweeps_of_parts
@@ -60,7 +60,9 @@ def predict(
         ValueError, TypeError: For what ReverseSweep or rollout would refuse; it names the argument.
     """
     item = model._mass.element_size()
-    steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
+    steps, scenes, sweeps = check_count("steps", steps), check_count("scenes", scenes), check_count("sweeps", sweeps)
+    for name, asked in (("material", material), ("rest", rest)):
+        check_bool(name, asked)
     scheme = check_integrator(integrator)
     solves = solves_of(scheme)
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]

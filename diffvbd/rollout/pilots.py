@@ -303,7 +303,7 @@ class Pilots:
         """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
         load = self.model.mass.double()[:, None] * torch.as_tensor(self.gravity, device=x.device).double()
         if self.given.get("force") is not None:
-            load = load + self.given["force"].double()
+            load = load + torch.as_tensor(self.given["force"]).to(load)
         stored = mechanical_energy(self.model, self.prepared, x, v).reshape(x.shape[:-2])
         return stored - (load * x.double()).sum((-1, -2))
 

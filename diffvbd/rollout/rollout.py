@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from ..adjoint.routes import Adjoint, check_adjoint
-from ..checks import check_count, check_function, fail, is_word
+from ..checks import check_bool, check_count, check_function, fail, is_word
 from ..model.model import Model
 from ..model.warnings import warn_of_inverted_bodies, warn_of_material
+from ..said import is_own
 from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
-from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, step_settings
+from ..step.arguments import GRAVITY, MAX_SWEEPS, acceleration_of, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
 from ..step.held_up import cut_share
 from ..step.integrators import (
@@ -143,7 +144,7 @@ def rollout(
         raise TypeError(f"{'time_step' if time_step is None else 'sweeps'}: expected a number, or settings, got None")
     if (finer := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
-    steps = check_count("steps", steps)
+    steps = check_count("steps", steps, maximum=MAX_SWEEPS)
     save = _checked_save(save)
     _check_estimates(estimate_errors, model)
     for name, asked in (("check_contact", check_contact), ("check_energy", check_energy)):
@@ -151,8 +152,7 @@ def rollout(
             raise TypeError(f"{name}: expected a bool or None, got {type(asked).__name__}")
     if observe is not None:
         check_function("observe", observe, "x", "v", "step")
-    if not isinstance(check_start, bool):
-        raise TypeError(f"check_start: expected a bool, got {type(check_start).__name__}")
+    check_bool("check_start", check_start)
     lead, adjoint, scheme = check_state(model, x, v), check_adjoint(adjoint), check_integrator(integrator)
     check_history(scheme, history, x, time_step)
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
@@ -218,7 +218,7 @@ def rollout(
             except (ValueError, TypeError) as error:
                 if type(error) not in (ValueError, TypeError):  # another one may take other arguments
                     raise
-                raise type(error)(f"{error} (in step {k})") from error
+                raise type(error)(f"{error} (in step {k})") from (None if is_own(error) else error)
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
@@ -276,8 +276,7 @@ def _checked_save(save: Any) -> Any:
 
 
 def _check_estimates(asked: Any, model: Any) -> None:
-    if not isinstance(asked, bool):
-        raise TypeError(f"estimate_errors: expected a bool, got {type(asked).__name__}")
+    check_bool("estimate_errors", asked)
     if asked and isinstance(model, Model):
         check_estimable(model, "estimate_errors")
 

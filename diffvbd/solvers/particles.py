@@ -12,9 +12,11 @@ from torch import Tensor
 from .. import ops
 from ..checks import (
     check_broadcast,
+    check_count,
     check_dtype,
     check_kind,
     check_positive,
+    check_readable,
     check_tensor,
     check_time_step,
     fail,
@@ -64,9 +66,7 @@ class ParticleSolver:
             if self.rest_points.dim() != 2 or self.rest_points.shape[1] != 3:
                 fail("points", "shape [V, 3], or a number of particles", f"shape {list(self.rest_points.shape)}")
             points = self.rest_points.shape[0]
-        if points < 0:
-            fail("points", "shape [V, 3], or a number of particles >= 0", points)
-        points = self.num_points = int(points)
+        points = self.num_points = check_count("points", points, 0, 2**31 - 1)
         self.pinned = vertex_mask(pinned, points).to(device)
         mass = numbers("mass", mass, dtype, device)
         if mass.shape not in ((), (points,)):
@@ -155,8 +155,9 @@ def numbers(name: str, value: Any, dtype: torch.dtype, device: torch.device | st
     try:
         if not isinstance(value, Tensor):
             value = torch.from_numpy(np.array(value, dtype=np.float64))  # a copy, of what may be write-protected
+        check_readable(name, value)
         out = value.detach().to(device, dtype)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise TypeError(f"{name}: expected numbers, got {type(value).__name__}") from None
     if not bool(torch.isfinite(out).all()):
         fail(name, "finite numbers", "NaN or Inf")

@@ -230,6 +230,8 @@ def vertex_block_descent(model: Model, time_step: float, update: type[VertexBloc
     """
     elastic_energy(model)
     time_step = check_time_step(time_step, model.mass.dtype)
+    if not (isinstance(update, type) and issubclass(update, VertexBlock)):
+        raise TypeError(f"update: expected VertexBlock or a subclass, got {update!r}")
     bounds = model.color_ptr.tolist()
     colors = (model.color_vertices[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
     return _ColorSolver(model, (update(model, time_step, vertices) for vertices in colors))

@@ -27,7 +27,7 @@ from .arguments import (
     acceleration_of,
     broadcastable,
     collider_state,
-    name_argument,
+    named,
 )
 from .check import check_on_cpu
 from .coarse import lengths_of, with_corrections
@@ -110,8 +110,7 @@ def swept(
                     found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
             return done.x
     except ValueError as error:
-        name_argument(model, error, given)
-        raise
+        raise named(model, error, given) from None  # the frames of operators say nothing to who gave the argument
 
 
 def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from ..checks import (
     check_broadcast,
     check_count,
     check_kind,
+    check_readable,
     check_tensor,
     check_time_step,
     fail,
@@ -269,20 +269,26 @@ def _refuse_lines(model: Model, name: str, points: Tensor) -> None:
                 fail(name, "three corner points of each Plane that span it", f"those of collider {number} on a line")
 
 
-def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
-    """Raises an error that names the argument, where the operator could name only what was made of several."""
+def named(model: Model, error: ValueError, arguments: dict[str, Any]) -> ValueError:
+    """The error of an operator, or one that names the argument where it could name only what was made of several."""
     if str(error).startswith(("predictor", "start")):
-        with suppress(RuntimeError):  # under vmap values cannot be looked at
+        try:
             refuse_non_finite(model, arguments)
+        except ValueError as found:
+            return found
+        except RuntimeError:  # under vmap values cannot be looked at
+            pass
+    return ValueError(*error.args) if type(error) is ValueError else error
 
 
 def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
     """Raises for the first tensor or number among arguments of a step that is, or holds, what is not finite."""
     for name, value in arguments.items():
         read = not name.startswith("prescribed") or model.num_active < model.num_vertices  # only where pinned
-        if isinstance(value, NUMBERS) and read and not math.isfinite(value):
+        if isinstance(value, NUMBERS) and read and not math.isfinite(to_float(name, value)):
             fail(name, "finite values", value)
         if isinstance(value, Tensor):
+            check_readable(name, value)
             good = torch.isfinite(value)
             if name.startswith("prescribed"):  # read only where pinned
                 value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]

@@ -375,7 +375,7 @@ class ContactStep:
             )
 
     def _refuse_what_is_not_finite(self) -> None:
-        """Which argument it was, finds arguments.name_argument."""
+        """Which argument it was, finds arguments.named."""
         given = (self.x_prev, self.begun.y, self.colliders, self.before)
         if not all(bool(torch.isfinite(t).all()) for t in given):
             raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")

@@ -3,7 +3,7 @@
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 try:
@@ -62,15 +62,15 @@ def prepare(out: Path, task: str) -> None:
     if there and (found := _task_of(out / "log.json")) != task:
         whose = f"{', '.join(there)} of {found or 'something else'}"
         raise ValueError(f"out: expected a folder without results, or with those of {task}, got {out} with {whose}")
-    for name in (*RESULTS, STATE):
-        for unfinished in out.glob(f"{name}.[0-9]*.part"):
+    for name in map(Path, (*RESULTS, STATE)):
+        for unfinished in out.glob(f"{name.stem}.[0-9]*.part{name.suffix}"):
             unfinished.unlink()
 
 
 def _task_of(log: Path) -> str | None:
     try:
         return str(json.loads(log.read_text(encoding="utf-8"))["task"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
@@ -85,10 +85,3 @@ def put_aside(state: Path) -> Path:
     while aside.exists():
         aside, k = state.with_name(f"state.other-{k + 1}.pt"), k + 1
     return state.rename(aside)
-
-
-def replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file anew; an interruption in the middle leaves the one before."""
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
-    write(unfinished)
-    os.replace(unfinished, path)

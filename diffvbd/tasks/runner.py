@@ -1,5 +1,6 @@
 """The optimiser loop that every task shares: stages, log, resume, pictures."""
 
+import io
 import json
 import math
 import sys
@@ -14,8 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffvbd.mesh.write import replace
 from diffvbd.tasks.capture import captured
-from diffvbd.tasks.folder import STATE, alone_in, prepare, put_aside, remove_results, replace
+from diffvbd.tasks.folder import STATE, alone_in, prepare, put_aside, remove_results
 from diffvbd.tasks.optimizer import optimizer_of
 from diffvbd.tasks.problem import (
     OWN_KEYS,
@@ -54,6 +56,7 @@ def solve(problem: Problem, settings: Settings, watch: Callable[[Row], object] |
 
     Raises:
         ArithmeticError: the loss or a gradient is not finite.
+        OSError: a file cannot be written, as on a full disk; the same call continues the run.
         ValueError, TypeError: the problem is not well formed; the device is not there; the folder cannot be written to,
             holds results of another task, or another run works in it.
     """
@@ -232,7 +235,7 @@ class _Run:
             "schedule": self.schedule.state_dict() if self.schedule else None,
             "random": torch.get_rng_state(),
         }
-        replace(self.state, lambda path: torch.save(state, path))
+        replace(self.state, partial(_save, state))
         self.write_log()
 
     def resume(self) -> None:
@@ -343,7 +346,7 @@ class _Run:
         )
         if listed.keys() != problem.parameters.keys():
             path = self.settings.out / "parameters.pt"
-            replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
+            replace(path, partial(_save, {name: p.detach().cpu() for name, p in problem.parameters.items()}))
             result.files.append(path)
         self._draw(result)
         self.state.unlink(missing_ok=True)
@@ -356,18 +359,26 @@ class _Run:
     def _draw(self, result: Result) -> None:
         """Pictures come last, and what goes wrong with them costs no result."""
         problem, draw = self.problem, {}
-        if problem.picture:
-            draw["picture.png"] = partial(problem.picture, self.settings.out / "picture.png", self.history)
+        if picture := problem.picture:
+            draw["picture.png"] = lambda path: picture(path, self.history)
         if problem.animation:
-            draw["motion.npz"] = partial(problem.animation, self.settings.out / "motion.npz")
+            draw["motion.npz"] = problem.animation
         if problem.animation and not self.settings.quick:
-            draw["animation.gif"] = partial(problem.animation, self.settings.out / "animation.gif")
+            draw["animation.gif"] = problem.animation
         for name, function in draw.items():
             try:
-                function()
+                replace(self.settings.out / name, function)
                 result.files.append(self.settings.out / name)
             except Exception as error:
+                if isinstance(error, OSError) and error.errno:  # a full disk: the run continues here once there is room
+                    raise
                 print(f"no {name}: {error or type(error).__name__}", file=sys.stderr)
+
+
+def _save(state: dict[str, Any], path: Path) -> None:
+    content = io.BytesIO()  # torch.save into a file turns the system's errors into others
+    torch.save(state, content)
+    path.write_bytes(content.getbuffer())
 
 
 def _norm(parameters: list[Tensor]) -> float:

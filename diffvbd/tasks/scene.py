@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.mesh.write import replace
 from diffvbd.tasks import archive
 
 MOST_STEPS = 10**7  # beyond, a typing error is likelier than patience
@@ -64,8 +65,9 @@ class Scene:
             energies += (dv.FloorBarrier(height=self.floor, kappa=self.kappa, dhat=self.dhat),)
         if self.friction is not None:
             energies += (dv.Friction(self.friction),)
-        options: dict[str, Any] = {"density": self.density, "pinned": self.pinned, "relaxation": self.relaxation}
+        options: dict[str, Any] = {"density": self.density, "relaxation": self.relaxation}
         options |= {"coarse": "auto"} if self.coarse else {}
+        options |= {"pinned": self.pinned} if self.pinned.any() else {}
         return dv.Model(self.mesh, energies=energies, **options).to(device)
 
     def simulate(
@@ -120,8 +122,12 @@ class Observation:
         if s.coarse:
             values["coarse"] = 1.0
         values |= self.truth
-        with open(path, "wb") as file:
-            np.savez_compressed(file, **values)
+
+        def write(new: Path) -> None:
+            with new.open("wb") as file:  # numpy adds .npz to other names
+                np.savez_compressed(file, **values)
+
+        replace(Path(path), write)
 
     @classmethod
     def load(cls, path: str | Path, mesh: dv.TetMesh, **overrides: Any) -> "Observation":

@@ -194,7 +194,7 @@ class Scene:
         return Model(
             TetMesh(self.points, self.tets),
             density=torch.from_numpy(self.arrays["density"]),
-            pinned=torch.from_numpy(self.pinned),
+            pinned=torch.from_numpy(self.pinned) if self.pinned.any() else None,
             energies=self.energies(),
             saturation=self.case.saturation,
             regularization=self.case.regularization,

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffvbd.checks import check_positive
+from diffvbd.mesh.arrays import to_path
 from diffvbd.viz.drawing import (
     COLORS,
     OTHER,
@@ -48,7 +50,8 @@ def animation(
         ImportError: matplotlib is not installed, for a .gif.
         ValueError: motions or triangles of another shape.
     """
-    if Path(path).suffix == ".npz":
+    path, time_step = to_path("path", path), check_positive("time_step", time_step, "s")
+    if path.suffix == ".npz":
         save_motions(path, surface, motions_as_arrays(motions, surface), time_step, scenery)
         return
     figure = new_figure(3.4 * len(motions), 3.2, dots=70)

@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from diffvbd.checks import check_count, check_positive
+from diffvbd.mesh.arrays import float_array, to_numpy
+
 COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
 OTHER = "#8c8c8c"
 BODIES = ("#4c78a8", "#e4704f", "#4f9d5b")
@@ -78,8 +81,10 @@ def draw(
 
 def floor(low: Sequence[float], high: Sequence[float], height: float = 0.0, cells: int = 8) -> Scenery:
     """A floor: the rectangle from (low x, low z) to (high x, high z) [m] at a height [m]."""
-    x, z = np.linspace(low[0], high[0], cells + 1), np.linspace(low[-1], high[-1], cells + 1)
-    points = np.stack(np.meshgrid(x, [height], z, indexing="ij"), -1).reshape(-1, 3)
+    cells = check_count("cells", cells, 1, 10_000)
+    first, last = (float_array(name, value, (None,)) for name, value in (("low", low), ("high", high)))
+    x, z = (np.linspace(first[k], last[k], cells + 1) for k in (0, -1))
+    points = np.stack(np.meshgrid(x, float_array("height", height, ()), z, indexing="ij"), -1).reshape(-1, 3)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"))
     a = i * (cells + 1) + j
     b, c, d = a + 1, a + cells + 2, a + cells + 1
@@ -88,7 +93,8 @@ def floor(low: Sequence[float], high: Sequence[float], height: float = 0.0, cell
 
 def box(low: Sequence[float], high: Sequence[float], color: str = SCENERY) -> Scenery:
     """A box between two corners [m], open above."""
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
+    ends = float_array("low", low, (3,)), float_array("high", high, (3,))
+    corners = np.stack(np.meshgrid(*zip(*ends, strict=True), indexing="ij"), -1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
     return Scenery(corners, np.array(triangles), color)
@@ -96,7 +102,7 @@ def box(low: Sequence[float], high: Sequence[float], color: str = SCENERY) -> Sc
 
 def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = SCENERY) -> Scenery:
     """All points within a radius [m] of the segment from a to b [m]; a ball if a = b."""
-    start, end = as_array(a), as_array(b)
+    start, end, radius = float_array("a", a, (3,)), float_array("b", b, (3,)), check_positive("radius", radius, "m")
     along = end - start
     length = np.linalg.norm(along)
     axis = along / length if length > 0 else np.array([0.0, 1.0, 0.0])
@@ -140,7 +146,10 @@ def as_array(values: Any) -> NDArray[np.float64]:
 
 def check_surface(surface: Any, vertices: int) -> None:
     """Raises ValueError for what is not a list of triangles of so many vertices."""
-    shape, last = list(np.shape(surface)), np.max(surface, initial=-1)
+    surface = to_numpy("surface", surface)
+    if surface.size and surface.dtype.kind not in "iu":
+        raise TypeError(f"surface: expected integers, got dtype {surface.dtype}")
+    shape, last = list(surface.shape), surface.max(initial=-1)
     if len(shape) != 2 or shape[1] != 3 or last >= vertices:
         raise ValueError(
             f"surface: expected triangles [F, 3] of {vertices} vertices, got shape {shape} with indices up to {last}"
@@ -155,6 +164,8 @@ def motions_as_arrays(
     Raises:
         ValueError: another shape, another N than there are times, or a surface of other vertices.
     """
+    if not isinstance(motions, Mapping):
+        raise TypeError(f"motions: expected positions by name, got {type(motions).__name__}")
     frames = {name: as_array(motion) for name, motion in motions.items()}
     for name, motion in frames.items():
         if motion.ndim != 3 or motion.shape[-1] != 3 or times not in (None, len(motion)):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..checks import check_count, fail
+from ..checks import check_bool, check_count, fail
 from ..model.model import Model
 from .drawing import Scenery
 from .motion import Mesh, Motion, mesh_of, motions_of
@@ -71,7 +71,8 @@ def live(
     check_count("port", port, 0, 65535)
     if not isinstance(host, str) or not host:
         raise TypeError(f"host: expected the name or address of a network interface, got {host!r}")
-    ranges, simulate, course = _ranges(sliders or {}), None, None
+    check_bool("play", play)
+    ranges, simulate, course = _ranges({} if sliders is None else sliders), None, None
     if isinstance(source, (str, Path)):
         course = opened(Path(source), time_step)
         motions, mesh = course.motions, course.mesh if mesh is None else mesh
@@ -90,6 +91,8 @@ def live(
     if simulate is not None:
         simulate = _with_material(simulate, values)
         values.mu, values.lam = (_first(ranges, name, value) for name, value in (("mu", mu), ("lam", lam)))
+    if not isinstance(scenery, Sequence) or not all(isinstance(thing, Scenery) for thing in scenery):
+        raise TypeError(f"scenery: expected a sequence of dv.viz.Scenery, got {type(scenery).__name__}")
     things = tuple(scenery)
     if isinstance(mesh, Model):
         things += scenery_of(mesh, *_bounds(motions), colliders)

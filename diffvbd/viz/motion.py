@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..checks import check_positive, fail
 from ..mesh.tet_mesh import TetMesh, boundary_faces
+from ..mesh.write import replace
 from ..model.model import Model
 from ..rollout.trajectory import Trajectory
 from .drawing import SCENERY, Scenery, as_array, check_surface
@@ -145,8 +146,12 @@ def save_motions(
     for k, thing in enumerate(scenery):
         arrays[f"scenery_points_{k}"] = as_array(thing.points).astype(np.float32)
         arrays[f"scenery_triangles_{k}"] = np.asarray(thing.triangles, np.int32)
-    with Path(path).open("wb") as file:  # numpy adds .npz to other names
-        np.savez_compressed(file, **arrays)
+
+    def write(new: Path) -> None:
+        with new.open("wb") as file:  # numpy adds .npz to other names
+            np.savez_compressed(file, **arrays)
+
+    replace(Path(path), write)
 
 
 def load_motions(path: str | PathLike[str]) -> dict[str, Motion]:

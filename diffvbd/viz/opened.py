@@ -68,12 +68,13 @@ def _run(folder: Path) -> Opened:
         kind = "a run that is not finished" if (folder / "state.pt").exists() else "none"
         raise ValueError(f"{folder}: expected the folder of a finished `diffvbd run` with {MOTION}, got {kind}")
     history: list[dict[str, Any]] = []
+    losses: tuple[float, ...] = ()
     if (folder / LOG).is_file():
         try:
             history = json.loads((folder / LOG).read_text(encoding="utf-8")).get("history", [])
-        except (ValueError, AttributeError) as error:
+            losses = tuple(float(row.get("loss", math.nan)) for row in history)
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{folder / LOG}: expected the log of a run, got {error}") from None
-    losses = tuple(float(row.get("loss", math.nan)) for row in history)
     last = history[-1] if history else {}
     numbers = {k: v for k, v in last.items() if k not in NOT_SHOWN and isinstance(v, (int, float))}
     return Opened(load_motions(folder / MOTION), None, losses, numbers)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,7 +41,7 @@ class Panel:
         self.gui = server.gui
         self.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 111, 159))
         self.gui.main_panel.dock_right()
-        self._tell, self._setting = tell, False
+        self._names, self._last = tuple(names), 1  # motions that there are; the last frame
         with self.gui.add_folder("Motion"):
             self.motion = self.gui.add_dropdown("show", tuple(names), initial_value=names[0], visible=len(names) > 1)
             self.play = self.gui.add_button("Play")
@@ -52,12 +54,13 @@ class Panel:
             self.color = self.gui.add_dropdown("by", tuple(QUANTITIES), initial_value=color)
             self.legend = self.gui.add_html("")
         self.message = self.gui.add_markdown("", visible=False)
-        for handle, what in ((self.motion, "motion"), (self.frame, "frame"), (self.color, "color"),
-                             (self.loop, "loop")):  # fmt: skip
-            handle.on_update(lambda event, what=what: self._say(what, event.target.value))
-        self.speed.on_update(lambda event: self._say("speed", float(event.target.value)))
-        self.play.on_click(lambda _: self._say("play", None))
-        camera.on_click(lambda _: self._say("camera", None))
+        self._listen(self.motion, lambda name: _among(name, self._names), lambda name: tell("motion", name))
+        self._listen(self.frame, lambda k: _within(k, 0, self._last), lambda k: tell("frame", int(k)))
+        self._listen(self.color, lambda name: _among(name, QUANTITIES), lambda name: tell("color", name))
+        self._listen(self.loop, bool, lambda loop: tell("loop", loop))
+        self._listen(self.speed, lambda speed: _among(speed, SPEEDS), lambda speed: tell("speed", float(speed)))
+        self.play.on_click(lambda _: tell("play", None))
+        camera.on_click(lambda _: tell("camera", None))
         self._values = {name: first for name, (_, _, first) in sliders.items()}
         self._moved = moved
         self.state: Any = None
@@ -67,15 +70,33 @@ class Panel:
         self._label = "loss"
         self._table: Any = None
 
-    def _say(self, what: str, value: Any) -> None:
-        if not self._setting:  # viser tells of values that the program sets, too
-            self._tell(what, value)
+    def _listen(self, handle: Any, accept: Callable[[Any], Any], tell: Callable[[Any], None]) -> None:
+        """Tells of values that users set, as `accept` takes them; None: not at all, and the control goes back.
+
+        The page keeps to the limits of its controls, but whoever reaches the server can send anything.
+        """
+        last = handle.value
+
+        def told(event: Any) -> None:
+            nonlocal last
+            if event.client is None:  # the program has set it
+                last = handle.value
+                return
+            given = handle.value
+            value = accept(given)
+            last = last if value is None else value
+            if value != given:
+                handle.value = last
+            if value is not None:
+                tell(value)
+
+        handle.on_update(told)
 
     def _add_sliders(self, sliders: Mapping[str, Slider]) -> None:
         with self.gui.add_folder("Parameters"):
             for name, (low, high, first) in sliders.items():
                 handle = self.gui.add_slider(name, low, high, (high - low) / STEPS, first)
-                handle.on_update(lambda event, name=name: self._move(name, event.target.value))
+                self._listen(handle, partial(_within, low=low, high=high), partial(self._move, name))
             self.state = self.gui.add_markdown("up to date")
 
     def _move(self, name: str, value: float) -> None:
@@ -95,17 +116,13 @@ class Panel:
     def set(self, handle: Any, value: Any) -> None:
         """Sets a control without telling of it."""
         if handle.value != value:
-            self._setting = True
-            try:
-                handle.value = value
-            finally:
-                self._setting = False
+            handle.value = value
 
     def show_frame(self, frame: int, frames: int, seconds: float | None, playing: bool) -> None:
         """The frame that is shown, of so many, and its time [s]."""
-        last = max(1, frames - 1)
-        if self.frame.max != last:
-            self.frame.max = last
+        self._last = max(1, frames - 1)
+        if self.frame.max != self._last:
+            self.frame.max = self._last
         self.set(self.frame, frame)
         when = "" if seconds is None else f", {seconds:.3f} s"
         text = f"frame {frame} of {frames - 1}{when}"
@@ -117,12 +134,9 @@ class Panel:
 
     def show_names(self, names: Sequence[str], chosen: str) -> None:
         """The motions that there are."""
-        if tuple(self.motion.options) != tuple(names):
-            self._setting = True
-            try:
-                self.motion.options = tuple(names)
-            finally:
-                self._setting = False
+        self._names = tuple(names)
+        if tuple(self.motion.options) != self._names:
+            self.motion.options = self._names
         self.set(self.motion, chosen)
         self.motion.visible = len(names) > 1
 
@@ -157,3 +171,12 @@ class Panel:
         scales = {"x": uplot.Scale(time=False)}
         with self.gui.add_folder("Loss", order=0):
             self._chart = self.gui.add_uplot((iterations, losses), series, scales=scales, aspect=1.6)
+
+
+def _within(value: float, low: float, high: float) -> float | None:
+    """The nearest value of a slider; None for NaN."""
+    return None if math.isnan(value) else min(max(value, low), high)
+
+
+def _among(value: str, known: Collection[str]) -> str | None:
+    return value if value in known else None

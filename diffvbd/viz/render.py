@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import check_positive, fail
+from ..mesh.write import replace
 from ..model.model import Model
 from .drawing import Scenery, as_array
 from .motion import Mesh, Motion, mesh_of, motions_of
@@ -225,8 +226,6 @@ def _save(path: Path, pictures: Sequence[NDArray[np.uint8]], seconds: float, qua
 
     images = [Image.fromarray(picture) for picture in pictures]
     images = [image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX) for image in images]
-    if len(images) == 1:
-        images[0].save(path, quality=quality)
-        return
-    images[0].save(path, save_all=True, append_images=images[1:], loop=0, quality=quality, method=4,
-                   duration=round(1000 * seconds / len(images)))  # fmt: skip
+    several: dict[str, Any] = {"save_all": True, "append_images": images[1:], "loop": 0, "method": 4,
+                               "duration": round(1000 * seconds / len(images))}  # fmt: skip
+    replace(path, lambda new: images[0].save(new, quality=quality, **several if len(images) > 1 else {}))

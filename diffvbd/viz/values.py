@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..checks import fail
+from ..checks import fail, is_word
 from ..inspect.forces import forces, stress
 from ..model.model import Model
 from .drawing import as_array
@@ -85,7 +85,7 @@ class Values:
         Raises:
             ValueError: an unknown name, or a quantity that these arguments do not tell.
         """
-        if name not in QUANTITIES:
+        if not is_word(name, *QUANTITIES):
             fail("color", f"one of {', '.join(QUANTITIES)}", repr(name))
         kept = self._kept.get((id(motion), name))
         if kept is not None and kept[0] is motion:
@@ -139,6 +139,8 @@ class Values:
         tets = self.model.num_tets if self.model is not None else int(self._tets_of(motion, what).max()) + 1
         if self.model is not None and len(values) not in (1, tets) or len(values) not in (1,) and len(values) < tets:
             fail(name, f"a number or one for each of {tets} tets", f"shape {list(as_array(value).shape)}")
+        if not np.isfinite(values).all():
+            fail(name, "finite numbers", float(values[~np.isfinite(values)][0]))
         return values
 
     def _stiffness(self, motion: Motion) -> NDArray[np.float64]:

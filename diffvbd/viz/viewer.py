@@ -10,13 +10,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from ..checks import check_count, fail
+from ..checks import check_count, fail, is_word
 from ..rollout.trajectory import Trajectory
 from ..scopes import record_to
 from .clock import DELAY, Clock, Rerun
 from .drawing import Scenery
 from .motion import Mesh, Motion, motions_of
 from .panel import Panel, Slider
+from .server import open_server
 from .stage import Stage
 from .values import QUANTITIES, Values, legend
 
@@ -61,8 +62,8 @@ class Viewer:
         self._changed = threading.Condition(threading.RLock())
         first = motions[self._name]
         self.clock = Clock(first.times, len(first))
-        self._server = _server(host, port)
-        self.url = f"http://{host}:{self._server.get_port()}"
+        self._server = open_server(host, port)
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self._stage = Stage(self._server)
         self._rerun = None if simulate is None else Rerun(simulate, self._simulated, self._failed, delay)
         self._panel = Panel(self._server, [*motions], color, self._told, sliders, self._moved)
@@ -90,7 +91,7 @@ class Viewer:
 
     @color.setter
     def color(self, name: str) -> None:
-        if name not in QUANTITIES:
+        if not is_word(name, *QUANTITIES):
             fail("color", f"one of {', '.join(QUANTITIES)}", repr(name))
         self._told("color", name)
 
@@ -312,24 +313,3 @@ def _number(name: str, value: Any) -> float:
         return float(value.detach() if hasattr(value, "detach") else value)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{name}: expected a number or a tensor of one, got {type(value).__name__}") from None
-
-
-def require_viser() -> Any:
-    """The module viser; an ImportError names the extra."""
-    try:
-        import viser
-    except ImportError:
-        raise ImportError("the viewer needs viser: pip install 'diffvbd[viz]'") from None
-    return viser
-
-
-def _server(host: str, port: int) -> Any:
-    viser = require_viser()
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
-        server = viser.ViserServer(host=host, port=port, label="diffvbd", verbose=False)
-    server.request_share_url = _no_tunnel
-    return server
-
-
-def _no_tunnel(verbose: bool = True) -> None:
-    """In place of viser's, which would connect to a server on the internet."""

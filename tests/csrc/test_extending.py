@@ -7,8 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from helpers.copied_sources import build, copy_sources, edit, run
 from helpers.paths import ROOT, needs_csrc
+
+from diffvbd.energies import Anchor, VertexEnergy
 
 SCRIPT = """
 import torch
@@ -62,6 +65,8 @@ def add_an_energy(root: Path) -> None:
     energies = root / "csrc" / "energies"
     header = (energies / "anchor.h").read_text(encoding="utf-8")
     (energies / "tether.h").write_text(renamed(header), encoding="utf-8")
+    edit(energies / "tether.h", "      const R k = s.h * s.h * data[i];\n",
+         "      R k = R(0);\n      k += select(data[i] > R(0), s.h * s.h * data[i], R(0));\n")  # fmt: skip
     edit(energies / "energies.h", '#include "anchor.h"', '#include "anchor.h"\n#include "tether.h"')
     edit(energies / "energies.h", "EnergyList<FloorBarrier, Anchor>", "EnergyList<FloorBarrier, Anchor, Tether>")
     python, reference = root / "diffvbd" / "energies.py", root / "diffvbd" / "reference" / "energies.py"
@@ -75,6 +80,22 @@ def test_the_page_counts_its_places() -> None:
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     steps = re.findall(r"^### (\d)\. ", page.split("### What you get")[0], re.MULTILINE)
     assert steps == ["1", "2", "3", "4"] and "Four places are touched" in page
+    own = [name for name, value in vars(VertexEnergy).items() if callable(value) and name in vars(Anchor)]
+    missing = [name for name in own if f"`{name}()`" not in page]
+    assert not missing and {"constants", "pack", "gradient", "blocks"} <= {*own}
+
+
+def test_blocks_that_an_energy_does_not_have_follow_from_its_gradient() -> None:
+    x, k = (torch.randn(2, 5, n, dtype=torch.float64, requires_grad=True) for n in (3, 4))
+    energy, given = Anchor(50.0), (x, x, k.flatten(1), 0.1, None)
+    for found, own in zip(*(_with_gradients(kind.blocks(energy, *given), x, k) for kind in (VertexEnergy, Anchor)),
+                          strict=True):  # fmt: skip
+        assert torch.equal(found, own.expand(found.shape))
+
+
+def _with_gradients(blocks: torch.Tensor, *inputs: torch.Tensor) -> list[torch.Tensor]:
+    loss = (blocks * torch.arange(9.0, dtype=blocks.dtype).reshape(3, 3)).sum()
+    return [blocks, *torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True)]
 
 
 @pytest.mark.slow

@@ -148,6 +148,9 @@ def test_bad_arguments() -> None:
         diagnose(model, x, previous=(x, x), **MATERIAL)
     with pytest.raises(ValueError, match="x: expected shape"):
         diagnose(model, x[:-1], **MATERIAL)
+    for mu, error in ((torch.ones(7, dtype=x.dtype), ValueError), (float("nan"), ValueError), ("soft", TypeError)):
+        with pytest.raises(error, match="^mu: expected"):
+            diagnose(model, x, mu=mu, lam=1e4)  # pyright: ignore[reportArgumentType]
 
 
 def test_empty_mesh() -> None:

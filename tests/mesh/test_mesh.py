@@ -321,7 +321,7 @@ def test_bad_meshes_are_named(points, tets, body, error, says):
 @pytest.mark.parametrize(
     ("call", "error", "says"),
     [
-        (lambda: dm.beam(1, 3, 3), ValueError, "n: expected at least 2, got 1"),
+        (lambda: dm.beam(1, 3, 3), ValueError, "nx: expected at least 2, got 1"),
         (lambda: dm.cube(2.0), TypeError, "n: expected an integer, got 2.0"),
         (lambda: dm.cube(size=-1), ValueError, "size: expected a positive length, got -1"),
         (lambda: dm.box((2, 2)), ValueError, "n: expected one number or three, got 2"),
@@ -338,6 +338,9 @@ def test_bad_meshes_are_named(points, tets, body, error, says):
         (lambda: dm.replicate(3, [[0, 0, 0]]), TypeError, "mesh: expected a diffvbd.TetMesh, got int"),
         (lambda: dm.subdivide(UNIT_POINTS), TypeError, "mesh: expected a diffvbd.TetMesh, got ndarray"),
         (lambda: dm.join(dm.cube()), TypeError, "meshes: expected TetMesh objects, as in a list, got TetMesh"),
+        (lambda: dm.TetMesh(UNIT_POINTS, [[0, 1, 2, 3]], orient=np.ones(3)), TypeError, "orient: expected a bool, got"),
+        (lambda: dm.load("", orient=np.ones(3)), TypeError, "orient: expected a bool, got ndarray"),
+        (lambda: dm.load("", return_vertices="no"), TypeError, "return_vertices: expected a bool, got str"),
         (lambda: dm.join([3]), TypeError, "meshes: expected TetMesh objects, got int at 0"),
         (lambda: dm.fill(lambda p: p[:, 0], (-1,) * 3, (1,) * 3, 0.5), ValueError, "expected a box around the body"),
         (lambda: dm.fill(lambda p: p[:, 0] + 9, (-1,) * 3, (1,) * 3, 0.5), ValueError, "found no point of it"),

@@ -141,6 +141,22 @@ def test_series_lists_frames_that_can_be_read_back(tmp_path):
         assert np.array_equal(dm.load(tmp_path / entry.attrib["file"]).body, mesh.body)
 
 
+def test_a_full_disk_is_named_with_the_file_and_leaves_the_one_before(tmp_path, monkeypatch):
+    mesh = dm.cube(2)
+
+    def fill(path, *_):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(dm.series, "write_gltf", fill)
+    monkeypatch.setattr(meshio.Mesh, "write", lambda self, path: fill(path))
+    for name in ("motion.glb", "motion.pvd"):
+        (tmp_path / name).write_bytes(b"before")
+        with pytest.raises(OSError, match="No space left on device: .*motion"):
+            dm.write_series(tmp_path / name, mesh, mesh.points[None])
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"before", b"before"]
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "says"),
     [

@@ -111,6 +111,7 @@ def test_holes_and_crowded_edges_are_counted() -> None:
     ("arguments", "says"),
     [
         ({"up": "w"}, "up: expected one of y, -y, z, -z, x, -x, got 'w'"),
+        ({"up": []}, r"up: expected one of y, -y, z, -z, x, -x, got \[\]"),
         ({"size": 1.0, "scale": 2.0}, "size: expected none beside scale = 2.0, got 1.0"),
         ({"size": 0.0}, "size: expected a positive length, got 0"),
         ({"scale": -1.0}, "scale: expected a positive length, got -1"),

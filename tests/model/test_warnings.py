@@ -30,6 +30,8 @@ def scaled(size: float, bodies: int = 1) -> dv.TetMesh:
         (lambda: dv.Model(scaled(101.0, 3)), "mesh: a body is 101 m long"),
         (lambda: dv.Model(scaled(5e-5)), "mesh: the largest body is 5e-05 m long"),
         (lambda: dv.Model(scaled(5e-5, 3)), "mesh: the largest body is 5e-05 m long"),
+        (lambda: dv.Model(scaled(1.0), pinned=np.zeros(8, bool)), "pinned: none of 8 vertices is pinned"),
+        (lambda: dv.Model(scaled(1.0), pinned=np.ones(8, bool)), "pinned: all 8 vertices are pinned"),
         (lambda: dv.Model(scaled(1.0), energies=FLOOR, relaxation=1.5), "relaxation: 1.5 with Friction"),
     ],
 )
@@ -47,6 +49,7 @@ def test_a_model_warns_where_it_is_made(build: Callable[[], Any], message: str) 
         lambda: dv.Model(scaled(2e-4, 3)),
         lambda: dv.Model(scaled(1.0), energies=FLOOR),
         lambda: dv.Model(scaled(1.0), relaxation=1.7),
+        lambda: dv.Model(scaled(1.0)).replace(relaxation=1.7),
         lambda: dv.Model(dv.TetMesh(np.zeros((0, 3)), np.zeros((0, 4), dtype=int))),
     ],
 )
@@ -87,7 +90,9 @@ def test_thin_tets_and_few_sweeps_are_named_once_for_a_model(run: Callable[..., 
         (1e-3, {"sweeps": 2000}),
         (1e-3, {"sweeps": 0}),
         (1e-3, {"sweeps": 20, "time_step": 1e-5}),  # a wave crosses less than an element
-        (1e-3, {"sweeps": 20, "mu": 1.0, "lam": 0.0}),
+        (1e-3, {"sweeps": 20, "mu": 6.0, "lam": 0.0}),
+        (0.01, {"sweeps": 20, "mu": 0.0, "lam": 0.0}),
+        (0.01, {"sweeps": 20, "time_step": 0.9}),
     ],
 )
 def test_sound_steps_do_not_warn(run: Callable[..., Any], thickness: float, changes: dict[str, Any]) -> None:
@@ -95,6 +100,27 @@ def test_sound_steps_do_not_warn(run: Callable[..., Any], thickness: float, chan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run(model, model.rest_points, **(STEP | changes))
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mu": 2.0, "lam": 1.0}, "mu: Young's modulus is at most 4.667 Pa"),
+        ({"mu": None, "lam": None, "young": 9.0, "poisson": 0.3}, "mu: Young's modulus is at most 9 Pa"),
+        ({"time_step": 1.0}, "time_step: 1 s is long for a step"),
+    ],
+)
+def test_what_looks_like_other_units_is_named_in_each_call(
+    run: Callable[..., Any], changes: dict[str, Any], message: str
+) -> None:
+    model = sheet(0.01)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            run(model, model.rest_points, sweeps=20, **(STEP | changes))
+    assert [message in str(each.message) for each in found] == [True, True]
+    assert found[0].filename == __file__
 
 
 def test_the_warning_is_right() -> None:

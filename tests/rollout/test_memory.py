@@ -142,6 +142,12 @@ def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype:
         assert sizes[1] - sizes[0] == tape_bytes
 
 
+@pytest.mark.parametrize(("name", "value"), [("sweeps", None), ("material", 1), ("rest", None)])
+def test_bad_arguments_are_named(name: str, value: Any) -> None:
+    with pytest.raises(TypeError, match=f"^{name}: expected"):
+        beam_model().memory(**{"sweeps": 3, name: value})
+
+
 def test_auto_chooses_by_size() -> None:
     model = beam_model()
     small, large = (model.memory(sweeps=sweeps, tape="auto") for sweeps in (20, 60_000))

@@ -1,6 +1,7 @@
 """Claim: what cannot be the value of a step is refused in words that help. A Trajectory prints in one line."""
 
 import functools
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -56,6 +57,27 @@ def test_an_error_of_a_step_says_which_step_it_was() -> None:
     turned = inputs | {"rest_points": lambda k, x, v: rest if k < 2 else -rest}
     with pytest.raises(ValueError, match=r"rest_points: .*at tet \d+ of scene 0 .in step 2.$"):
         dv.rollout(model, **turned, steps=STEPS, sweeps=SWEEPS)
+
+
+def test_an_error_shows_where_it_was_made_and_no_more() -> None:
+    """What a user has given wrong is at the end of a short traceback; what a user's function raises keeps its line."""
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+
+    def shown(run: Callable[..., Any], **changes: Any) -> str:
+        with pytest.raises(ValueError) as found:
+            run(model, **(inputs | changes), sweeps=SWEEPS)
+        return "".join(traceback.format_exception(found.type, found.value, found.tb))
+
+    for name, value in (("mu", float("nan")), ("gravity", (0.0, float("nan"), 0.0)), ("density", -1.0)):
+        for run in (functools.partial(dv.rollout, steps=1), dv.step):
+            text = shown(run, **{name: value})
+            assert len(text.splitlines()) <= 30 and f"ValueError: {name}: expected finite" in text
+
+    def torn(k: int, x: Tensor, v: Tensor) -> Tensor:
+        raise ValueError("no force today")
+
+    assert 'raise ValueError("no force today")' in shown(functools.partial(dv.rollout, steps=1), force=torn)
 
 
 @pytest.mark.parametrize(

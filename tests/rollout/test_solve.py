@@ -119,15 +119,18 @@ BAD = [
     ({"max_sweeps": -1}, ValueError, "max_sweeps: expected an integer >= 0"),
     ({"check_every": 0}, ValueError, "check_every: expected an integer >= 1"),
     ({"on_failure": "pass"}, ValueError, "on_failure: expected"),
+    *(({name: value}, ValueError, f"^{name}: expected finite values")
+      for name in ("mu", "lam") for value in (float("nan"), float("inf"))),
+    ({"gravity": (0.0, float("nan"), 0.0)}, ValueError, "^gravity: expected finite values, got nan"),
     ({"adjoint": "global"}, TypeError, "adjoint: expected a diffvbd.ReverseSweep, Unrolled or GlobalAdjoint, got str"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("options", "error", "message"), BAD)
 def test_bad_arguments_are_named(options: dict, error: type, message: str) -> None:
     model, inputs = scene_on("cpu", "plain")
     with pytest.raises(error, match=message):
-        dv.solve(model, **inputs, **options)
+        dv.solve(model, **(inputs | options))
 
 
 def test_float32(device: str) -> None:

@@ -284,6 +284,16 @@ def test_check_gradients_names_what_the_loss_must_take_and_return() -> None:
             dv.check_gradients(loss, given)
     with pytest.raises(ValueError, match="loss: expected a scalar with the graph of its arguments, got one that"):
         dv.check_gradients(lambda: torch.ones(()), {})
+    for bad, message in (
+        ({"loss": None}, "loss: expected a function of mu, got NoneType"),
+        ({"arguments": {1: given["mu"]}}, r"arguments: expected a dict of tensors by name, got the keys \[1\]"),
+        ({"relative_steps": []}, "relative_steps: expected a sequence of numbers > 0"),
+        ({"relative_steps": [0.0]}, "relative_steps: expected a finite number > 0"),
+        ({"tolerance": None}, "tolerance: expected a number, got NoneType"),
+        ({"seed": "a"}, "seed: expected an integer, got str"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            dv.check_gradients(**{"loss": lambda mu: mu.square(), "arguments": given, **bad})  # pyright: ignore
 
 
 class WrongBackward(torch.autograd.Function):

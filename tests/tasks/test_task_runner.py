@@ -1,5 +1,6 @@
 """Claim: the runner's stages, optimisers and interruptions leave the numbers that one run in one go would have."""
 
+import errno
 import json
 import math
 import re
@@ -216,6 +217,18 @@ def test_a_picture_that_fails_costs_no_result(tmp_path: Path, capsys: pytest.Cap
     assert [path.name for path in result.files] == ["log.json"]
     assert "no picture.png: no paint" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.json"]
+
+
+def test_a_full_disk_ends_a_run_by_name_and_leaves_no_half_of_a_file(tmp_path: Path) -> None:
+    def fill(path: Path) -> None:
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left on device: .*motion.npz"):
+        solve(toy(animation=fill), Settings(tmp_path))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log.json", "state.pt"]
+    result = solve(toy(animation=lambda path: path.write_bytes(b"whole")), Settings(tmp_path))
+    assert [path.name for path in result.files] == ["log.json", "motion.npz", "animation.gif"]
 
 
 def test_another_run_puts_a_state_aside(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -124,6 +124,7 @@ def test_levels_span_the_legend() -> None:
         ("stress", {}, r"color: stress needs a dv.Model, or a mesh with mu and lam \[Pa\], got neither"),
         ("stress", {"model": MODEL, "mu": 1.0}, r"color: stress needs lam \[Pa\], got None"),
         ("stiffness", {"model": MODEL}, r"color: stiffness needs mu \[Pa\]"),
+        ("stiffness", {"model": MODEL, "mu": float("nan")}, "mu: expected finite numbers, got nan"),
         ("stiffness", {"model": MODEL, "mu": np.ones(3)}, "mu: expected a number or one for each of 12 tets"),
         ("contact", {}, "color: contact needs a dv.Model"),
     ],
@@ -264,6 +265,18 @@ def test_motions_of_a_run_are_kept(tmp_path: Path) -> None:
         STEP * np.arange(7)
     )
     assert [thing.color for thing in recovered.scenery] == [thing.color for thing in things]
+
+
+@pytest.mark.parametrize(
+    "log",
+    ["[" * 10**5, '{"history": 3}', '{"history": [3]}', '{"history": [{"loss": "x"}]}'],
+    ids=["nested too deep", "no rows", "no row", "no loss"],
+)
+def test_the_log_of_a_run_that_is_none_is_refused(log: str, tmp_path: Path) -> None:
+    motion.save_motions(tmp_path / opened.MOTION, MESH.surface, {"target": X[None]}, STEP)
+    (tmp_path / "log.json").write_text(log)
+    with pytest.raises(ValueError, match="log.json: expected the log of a run, got"):
+        opened.opened(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
-"""Claim: the viewer serves a page on this machine alone, draws in a real browser, plays, reruns what sliders ask for,
-follows an optimisation without changing it, and stops."""
+"""Claim: the viewer serves a page on this machine alone and to no other site's page, draws in a real browser, plays,
+reruns what sliders ask for within their limits, follows an optimisation without changing it, and stops."""
 
 import io
 import socket
@@ -59,6 +59,7 @@ def test_it_serves_this_machine_alone_and_stops() -> None:
         ({"source": MESH, "color": "stress"}, ValueError, "color: stress needs a dv.Model"),
         ({"source": MESH, "port": 70000}, ValueError, "port: expected an integer <= 65535, got 70000"),
         ({"source": MESH, "host": ""}, TypeError, "host: expected the name"),
+        ({"source": MESH, "host": "203.0.113.7"}, ValueError, "host: expected .* of this machine, got '203.0.113.7'"),
         ({"source": "none.pvd"}, FileNotFoundError, "none.pvd does not exist"),
         ({"source": MESH, "sliders": {"mu": (0, 1)}}, TypeError, "source: expected a function of mu for sliders"),
         ({"source": fall, "mesh": MODEL}, ValueError, "sliders: expected ranges of the function's parameters"),
@@ -75,6 +76,68 @@ def test_it_serves_this_machine_alone_and_stops() -> None:
 def test_what_cannot_be_shown_is_refused(arguments: dict[str, Any], kind: type, expected: str) -> None:
     with pytest.raises(kind, match=expected):
         live(**arguments)
+
+
+def answer(viewer: dv.viz.Viewer, **headers: str) -> int:
+    """Status of a handshake with these headers; 101: a connection is open."""
+    _, _, place = viewer.url.rpartition("/")
+    host, _, port = place.rpartition(":")
+    lines = {"Host": place, "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+             "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="} | headers  # fmt: skip
+    text = "".join(f"{name}: {value}\r\n" for name, value in lines.items() if value)
+    with socket.create_connection((host, int(port)), timeout=30.0) as connection:
+        connection.sendall(f"GET / HTTP/1.1\r\n{text}\r\n".encode())
+        return int(connection.recv(100).split()[1])
+
+
+def test_pages_of_other_sites_are_refused() -> None:
+    with live(MESH, play=False) as viewer:
+        own = viewer.url.rpartition("/")[2]
+        assert answer(viewer, Origin=viewer.url) == answer(viewer) == 101
+        assert answer(viewer, Host="localhost:9", Origin="http://localhost:9") == 101  # a port that is forwarded
+        for foreign in ("http://site.test", "http://localhost:9", f"http://{own}.site.test", "null"):
+            assert answer(viewer, Origin=foreign) == 403
+        for host in ("site.test", "site.test:80", "127.0.0.1.site.test", ""):  # as after DNS rebinding
+            assert answer(viewer, Host=host, Origin=f"http://{host}") == 403
+        assert answer(viewer, Host="site.test", Upgrade="") == 403  # nor does the page itself arrive
+
+
+def test_values_that_no_slider_has_never_reach_a_function() -> None:
+    import msgspec
+    import viser
+    from websockets.sync.client import connect
+
+    speeds: list[float] = []
+    shown = fall().x
+
+    def throw(speed: float) -> torch.Tensor:
+        speeds.append(speed)
+        return shown
+
+    camera = {"type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, 0, 1), "fov": 1, "near": 1, "far": 9,
+              "image_height": 9, "image_width": 9, "look_at": (0, 0, 0), "up_direction": (0, 1, 0)}  # fmt: skip
+    with live(throw, MODEL, time_step=STEP, sliders={"speed": (0.0, 5.0, 1.0)}, play=False) as viewer:
+        viewer._rerun.delay = 0.0  # pyright: ignore[reportOptionalMemberAccess]
+        panel, slider = viewer._panel, [*viewer._server.gui._gui_input_handle_from_uuid.values()][-1]
+        protocol: Any = [f"viser-v{viser.__version__}"]
+        with connect(viewer.url.replace("http", "ws"), subprotocols=protocol, max_size=None) as page:
+
+            def send(handle: Any, value: Any) -> None:
+                message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
+                page.send(msgspec.msgpack.encode(message))
+
+            page.send(msgspec.msgpack.encode(camera))
+            assert until(lambda: viewer.watched)
+            for value, kept in ((2.0, 2.0), (1e300, 5.0), (-5.0, 0.0), (3.0, 3.0)):
+                send(slider, value)
+                assert until(lambda kept=kept: speeds[-1] == slider.value == kept)
+            controls = (slider, panel.color, panel.speed, panel.frame)
+            for handle, value in zip(controls, (float("nan"), "heat", "nan", 10**9), strict=True):
+                send(handle, value)
+            assert until(lambda: viewer.frame == 8)  # the last one sent
+            assert until(lambda: [handle.value for handle in controls] == [3.0, "body", "1", 8])
+    assert all(0.0 <= speed <= 5.0 for speed in speeds)
+    assert viewer.color == "body" and viewer.clock.speed == 1.0 and viewer.frame == 8
 
 
 def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
