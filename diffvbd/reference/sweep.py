@@ -378,7 +378,7 @@ def _descending(energies: list[Any], hessian: Tensor, raw: Tensor, update: Tenso
     barriers = [energy for energy in energies if hasattr(energy, "limit")]
     whole, square = _square(hessian, raw), dot(raw, raw)
     own, ratio = whole - tau * square, dot(raw, update) / torch.where(square > 0, square, 1.0)
-    near = sum(((b.gap(x) < b.dhat) | (b.gap(x + update) < b.dhat)).any(-2) for b in barriers) > 0
+    near: Any = sum(((b.gap(x) < b.dhat) | (b.gap(x + update) < b.dhat)).any(-2) for b in barriers) > 0
     fraction, found = torch.ones_like(near + whole), torch.zeros_like(near + whole, dtype=torch.bool)
     for _ in range(HALVINGS):
         t, step = fraction * ratio, fraction.unsqueeze(-2) * update
