@@ -142,9 +142,10 @@ def verdict(depths: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> str:
     means += f"; the paper has t = {paper.DEPTH_T[5, 20]} and {paper.DEPTH_T[5, 100]} between 5 sweeps and more."
     theirs = paper.DEPTH[100]["std"] / paper.DEPTH[5]["std"]
     ours = many["std"] / few["std"]
-    present = ours < math.sqrt(theirs)  # nearer to the paper's ratio than to 1
-    spread = (f"In the paper the standard deviation with 100 sweeps is {theirs:.2g} of that with 5. Here {many['sweeps']} "
-              f"sweeps have {ours:.2g} of that with {few['sweeps']}: the effect is {'there' if present else 'absent'}.")  # fmt: skip
+    effect = "there" if ours < math.sqrt(theirs) else "absent"  # nearer to the paper's ratio than to 1
+    spread = (f"In the paper the standard deviation with 100 sweeps is {theirs:.2g} of that with 5. "
+              f"Here {many['sweeps']} sweeps have {ours:.2g} of that with {few['sweeps']}: "
+              f"the effect is {effect}.")  # fmt: skip
     rest = [sorted(row["distances"])[:-1] for row in depths]
     if min(map(len, rest)) > 1:
         spread += (" Without the worst throw of each row it is "
