@@ -39,6 +39,9 @@ files in `bench/results`; no figure here was typed by hand.
 
 Where the paper states a figure for the same quantity, it is shown beside ours. Its scenes, meshes and machines differ,
 as the text of each table says.
+
+Results are as old as their date and commit in this table say, and each page repeats them. The code has changed since:
+`git rev-list --count COMMIT..HEAD` counts by how many commits. Measure again what you rely on.
 """
 
 

@@ -87,8 +87,8 @@ Times are those of the optimisation, without pictures. Runs are repeatable: on o
 numbers, bit by bit. Only parts that run for a given time, such as CMA-ES in learn-controller, depend on the speed of
 the machine.
 
-"bar met" judges the result of every run in the table of the task, and the time on the GPU where the paper states one. The
-last columns of those tables say on which commit a run was made: few are of the present one.
+"bar met" judges the result of every run in the table of the task, and the time on the GPU where the paper states one.
+The last columns of those tables say when and on which commit a run was made: few are of the present one.
 """
 
 
