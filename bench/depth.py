@@ -6,6 +6,7 @@ import itertools
 import math
 import statistics
 import tempfile
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -143,14 +144,15 @@ def verdict(depths: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> str:
     theirs = paper.DEPTH[100]["std"] / paper.DEPTH[5]["std"]
     ours = many["std"] / few["std"]
     effect = "there" if ours < math.sqrt(theirs) else "absent"  # nearer to the paper's ratio than to 1
-    spread = (f"In the paper the standard deviation with 100 sweeps is {theirs:.2g} of that with 5. "
-              f"Here {many['sweeps']} sweeps have {ours:.2g} of that with {few['sweeps']}: "
+    spread = (f"In the paper the standard deviation with 100 sweeps is {theirs:.2f} times that with 5. "
+              f"Here with {many['sweeps']} it is {ours:.2f} times that with {few['sweeps']}: "
               f"the effect is {effect}.")  # fmt: skip
     rest = [sorted(row["distances"])[:-1] for row in depths]
     if min(map(len, rest)) > 1:
         spread += (" Without the worst throw of each row it is "
                    f"{', '.join(f'{statistics.stdev(values):.2g}' for values in rest)} m.")  # fmt: skip
-    return f"{means} {spread} {few['sweeps']} sweeps leave {1000 * few['unsolved']:.2g} mm unsolved at most."
+    unsolved = f"{few['sweeps']} sweeps leave {1000 * few['unsolved']:.2g} mm of a distance unsolved at most."
+    return textwrap.fill(f"{means} {spread} {unsolved}", 120)
 
 
 def bound(df: float) -> float:
