@@ -88,7 +88,7 @@ numbers, bit by bit. Only parts that run for a given time, such as CMA-ES in lea
 the machine.
 
 "bar met" judges the result of every run in the table of the task, and the time on the GPU where the paper states one.
-The last columns of those tables say when and on which commit a run was made: few are of the present one.
+The last columns of those tables say when and on which commit a run was made, often an earlier one than the present.
 """
 
 
