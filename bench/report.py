@@ -120,7 +120,8 @@ def section(results: Path) -> str:
         if path.exists():
             content = json.loads(path.read_text(encoding="utf-8"))
             tables = importlib.import_module(f"bench.{name}").markdown(content["results"])
-            parts.append(machine(content["environment"]) + "\n\n" + tables)
+            e = content["environment"]
+            parts.append(f"{machine(e)} Commit {commit(e)}.\n\n{tables}")
     return "\n".join(parts) or EMPTY
 
 
