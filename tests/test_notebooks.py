@@ -1,5 +1,5 @@
-"""Claim: the tutorials are stored without outputs, small and portable, all are in the navigation, assert what their text
-says, and the first of them finds it."""
+"""Claim: the tutorials are stored without outputs, small and portable, all are in the navigation and assert what their
+text says, and the first of them finds it."""
 
 import importlib.util
 import json
