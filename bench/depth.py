@@ -6,6 +6,7 @@ import itertools
 import math
 import statistics
 import tempfile
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,17 +24,16 @@ CONVERGED = 500  # sweeps that judge what was found with fewer
 STARTS, JITTER, SEED = 8, 0.15, 0  # first states around the task's own; standard deviation of each number, relative
 ITERATIONS = 40
 PAPER_COLUMNS = ("mean", "std", "min", "max", "default")
-COLUMNS = ("mean", "std", "median", "min", "max", "near", "default", "converged")
+COLUMNS = ("mean", "std", "median", "min", "max", "near", "default", "converged", "unsolved")
 
 INTRODUCTION = """\
 Best distance [m] of the cube's center of mass from its target after the bounce, within {iterations} iterations of Adam,
 from {starts} first states: height, and velocity along each axis, of the task's own first state times 1 + {jitter:g} n
 with n normal. "default" starts from that state itself. Every result is a new rollout of the best throw with the sweeps
-it was found with; "converged" is the median distance of the same throws with {converged} sweeps. "near" counts the
-throws that pass within {near:g} m, which the paper's cube reaches in 151 iterations. Mean and standard deviation
+it was found with; "converged" is the median distance of the same throws with {converged} sweeps, and "unsolved" by how
+much the distance of one throw changes with them, at most. "near" counts the throws that pass within {near:g} m, which
+the paper's cube reaches in 151 iterations. Mean and standard deviation
 include throws that end in a local minimum far from the target; the median and the count say how many do not.
-
-How much depth matters depends on the cube, whose stiffness was chosen so that 5 sweeps leave its steps unsolved.
 """
 
 
@@ -67,6 +67,7 @@ def study(sweeps: int, starts: int, iterations: int, converged: int) -> dict[str
         "max": max(found[1:]),
         "default": found[0],
         "converged": statistics.median(judged[1:]),
+        "unsolved": max(abs(a - b) for a, b in zip(found[1:], judged[1:], strict=True)),
         "near": sum(distance <= paper.BOUNCE_DISTANCE for distance in found[1:]),
         "seconds": history[-1]["seconds"],
     }
@@ -132,6 +133,34 @@ def welch(a: Sequence[float], b: Sequence[float]) -> dict[str, float]:
     }
 
 
+def verdict(depths: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> str:
+    """What the tables show, in sentences that follow from their numbers."""
+    few, many = depths[0], depths[-1]
+    apart = [f"{a} and {b}" for row in pairs for a, b in [row["sweeps"]] if abs(row["t"]) > bound(row["df"])]
+    t = max(abs(row["t"]) for row in pairs)
+    means = (f"The means with {', with '.join(apart)} sweeps differ at the 5 % level" if apart else
+             f"**Depth makes no difference to the means**: |t| is {t:.2g} at most")  # fmt: skip
+    means += f"; the paper has t = {paper.DEPTH_T[5, 20]} and {paper.DEPTH_T[5, 100]} between 5 sweeps and more."
+    theirs = paper.DEPTH[100]["std"] / paper.DEPTH[5]["std"]
+    ours = many["std"] / few["std"]
+    effect = "there" if ours < math.sqrt(theirs) else "absent"  # nearer to the paper's ratio than to 1
+    spread = (f"In the paper the standard deviation with 100 sweeps is {theirs:.2f} times that with 5. "
+              f"Here with {many['sweeps']} it is {ours:.2f} times that with {few['sweeps']}: "
+              f"the effect is {effect}.")  # fmt: skip
+    rest = [sorted(row["distances"])[:-1] for row in depths]
+    if min(map(len, rest)) > 1:
+        spread += (" Without the worst throw of each row it is "
+                   f"{', '.join(f'{statistics.stdev(values):.2g}' for values in rest)} m.")  # fmt: skip
+    unsolved = f"{few['sweeps']} sweeps leave {1000 * few['unsolved']:.2g} mm of a distance unsolved at most."
+    return textwrap.fill(f"{means} {spread} {unsolved}", 120)
+
+
+def bound(df: float) -> float:
+    """What |t| exceeds by chance in one case of twenty (the quantile's expansion in 1 / df)."""
+    z = 1.959964
+    return z + (z**3 + z) / (4 * df) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * df**2)
+
+
 def markdown(results: dict[str, Any]) -> str:
     depths = results["depths"]
     text = INTRODUCTION.format(starts=len(depths[0]["starts"]), near=paper.BOUNCE_DISTANCE,
@@ -144,4 +173,5 @@ def markdown(results: dict[str, Any]) -> str:
     header = ["sweeps", "start, mean", *COLUMNS, *(f"paper, {key}" for key in PAPER_COLUMNS)]
     tests = [[*row["sweeps"], row["t"], row["df"], paper.DEPTH_T.get(tuple(row["sweeps"]))] for row in results["pairs"]]
     table = markdown_table(["sweeps", "sweeps", "Welch's t", "degrees of freedom", "paper, t"], tests)
-    return f"{text}\n{markdown_table(header, rows)}\nDifferences of the means:\n\n{table}"
+    said = verdict(depths, results["pairs"])
+    return f"{text}\n{said}\n\n{markdown_table(header, rows)}\nDifferences of the means:\n\n{table}"

@@ -121,6 +121,7 @@ class Task:
     iterations: str
     outcome: str
     bars: dict[str, float]
+    seconds: float | None = None  # the paper's time on its GPU, where it states one
 
 
 # Bars are the paper's results or about as strict; the last three tasks are not in it.
@@ -132,7 +133,7 @@ TASKS = {
     "flag-wind": Task("199", "loss 32 -> 5.1e-3 m^2", {"loss": 5e-3}),
     "cube-bounce": Task("151", "0.304 -> 0.013 m", {"distance": BOUNCE_DISTANCE}),
     "bunny-bounce": Task("100", "0.035 -> 0.034 m", {"distance": 0.034}),
-    "cover-the-spot": Task("600", f"0.0 % uncovered, < {COVER_SECONDS} s", {"uncovered": 0.0}),
+    "cover-the-spot": Task("600", f"0.0 % uncovered, < {COVER_SECONDS} s", {"uncovered": 0.0}, COVER_SECONDS),
     "cape-mu": Task("80", "mu 0.16 %", {"mu": 1.6e-3}),
     "dress-size": Task("80", "scale < 0.5 %", {"size": 5e-3}),
     "cape-wind": Task("120", "wind < 0.3 %", {"deviation": 3e-3}),

@@ -39,6 +39,9 @@ files in `bench/results`; no figure here was typed by hand.
 
 Where the paper states a figure for the same quantity, it is shown beside ours. Its scenes, meshes and machines differ,
 as the text of each table says.
+
+Results are as old as their date and commit in this table say, and each page repeats them. The code has changed since:
+`git rev-list --count COMMIT..HEAD` counts by how many commits. Measure again what you rely on.
 """
 
 
@@ -117,7 +120,8 @@ def section(results: Path) -> str:
         if path.exists():
             content = json.loads(path.read_text(encoding="utf-8"))
             tables = importlib.import_module(f"bench.{name}").markdown(content["results"])
-            parts.append(machine(content["environment"]) + "\n\n" + tables)
+            e = content["environment"]
+            parts.append(f"{machine(e)} Commit {commit(e)}.\n\n{tables}")
     return "\n".join(parts) or EMPTY
 
 

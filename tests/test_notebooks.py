@@ -1,5 +1,5 @@
-"""Claim: the tutorials are stored without outputs, small and portable, all are in the navigation, and the first of them
-finds what it says."""
+"""Claim: the tutorials are stored without outputs, small and portable, all are in the navigation and assert what their
+text says, and the first of them finds it."""
 
 import importlib.util
 import json
@@ -66,6 +66,15 @@ def test_faults_are_found() -> None:
 def test_nothing_is_stored_but_text_and_code(path: Path) -> None:
     assert faults(read(path)) == [], "clear all outputs before you commit"
     assert path.stat().st_size <= LARGEST
+
+
+@notebooks
+def test_text_is_asserted_and_no_fallback_is_silent(path: Path) -> None:
+    code = [source(cell) for cell in read(path)["cells"] if cell["cell_type"] == "code"]
+    assert sum("\nassert " in f"\n{text}" or "\n    assert " in text for text in code) >= 2
+    for text in code:
+        for handler in text.split("except ")[1:]:
+            assert "print(" in re.split(r"\n(?=\S)", handler)[0], f"silent fallback: {handler}"
 
 
 @notebooks

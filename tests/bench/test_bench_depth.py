@@ -2,6 +2,7 @@
 
 import json
 import math
+import statistics
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,20 @@ def test_quick_run_brings_every_throw_closer(tmp_path: Path) -> None:
     assert abs(few["converged"] - few["median"]) > 1e-5
     text = (tmp_path / "depth.md").read_text()
     assert "| 5 | 20 |" in text and "| paper, mean |" in text and "| 0.052 |" in text
+
+
+def test_page_says_what_its_numbers_say() -> None:
+    """Depth that helps the mean and narrows the spread, and depth that does neither."""
+
+    def said(many: list[float]) -> str:
+        rows = [{"sweeps": k, "distances": d, "std": statistics.stdev(d), "unsolved": 1e-3}
+                for k, d in ((5, [0.15, 0.2, 0.25]), (100, many))]  # fmt: skip
+        return depth.verdict(rows, [{"sweeps": [5, 100], **depth.welch(rows[0]["distances"], many)}])
+
+    better, same = said([0.010, 0.012, 0.011]), said([0.15, 0.2, 0.25])
+    assert "5 and 100 sweeps differ" in better and "the effect is there" in better
+    assert "no difference" in same and "the effect is absent" in same
+    assert depth.bound(14) == pytest.approx(2.145, abs=2e-3)  # of Student's table
 
 
 def test_throw_of_a_batch_moves_as_if_alone(tmp_path: Path) -> None:
