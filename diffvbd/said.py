@@ -6,6 +6,8 @@ import contextlib
 import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 
 import torch
@@ -27,6 +29,26 @@ def page(name: str) -> str:
 def percent(share: float) -> str:
     """A share [-] with two digits, as "0.52 %", "17 %" or "220 %"."""
     return f"{100 * share:.2g} %" if 100 * share < 99.5 else f"{100 * share:.0f} %"
+
+
+_silent: ContextVar[bool] = ContextVar("diffvbd.silent", default=False)
+
+
+def is_silent() -> bool:
+    """Whether nobody would hear a warning, so that nothing need be looked at for one."""
+    return _silent.get()
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Inside, nothing is warned of."""
+    token = _silent.set(True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            _silent.reset(token)
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

@@ -43,6 +43,11 @@ def is_captured(value: Tensor) -> bool:
     return value.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
+def may_copy(value: Tensor) -> bool:
+    """Whether a value on CUDA may be copied to the host while the device works on."""
+    return value.is_cuda and not torch.compiler.is_compiling() and not is_captured(value) and not transformed()
+
+
 def transformed() -> bool:
     """Whether a transform of torch.func is under way. Under torch.compile one may be, unseen."""
     if torch.compiler.is_compiling():

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
-from ..said import page, warn
-from .growth import GROWS, STEPS_SEEN, warn_of_growth
-from .tet_shapes import inside_out, shapes_of_tets
+from ..said import page, silence, warn
+from .tet_shapes import inside_out, thinness
 
 if TYPE_CHECKING:
     from .model import Model
@@ -30,9 +29,8 @@ THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
 # of a Model's _derived: what is said once, or ever more seldom
-THIN_SEEN, OVER_RELAXED, CONTACT_SEEN = "thin", "over-relaxed", "contact of rollouts"
-HELD_UP, HELD_UP_SEEN, ERRATIC = "held up", "steps held up", "erratic gradients"
-ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, CONTACT_SEEN, HELD_UP, HELD_UP_SEEN, ERRATIC)
+HELD_UP_SEEN, ERRATIC = "steps held up", "erratic gradients"
+ONCE = (HELD_UP_SEEN, ERRATIC)
 
 
 def warn_of(model: Model) -> None:
@@ -100,29 +98,11 @@ def _bodies_of(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return names, first, of
 
 
-def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, scheme: str) -> None:
-    """Warns, once for each Model, of moduli that its settings do not suit.
-
-    Args:
-        mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
-        time_step, sweeps: Of the step.
-        scheme: Name of its integrator.
-    """
-    if sweeps == 0 or not model.mesh.num_tets:
-        return
-    _warn_of_thin_tets(model, mu, lam, time_step, sweeps)
-    _warn_of_over_relaxation(model, mu, lam)
-    if model._derived.get(OVER_RELAXED) == 0:  # it has warned, of the same
-        return
-    warn_of_growth(model, mu, lam, time_step, sweeps, scheme)
-
-
 @contextlib.contextmanager
 def silent(model: Model) -> Iterator[None]:
     """Inside, nothing is warned of, and what would have been said once of this Model is still to be said after it."""
     before = {id(m): {name: m._derived[name] for name in ONCE if name in m._derived} for m in _with_settings(model)}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silence():
         try:
             yield
         finally:
@@ -142,34 +122,16 @@ def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
     return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
 
 
-def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
-    """Moduli may change from step to step: those of the 1st, 2nd, 4th, 8th, ... are looked at."""
-    seen = model._derived.get(OVER_RELAXED, 0) + 1  # 0: it has warned
-    if seen == 1 and OVER_RELAXED in model._derived or model.relaxation <= 1:
-        return
-    model._derived[OVER_RELAXED] = seen
-    if seen & (seen - 1) or not any(isinstance(e, StableNeoHookean) for e in model.energies):
-        return
-    if is_nearly_incompressible(mu, lam):
-        model._derived[OVER_RELAXED] = 0
-        warn(
-            f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
-            "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
-            'coarse="auto" in place of it',
-        )
-
-
-def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
-    """Tets so thin that few sweeps leave a sheet without stiffness.
+def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+    """Warns of tets so thin that few sweeps leave a sheet without stiffness; moduli [Pa] that may be looked at.
 
     The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
     sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
     corrections move them together.
     """
-    if THIN_SEEN in model._derived or model.coarse is not None:
+    if sweeps == 0 or not model.num_tets or model.coarse is not None:
         return
-    model._derived[THIN_SEEN] = True
-    aspect, height = (float(np.median(value)) for value in shapes_of_tets(model))
+    aspect, height = thinness(model)
     if aspect < THIN:
         return
     needed = min(aspect, _crossed(model, mu, lam, time_step, height)) ** 2 * (2 - model.relaxation) / model.relaxation

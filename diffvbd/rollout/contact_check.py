@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ..model.model import Model
-from ..model.warnings import CONTACT_SEEN, HELD_UP
-from ..said import page, percent, warn
+from ..said import is_silent, page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
@@ -29,7 +28,7 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
         return False
     if asked:
         return not is_captured(x)
-    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and CONTACT_SEEN not in model._derived
+    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and not is_silent()
 
 
 def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
@@ -64,10 +63,7 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     shares = torch.stack(cuts).tolist()
     cut = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
-    if cut > CUT or left > UNBALANCED_FRICTION:
-        model._derived[CONTACT_SEEN] = True
     if cut > CUT:
-        model._derived[HELD_UP] = True
         warn(
             f"pair_barrier: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "

@@ -14,11 +14,12 @@ from torch import Tensor
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_count, check_function, fail, is_word
 from ..model.model import Model
-from ..model.warnings import warn_of_inverted_bodies, warn_of_material
+from ..model.warnings import warn_of_inverted_bodies
 from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
+from ..step.growth import warn_of_sweeps
 from ..step.held_up import cut_share
 from ..step.integrators import (
     History,
@@ -33,7 +34,8 @@ from ..step.intersections import check_start as refuse_start
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .chosen import rollout_with
 from .contact_check import checks_contact, warn_of_contact
-from .energy_check import look_at_energy, warn_of_end, warn_of_last_end
+from .end_check import look_at_end, warn_of_last_end
+from .energy_check import look_at_energy
 from .finer import rollout_finer
 from .repeated import repeated
 from .settings import Settings
@@ -168,9 +170,8 @@ def rollout(
     chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": execution}
     anew = any(_changes(value) for value in (*(options[k] for k in _STATIC), *own.values()))
     fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
-    if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
-        warn_of_material(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps,
-                         type(scheme).__name__)  # fmt: skip
+    if fixed is not None and steps:
+        warn_of_sweeps(model, fixed, scheme)
     for value in _tensors(options["prescribed"]):
         check_prescribed(model, value, x)
     if check_start and steps:
@@ -195,6 +196,7 @@ def rollout(
     driven = any(options[k] is not None for k in ("force", "prescribed", "colliders")) or _changes(options["gravity"])
     energy = None if driven else look_at_energy(check_energy, model, x, v, steps, fixed, options["gravity"])
     warn_of_last_end(model, x)
+    ending = look_at_end(check_energy, model, scheme, x, v, steps, execution)
 
     outer = x
 
@@ -208,16 +210,20 @@ def rollout(
                 now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
                 given = _to_advance(model, options, k, x, v, outer, colliders_before)
                 check_staged(scheme, given)
+                v_before = v
                 x, v, past, solve = take(scheme, model, x, v, past, now, given, run)
             except (ValueError, TypeError) as error:
                 if type(error) not in (ValueError, TypeError):  # another one may take other arguments
                     raise
-                raise type(error)(f"{error} (in step {k})") from error
+                more = "" if ending is None else ending.explain(error, x, v)
+                raise type(error)(f"{error} (in step {k}){more}") from error
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
             if energy is not None:
                 energy.see(k + 1, x, v)
+            if ending is not None:
+                ending.see(k + 1, now, given["force"], solve, v_before, x, v)
             if looks and not last:  # not in a segment that runs again
                 cuts.append(cut_share(model))
             if looks and k + 1 == steps and not last:
@@ -238,7 +244,8 @@ def rollout(
         last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
     if energy is not None:
         energy.warn()
-    warn_of_end(model, *done.end[:2])
+    if ending is not None:
+        ending.warn(*done.end[:2], options["gravity"])
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     trajectory = Trajectory(
         x=torch.stack([f[1] for f in frames]),
