@@ -122,6 +122,21 @@ def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
     return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
 
 
+def warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> bool:
+    """Warns of over-relaxed sweeps of what is nearly incompressible, whose growth may be too slow to be measured;
+    whether it did."""
+    if model.relaxation <= 1 or not any(isinstance(e, StableNeoHookean) for e in model.energies):
+        return False
+    if not is_nearly_incompressible(mu, lam):
+        return False
+    warn(
+        f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
+        "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
+        'coarse="auto" in place of it',
+    )
+    return True
+
+
 def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
     """Warns of tets so thin that few sweeps leave a sheet without stiffness; moduli [Pa] that may be looked at.
 
@@ -129,7 +144,7 @@ def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, s
     sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
     corrections move them together.
     """
-    if sweeps == 0 or not model.num_tets or model.coarse is not None:
+    if model.coarse is not None:
         return
     aspect, height = thinness(model)
     if aspect < THIN:

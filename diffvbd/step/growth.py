@@ -25,7 +25,7 @@ from ..mesh import TetMesh
 from ..model.model import Model
 from ..model.replaced import replaced_arguments
 from ..model.tet_shapes import height_of_tets
-from ..model.warnings import warn_of_thin_tets
+from ..model.warnings import warn_of_over_relaxation, warn_of_thin_tets
 from ..said import is_silent, page, warn
 from ..scopes import looks_at
 from ..tuples import replaced
@@ -72,8 +72,12 @@ def warn_of_sweeps(model: Model, prepared: Prepared, integrator: Integrator) -> 
     if not (looks_at(prepared.mu) and looks_at(prepared.lam)) or is_silent():
         return
     h, sweeps = prepared.time_step_and_sweeps
+    if not sweeps or not model.num_tets:
+        return
     warn_of_thin_tets(model, prepared.mu, prepared.lam, h, sweeps)
-    if not _proven.get() and (message := growth_message(model, prepared, integrator)):
+    if warn_of_over_relaxation(model, prepared.mu, prepared.lam) or _proven.get():
+        return
+    if (message := growth_message(model, prepared, integrator)):
         warn(message)
 
 
@@ -215,7 +219,7 @@ def growth(model: Model, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: i
         total = total - 2 * scale.log()
         x, v = rest + scale * (x - rest), scale * v
         if history is not None:
-            history = history._replace(moved=scale * history.moved, v=scale * history.v)
+            history = replaced(history, moved=scale * history.moved, v=scale * history.v)
         if len(logs) == STEPS + 1 and _factor(logs, BURN, STEPS) > GROWS:
             last = STEPS + MORE
     return _factor(logs, last - (STEPS - BURN), last)
