@@ -137,6 +137,17 @@ def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def unheard() -> Iterator[None]:
+    """Inside, steps are recorded nowhere and not checked: they are none of the caller's."""
+    checked, recording = _checking.set(False), _recording.set(())
+    try:
+        yield
+    finally:
+        _recording.reset(recording)
+        _checking.reset(checked)
+
+
+@contextlib.contextmanager
 def refined(factors: tuple[int, int, list[int]] | None) -> Iterator[None]:
     """Inside, refinement() is ``factors``; None: a refined rollout runs as it stands."""
     token = _refining.set(factors)

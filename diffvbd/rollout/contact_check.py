@@ -14,7 +14,9 @@ from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
 from ..step.contact_cycles import CUT
 from ..step.held_up import what_helps
+from ..step.integrators import Solve
 from ..step.predict import begin
+from ..step.unsolved import unsolved
 
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 
@@ -33,7 +35,8 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
 
 def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
                         given: dict[str, Any]) -> float:  # fmt: skip
-    """The largest share of the friction on a body that a step left unbalanced [-]; 0 where it cannot be told.
+    """What a step left unbalanced along the contact of a body, over the most that friction can bear there [-], the
+    largest; 0 where it cannot be told.
 
     Args:
         before: State (x, v) before the step.  x: Positions after it.  given: Its other arguments, as of advance().
@@ -69,10 +72,16 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
             f"{percent(CUT)}); " + what_helps(model),
         )
-    if left > UNBALANCED_FRICTION:
+    if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
         faster = ' a Model with coarse="auto",' if model.coarse is None else ""
         warn(
-            f"friction: {percent(left)} of it is not balanced in the last step: the sweeps have not converged, and "
+            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not converged, and "
             f"the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a smaller "
             "time_step or a larger Friction(velocity=); " + page("contact.md"),
         )
+
+
+def _matters(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]) -> bool:
+    """Whether what a step has left unbalanced would have moved a body, beside what forces do in a step."""
+    found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
+    return found is not None and found.error > UNBALANCED_FRICTION * found.forced

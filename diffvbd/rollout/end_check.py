@@ -39,7 +39,7 @@ class EndLook:
 
     model: Model
     integrator: Integrator
-    start: tuple[Tensor, Tensor]
+    start: tuple[Tensor, ...]  # positions and velocities
     steps: int
     time_step: float
     at: frozenset[int]  # steps whose sweeps are looked at; none: only whether the end is lost
@@ -83,6 +83,10 @@ class EndLook:
             _warn_of_loss("the rollout", finite, self.fault())
         elif self.at:
             self._warn_of_sweeps(duration)
+
+    def forget(self) -> None:
+        """Lets go of tensors, which a segment that runs again in a backward would keep."""
+        self.kept, self.last, self.start = {}, None, ()
 
     def fault(self) -> str:
         """What is at fault where the state that the latest step has left is lost."""

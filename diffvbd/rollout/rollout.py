@@ -246,6 +246,7 @@ def rollout(
         energy.warn()
     if ending is not None:
         ending.warn(*done.end[:2], options["gravity"])
+        ending.forget()
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     trajectory = Trajectory(
         x=torch.stack([f[1] for f in frames]),

@@ -27,7 +27,7 @@ from ..model.replaced import replaced_arguments
 from ..model.tet_shapes import height_of_tets
 from ..model.warnings import warn_of_over_relaxation, warn_of_thin_tets
 from ..said import is_silent, page, warn
-from ..scopes import looks_at
+from ..scopes import looks_at, unheard
 from ..tuples import replaced
 from .advance import advance
 from .arguments import Prepared, acceleration_of, prepare
@@ -92,7 +92,7 @@ def growth_message(model: Model, prepared: Prepared, integrator: Integrator) -> 
     key = (type(integrator).__name__, h, sweeps, *_mark(mu), *_mark(lam))
     known = model._derived.setdefault(EIGENVALUES, {})
     if key not in known:
-        with torch.no_grad(), torch.autocast("cpu", enabled=False), torch.inference_mode(False):
+        with torch.no_grad(), torch.autocast("cpu", enabled=False), torch.inference_mode(False), unheard():
             known[key] = _message(model, mu.double(), lam.double(), h, sweeps, integrator)
     return known[key]
 

@@ -24,7 +24,7 @@ def size_of(model: Model) -> float:
     return model.derived("size", lambda: float((model._rest_points.amax(0) - model._rest_points.amin(0)).norm()))
 
 
-def reach_of(model: Model, start: tuple[Tensor, Tensor], x: Tensor, gravity: Any, duration: float) -> Tensor:
+def reach_of(model: Model, start: tuple[Tensor, ...], x: Tensor, gravity: Any, duration: float) -> Tensor:
     """How far the farthest vertex is from where it began, over the Model's size, beside what its velocity, gravity and
     its pins may have given it [-]."""
     x0, v0 = (t.detach() for t in start)

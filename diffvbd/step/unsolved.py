@@ -18,11 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..adjoint.contact_potential import ContactPotential
 from ..adjoint.potential import IncrementalPotential
 from ..model.model import Model
 from ..model.rest import shape_gradients
-from .arguments import Prepared, acceleration_of
-from .balance import of_bodies, potential_of_step, rounding, share
+from .arguments import Prepared, acceleration_of, collider_state
+from .balance import contact_of_step, of_bodies, potential_of_step, rounding, share
 from .integrators import Solve
 from .predict import begin
 
@@ -93,9 +94,13 @@ def unsolved(model: Model, solve: Solve, x: Tensor, known: dict[tuple[int, int],
                       given["prescribed"])  # fmt: skip
         end = x.reshape(begun.y.shape)
         end = end if begun.origin is None else end - begun.origin
-        at = potential_of_step(model, end, begun, prepared, None)
-        inertia, elastic = at.free * at.inertia(), at.free * at.elastic()
-        forces = at.free * at.forces() if model.vertex_energies else elastic
+        where = collider_state(model, solve.x, given["colliders"], given["colliders_before"])
+        try:
+            at = potential_of_step(model, end, begun, prepared, contact_of_step(model, begun, prepared, where))
+            inertia, elastic = at.free * at.inertia(), at.free * at.elastic()
+            forces = at.free * at.forces() if model.vertex_energies or where is not None else elastic
+        except ValueError:  # surfaces that touch; the next step says where
+            return None
         left, norm, scene, body = inertia + forces, of_bodies(model), 0, 0
         bodies = model.derived("labelled", lambda: int(model.body.max()) + 1)
         if len(end) * bodies > 1:
@@ -135,8 +140,11 @@ def _of_body(model: Model, at: IncrementalPotential, prepared: Prepared, scene: 
     arms = [a - (weight * a).sum(0) / weight.sum() for a in (now, of.rest)]
     u, _, vt = np.linalg.svd(arms[0].T @ (weight * arms[1]))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    for energy, data in at._vertex_energies(at.data) if pushed else ():
-        blocks = array(energy.blocks(at.x, at.x_prev, data, at.h, at.origin))
+    added = [energy.blocks(at.x, at.x_prev, data, at.h, at.origin) for energy, data in at._vertex_energies(at.data)]
+    if isinstance(at, ContactPotential):  # as stiff along a surface as across it
+        trace = at.h**2 * at.step_contact.stiffness(at.contact)
+        added.append(trace[..., None, None] * torch.eye(3, dtype=trace.dtype, device=trace.device))
+    for blocks in map(array, added if pushed else ()):
         acts = blocks.any((1, 2)) & (mass[:, 0] > 0)
         if acts.any():
             matrix += np.einsum("nf,ncd,ng->cfdg", q[acts], turn.T @ blocks[acts] @ turn, q[acts], optimize=True)
