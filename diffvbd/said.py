@@ -36,7 +36,7 @@ _silent: ContextVar[bool] = ContextVar("diffvbd.silent", default=False)
 
 def is_silent() -> bool:
     """Whether nobody would hear a warning, so that nothing need be looked at for one."""
-    return _silent.get()
+    return not torch.compiler.is_compiling() and _silent.get()
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ from .predict import begin
 
 DEPENDENT = 1e-9  # of the largest singular value: below it a polynomial is a combination of the others
 NO_MATTER = 0.01  # of what forces did in the step: below it, it is not asked whether rounding left the error
-CHUNK = 20_000  # tets that are summed at once
+CHUNK = 2000  # tets that are summed at once
 
 
 class Unsolved(NamedTuple):
