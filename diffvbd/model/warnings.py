@@ -26,6 +26,9 @@ HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 # the wrong sign at 20 and at 40 was 7e5 times too large
 ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
+TOO_STIFF = 0.55  # times aspect^2: so much too stiff were sheets of one layer, from 3.4 to 24
+MOST_BODIES = 8  # whose bending is looked at
+BENT = 0.01  # of the height of a tet, by which a body is no longer an affine image of its rest shape
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
 # of a Model's _derived: what is said once, or ever more seldom
@@ -157,6 +160,34 @@ def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, s
             f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
             "material. Linear tets this thin are also much too stiff in bending; " + page("numerics.md"),
         )
+
+
+def warn_of_bending(model: Model, x: Tensor) -> None:
+    """Warns of thin tets that a state x [..., V, 3] bends: linear ones lock."""
+    aspect, height = thinness(model) if model.num_tets else (0.0, 0.0)
+    if aspect < THIN:
+        return
+    for vertices, terms, inverse in model.derived("affine maps", lambda: _affine_maps(model)):
+        now = x.detach().reshape(-1, *x.shape[-2:])[:, vertices].double()
+        off = (now - terms @ (inverse @ now)).square().sum(-1).mean(-1).sqrt()
+        if float(off.max()) > BENT * height:
+            warn(
+                f"mesh: tets {aspect:.2g} times as wide as thick bend here: linear ones are too stiff for that, about "
+                f"{TOO_STIFF * aspect**2:.0f} times; divide Young's modulus by as much where only bending counts, or "
+                "take tets as wide as thick; " + page("numerics.md")
+            )
+            return
+
+
+def _affine_maps(model: Model) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Of each of the first bodies its vertices [n], the terms of an affine map of them [n, 4], and their inverse."""
+    out = []
+    for body in range(min(MOST_BODIES, int(model.body.max()) + 1)):
+        vertices = (model.body == body).nonzero()[:, 0]
+        rest = model._rest_points[vertices].double()
+        terms = torch.cat([torch.ones_like(rest[:, :1]), rest - rest.mean(0)], 1)
+        out.append((vertices, terms, torch.linalg.pinv(terms)))
+    return out
 
 
 def _crossed(model: Model, mu: Tensor, lam: Tensor, time_step: float, height: float) -> float:

@@ -13,16 +13,19 @@ from torch import Tensor
 
 from ..mask import ELASTIC
 from ..model.model import Model
+from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
 from ..said import is_silent, page, percent, warn
 from ..scopes import looks_at, may_copy
 from ..step.arguments import Prepared
 from ..step.integrators import Integrator, Solve
-from ..step.lost import FAR, fault_of, reach_of
+from ..step.lost import FAR, fault_of, reach_of, size_of
 from ..step.unsolved import Unsolved, unsolved
 from ..tuples import replaced
 
 WRONG = 0.05  # of the motion: an estimate above it is warned of
+MADE_GOOD = 2.5  # with coarse corrections the next steps make good most of an error: it was 1 / 2.4 to 1 / 40 as large
+UNSEEN = 1e-6  # of the Model's size: by less nothing is wrong
 LEAST_STEPS = 10  # of a rollout whose sweeps are looked at unasked: a look costs as much as some steps
 EVERY, MOST = 75, 4  # steps between two looks, and looks at most, beside that at the hardest step
 ENDED = "ended"  # of a Model's _derived, on CUDA: how its latest rollouts ended, on the way to the host
@@ -42,7 +45,8 @@ class EndLook:
     start: tuple[Tensor, ...]  # positions and velocities
     steps: int
     time_step: float
-    at: frozenset[int]  # steps whose sweeps are looked at; none: only whether the end is lost
+    asked: bool  # whether to look at more than whether the end is lost
+    at: frozenset[int]  # steps whose sweeps are looked at
     kept: dict[int, tuple[Solve, Tensor]] = field(default_factory=dict)
     hardest: tuple[int, float] = (0, 0.0)  # a step, and by how much its velocities changed, root sum of squares
     forced: float = 0.0  # sum of the squares of that
@@ -75,14 +79,17 @@ class EndLook:
         with torch.no_grad():
             reach = reach_of(model, self.start, x, gravity, duration)
             good = torch.stack([torch.isfinite(x).all() & torch.isfinite(v).all(), reach <= FAR])
-        if not looks_at(x):
+        if not looks_at(x) and not self.asked:
             _say_later(model, good)
             return
         finite, near = good.tolist()
         if not (finite and near):
             _warn_of_loss("the rollout", finite, self.fault())
-        elif self.at:
+            return
+        if self.at:
             self._warn_of_sweeps(duration)
+        if self.asked:
+            warn_of_bending(model, x)
 
     def forget(self) -> None:
         """Lets go of tensors, which a segment that runs again in a backward would keep."""
@@ -96,9 +103,12 @@ class EndLook:
 
     def explain(self, error: Exception, x: Tensor, v: Tensor) -> str:
         """The end of a message of a step that refuses the state that earlier ones have left."""
-        if self.last is None or not str(error).startswith(("x:", "v:")) or not looks_at(x):
+        if self.last is None or not str(error).startswith(("x:", "v:", "x, v:")) or not looks_at(x):
             return ""
-        return "" if bool(torch.isfinite(x).all() and torch.isfinite(v).all()) else f", which the steps before made; {self.fault()}"
+        largest = float(torch.stack([(x - self.start[0]).abs().amax(), v.abs().amax()]).amax())
+        if largest <= FAR * size_of(self.model):
+            return ""
+        return f", which the steps before made; {self.fault()}"
 
     def _warn_of_sweeps(self, duration: float) -> None:
         known: dict[tuple[int, int], np.ndarray] = {}
@@ -115,7 +125,9 @@ class EndLook:
         share = math.sqrt(left / forced) if forced > 0 else math.inf
         acceleration = math.sqrt(self.forced / self.steps) / self.time_step
         error = share * max(1.0, 0.5 * duration * math.sqrt(acceleration / way) if way > 0 else 1.0)
-        if not error > WRONG:
+        error /= 1.0 if self.model.coarse is None else MADE_GOOD
+        distance = max(self.steps * math.sqrt(left / len(found)), error * way / math.sqrt(self.start[0][..., 0].numel()))
+        if not (error > WRONG and distance > UNSEEN * size_of(self.model)):
             return
         worst = max(found, key=lambda u: u.error)
         of = f"body {worst.body}" + (f" of scene {worst.scene}" if worst.scene else "")
@@ -132,13 +144,11 @@ def look_at_end(asked: bool | None, model: Model, integrator: Integrator, x: Ten
     """A look at a rollout; None where nothing may be looked at."""
     if steps == 0 or x.numel() == 0 or is_silent() or not (looks_at(x) or may_copy(x)):
         return None
-    at: frozenset[int] = frozenset()
-    unasked = asked is None and (x.is_cuda or steps < LEAST_STEPS)
-    if looks_at(x) and asked is not False and not unasked and settings.sweeps and not model.touches:
-        if model.energy_mask & ELASTIC and model.num_active:
-            count = max(1, min(MOST, steps // EVERY))
-            at = frozenset(round(steps * k / count) for k in range(1, count + 1))
-    return EndLook(model, integrator, (x, v), steps, settings.numbers.time_step, at)
+    looked = asked is not False and (asked or (not x.is_cuda and steps >= LEAST_STEPS))
+    looked = bool(looked and settings.sweeps and model.num_active and model.energy_mask & ELASTIC)
+    count = 0 if not looked or model.touches else max(1, min(MOST, steps // EVERY))
+    at = frozenset(round(steps * k / count) for k in range(1, count + 1))
+    return EndLook(model, integrator, (x, v), steps, settings.numbers.time_step, looked, at)
 
 
 # --- on CUDA, where looking waits for the device ----------------------------------------------------------------------

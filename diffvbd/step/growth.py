@@ -200,10 +200,11 @@ def growth(model: Model, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: i
         """Times 2 h^2 [kg m^2]."""
         return (free * d * at_rest.elastic_product(free * d) + mass * (time_step * v).square()).sum((-2, -1))
 
-    noise = torch.randn(rest.shape[1:], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    generator = torch.Generator("cpu").manual_seed(0)
+    noise = torch.randn(rest.shape[1:], generator=generator, dtype=torch.float64, device="cpu")
     size = float((rest[0].amax(0) - rest[0].amin(0)).norm())
     x, v, history = rest + NOISE * size * free * noise, torch.zeros_like(rest), None
-    total, logs = torch.zeros(lead, dtype=torch.float64), [energy(x - rest, v).log()]
+    total, logs = torch.zeros(lead, dtype=torch.float64, device="cpu"), [energy(x - rest, v).log()]
     run = partial(advance, adjoint=None)
     last = STEPS
     while len(logs) <= last:

@@ -7,7 +7,8 @@ polynomials of degree two of the body's rest shape, zero where it is pinned, whi
     e = R Q (Q^T (M + h^2 K) Q)^-1 Q^T R^T r
 
 is what a step of Newton's method among them would change. K is the stiffness at rest, with the blocks of planes and
-springs at the state.
+springs at the state. What the next step keeps of it, (M + h^2 K)^-1 M e without those, is the error that counts: in
+stiff motions it is gone.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Unsolved(NamedTuple):
 
     scene: int
     body: int
-    error: float  # e
+    error: float  # what the next step keeps of e
     forced: float  # x' - (x + h v): what all forces did in the step
 
 
@@ -136,6 +137,7 @@ def _of_body(model: Model, at: IncrementalPotential, prepared: Prepared, scene: 
     gram = q.T @ (mass * q)
     for c in range(3):
         matrix[c, :, c] += gram
+    elastic = matrix.copy().reshape(3 * count, -1)
 
     arms = [a - (weight * a).sum(0) / weight.sum() for a in (now, of.rest)]
     u, _, vt = np.linalg.svd(arms[0].T @ (weight * arms[1]))
@@ -150,6 +152,7 @@ def _of_body(model: Model, at: IncrementalPotential, prepared: Prepared, scene: 
             matrix += np.einsum("nf,ncd,ng->cfdg", q[acts], turn.T @ blocks[acts] @ turn, q[acts], optimize=True)
     force = (q.T @ (residual @ turn)).T.reshape(-1)
     way = np.linalg.solve(matrix.reshape(3 * count, -1), force).reshape(3, count)
-    error = (way @ gram * way).sum()
+    kept = np.linalg.solve(elastic, (way @ gram).reshape(-1)).reshape(3, count)
+    error = (kept @ gram * kept).sum()
     return Unsolved(scene, body, float(max(error, 0.0) / total) ** 0.5,
                     float((mass * array(forced[None]) ** 2).sum() / total) ** 0.5)  # fmt: skip
