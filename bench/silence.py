@@ -159,7 +159,8 @@ def measure(case: tuple[str, int]) -> dict[str, Any]:
         warnings.simplefilter("ignore")
         reference = converged(scene, kind in list(KINDS)[:2])
     error = None if reference is None else math.inf if frames is None else apart(frames, reference)
-    return {"error": error, "warned": bool(said) or frames is None, "of": sorted({str(w.message).split(":")[0] for w in said}),
+    return {"error": error, "warned": bool(said) or frames is None,
+            "of": sorted({str(w.message).split(":")[0] for w in said}),
             "sweeps": scene.sweeps, "time_step": scene.time_step, "steps": scene.steps, "young": scene.young,
             "poisson": scene.poisson, "relaxation": scene.model.relaxation, "coarse": scene.model.coarse is not None,
             "integrator": type(scene.integrator).__name__, "seconds": seconds}  # fmt: skip

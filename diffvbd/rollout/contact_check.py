@@ -75,9 +75,9 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
         faster = ' a Model with coarse="auto",' if model.coarse is None else ""
         warn(
-            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not converged, and "
-            f"the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a smaller "
-            "time_step or a larger Friction(velocity=); " + page("contact.md"),
+            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
+            f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
+            "smaller time_step or a larger Friction(velocity=); " + page("contact.md"),
         )
 
 

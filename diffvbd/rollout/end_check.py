@@ -126,7 +126,9 @@ class EndLook:
         acceleration = math.sqrt(self.forced / self.steps) / self.time_step
         error = share * max(1.0, 0.5 * duration * math.sqrt(acceleration / way) if way > 0 else 1.0)
         error /= 1.0 if self.model.coarse is None else MADE_GOOD
-        distance = max(self.steps * math.sqrt(left / len(found)), error * way / math.sqrt(self.start[0][..., 0].numel()))
+        distance = max(
+            self.steps * math.sqrt(left / len(found)), error * way / math.sqrt(self.start[0][..., 0].numel())
+        )
         if not (error > WRONG and distance > UNSEEN * size_of(self.model)):
             return
         worst = max(found, key=lambda u: u.error)
@@ -171,7 +173,11 @@ def warn_of_last_end(model: Model, x: Tensor) -> None:
     model._derived[ENDED] = [end for end, (_, there) in zip(model._derived[ENDED], ends, strict=True) if not there]
     for said, there in ends:
         if there and not bool(said.all()):
-            _warn_of_loss("a rollout of this Model before this one", bool(said[0]), "take a smaller time_step, more sweeps, or float64")
+            _warn_of_loss(
+                "a rollout of this Model before this one",
+                bool(said[0]),
+                "take a smaller time_step, more sweeps, or float64",
+            )
             return
 
 

@@ -99,7 +99,14 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
 
     prepared: Arguments that all steps share; None: there are none, and nothing is looked at.
     """
-    if asked is False or is_silent() or steps == 0 or x.numel() == 0 or prepared is None or not model.energy_mask & ELASTIC:
+    if (
+        asked is False
+        or is_silent()
+        or steps == 0
+        or x.numel() == 0
+        or prepared is None
+        or not model.energy_mask & ELASTIC
+    ):
         return None
     if any(isinstance(e, Anchor) for e in model.energies):  # springs
         return None

@@ -245,7 +245,7 @@ def rollout(
     if energy is not None:
         energy.warn()
     if ending is not None:
-        ending.warn(*done.end[:2], options["gravity"])
+        ending.warn(done.end[0], done.end[1], options["gravity"])
         ending.forget()
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     trajectory = Trajectory(

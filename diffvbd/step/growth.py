@@ -77,7 +77,7 @@ def warn_of_sweeps(model: Model, prepared: Prepared, integrator: Integrator) -> 
     warn_of_thin_tets(model, prepared.mu, prepared.lam, h, sweeps)
     if warn_of_over_relaxation(model, prepared.mu, prepared.lam) or _proven.get():
         return
-    if (message := growth_message(model, prepared, integrator)):
+    if message := growth_message(model, prepared, integrator):
         warn(message)
 
 

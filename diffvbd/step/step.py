@@ -26,7 +26,6 @@ from .integrators import (
     check_staged,
     take,
 )
-
 from .lost import notice_loss
 
 

@@ -1,5 +1,5 @@
-"""Claim: a rollout, or a step of a loop, that ends with what is no number or too far away says so, each time, and what is
-at fault; and one whose sweeps leave its motion wrong does."""
+"""Claim: a rollout, or a step of a loop, that ends with what is no number or too far away says so, each time, and what
+is at fault; so does one whose sweeps leave its motion wrong, and one that bends tets too thin for it."""
 
 import warnings
 from types import SimpleNamespace
@@ -15,6 +15,7 @@ from diffvbd.step.arguments import prepare
 from diffvbd.step.integrators import Solve
 from diffvbd.step.lost import FAR
 from diffvbd.step.unsolved import unsolved
+from diffvbd.testing import tolerance
 
 SOFT: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 10}
 
@@ -93,7 +94,9 @@ def test_a_force_that_explodes_is_blamed() -> None:
     for _ in range(2):  # each time
         (text,) = driven(lambda k, x, v: -50.0 * v, steps=20)
         assert f"more than {FAR:g} body sizes" in text and "force: in one step it changes velocities by more" in text
-    with pytest.raises(ValueError, match=r"expected finite values.*\(in step \d+\), which the steps before made; force:"):
+    with pytest.raises(
+        ValueError, match=r"expected finite values.*\(in step \d+\), which the steps before made; force:"
+    ):
         driven(lambda k, x, v: -50.0 * v, steps=200)
     with pytest.raises(ValueError, match=r"force: expected finite values, got nan .*\(in step 3\)"):
         driven(lambda k, x, v: torch.full_like(x, torch.nan) if k == 3 else 0 * x)
@@ -125,8 +128,8 @@ def test_a_loop_of_steps_says_it_too() -> None:
 
 def test_a_flight_is_not_lost() -> None:
     model, x, v = bent()
-    flight: dict[str, Any] = SOFT | {"sweeps": 1, "mu": 1.0, "lam": 1.0}
-    assert messages(lambda: dv.rollout(model, x, 0 * v + 500.0, steps=9, **flight | {"time_step": 1.0})) == []
+    flight: dict[str, Any] = {"mu": 1.0, "lam": 1.0, "time_step": 1.0, "sweeps": 1}
+    assert messages(lambda: dv.rollout(model, x, 0 * v + 500.0, steps=9, **flight)) == []
 
 
 # --- what sweeps leave ------------------------------------------------------------------------------------------------
@@ -154,9 +157,12 @@ def test_motion_that_sweeps_leave_wrong_is_warned_of_and_what_is_right_is_not() 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_what_rests_or_has_no_sweeps_to_judge_is_not_doubted(dtype: torch.dtype) -> None:
-    model = dv.Model(dv.mesh.box(3, 0.2), dtype=dtype, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.004, kappa=1e4)))
+    model = dv.Model(
+        dv.mesh.box(3, 0.2), dtype=dtype, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.004, kappa=1e4))
+    )
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    end = dv.rollout(model, x, v, steps=60, save="last", check_energy=False, **SOFT | {"sweeps": 100})
+    many: dict[str, Any] = SOFT | {"sweeps": 100}
+    end = dv.rollout(model, x, v, steps=60, save="last", check_energy=False, **many)
     for frames in (10, 40):
         assert messages(lambda n=frames: dv.rollout(model, end.x[-1], end.v[-1], steps=n, **SOFT)) == []
 
@@ -173,7 +179,7 @@ def test_the_error_is_that_of_newtons_method_among_polynomials() -> None:
                        parameters=None)  # fmt: skip
     away = torch.tensor([3e-4, 0.0, -4e-4], dtype=x.dtype)
     found = unsolved(model, Solve(x, 0 * x, prepared, given), converged + away, {})
-    assert found is not None and abs(found.error - 5e-4) < 1e-8
+    assert found is not None and abs(found.error / 5e-4 - 1) <= tolerance("closed_form")
 
 
 def test_bending_of_thin_tets_is_said_where_it_shows() -> None:

@@ -219,7 +219,15 @@ def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
     model = beam_model()
     x = model.rest_points.clone()
     v = torch.zeros_like(x).requires_grad_()
-    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": SWEEPS, "steps": 36, "save": "last", "check_energy": False}
+    options = {
+        "mu": 1e4,
+        "lam": 1e4,
+        "time_step": 0.01,
+        "sweeps": SWEEPS,
+        "steps": 36,
+        "save": "last",
+        "check_energy": False,
+    }
     dv.rollout(model, x, v, **options)  # what a Model measures once is over
     adjoint = dv.ReverseSweep("full")
     peaks = []

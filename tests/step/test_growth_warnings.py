@@ -127,7 +127,8 @@ def test_what_is_not_elastic_and_how_large_a_mesh_is_do_not_matter(monkeypatch: 
         model = dv.Model(BODY, pinned=BODY.points[:, 0] < 1e-9, relaxation=1.5, energies=energies)
         x = model.rest_points + 1.0
         mu = torch.full((model.num_tets,), 1e8, dtype=x.dtype)
-        assert any("with BDF2()" in text for text in messages(lambda: dv.step(model, x, 0 * x, **given | {"mu": mu})))
+        said = messages(lambda m=model, x=x, g=given | {"mu": mu}: dv.step(m, x, 0 * x, **g))
+        assert any("with BDF2()" in text for text in said)
 
 
 def test_a_measurement_is_made_once_for_alike_moduli(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +152,8 @@ def test_nothing_is_said_of_soft_bodies_plain_sweeps_and_enough_of_them() -> Non
 
 def test_settings_of_pilot_runs_are_not_doubted() -> None:
     model = dv.Model(BODY, pinned=torch.tensor(BODY.points[:, 0] < 1e-9))
-    x, stiff = model.rest_points, {"mu": 1e8, "lam": 1e8}
+    x = model.rest_points
+    stiff: dict[str, Any] = {"mu": 1e8, "lam": 1e8}
     few = dv.Settings(0.01, 2, BDF2, relaxation=1.5)
     told = dv.Prediction(0.01, 0.01, 1.0, 0.03, True, "", (), 1.0, 1)
     proven = dv.Settings(0.01, 2, BDF2, relaxation=1.4, predicted=told)
