@@ -115,13 +115,14 @@ def rollout(
             is swept twice for it, the second time without a tape, once under every schedule; states and gradients are
             the same.
         check_contact: Whether to warn (UserWarning) where pairs held up more than 1 % of vertices in a step, or the
-            last one left more than 5 % of its friction unbalanced. None: on the CPU, after ten steps or more, until the
-            Model has warned. A look costs about a step and on CUDA waits for the device; nothing that is compiled or
-            captured is looked at.
+            last one left more than 5 % of what friction can bear unbalanced. None: on the CPU, after ten steps or more.
+            A look costs about a step and on CUDA waits for the device; nothing that is compiled or captured is looked
+            at.
         check_energy: Whether to warn (UserWarning) where a scene that only gravity drives has 5 % more energy (where
-            barriers push at the start, twice as much) than it began with and gravity gave it. True: after any step.
-            None: on the CPU, after six steps, most of them early (with a floor 12, with contact up to 64), of the 1st,
-            2nd, 4th, 8th, ... rollout of ten steps or more of a Model, until one has warned.
+            barriers push at the start, twice as much) than it began with and gravity gave it; where, without pairs and
+            friction, the sweeps leave the motion off by an estimated 5 %; where thin tets bend. True: energy after any
+            step. None: on the CPU, of ten steps or more, after six of them, most of them early (with a floor 12, with
+            contact up to 64). A rollout that ends with what is not finite, or too far away, always warns.
         check_start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or
             vertices behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs a
             quarter of one detection or less on the CPU and, on CUDA, waits for the device once. Under torch.compile,
