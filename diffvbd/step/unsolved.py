@@ -131,8 +131,14 @@ def _of_body(model: Model, at: IncrementalPotential, prepared: Prepared, scene: 
     total = max(float(mass.sum()), 1e-300)
     if (scene, body) not in known:
         mu, lam = (own(m).double() for m in (prepared.mu, prepared.lam))
-        mu, lam = (m if len(m) == 1 else m[of.tets] for m in (mu, lam))
-        known[scene, body] = _stiffness(model, of, mu, lam)
+        if len(mu) == len(lam) == 1:
+            one, none = torch.ones_like(mu), torch.zeros_like(mu)
+            of_mu, of_lam = model.derived(f"unit stiffness of body {body}", lambda: (
+                _stiffness(model, of, one, none), _stiffness(model, of, none, one)))  # fmt: skip
+            known[scene, body] = float(mu) * of_mu + float(lam) * of_lam
+        else:
+            mu, lam = (m if len(m) == 1 else m[of.tets] for m in (mu, lam))
+            known[scene, body] = _stiffness(model, of, mu, lam)
     matrix = at.h**2 * known[scene, body].reshape(3, count, 3, count)
     gram = q.T @ (mass * q)
     for c in range(3):
