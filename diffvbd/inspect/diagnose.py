@@ -341,7 +341,8 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
     if slip is not None and not _largest(slip) <= UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
         out.append(f"friction has not converged: {percent(_largest(slip))} of what it can bear on {_place(slip)} is "
-                   f"not balanced; take more sweeps, a smaller time step{faster} or a larger Friction(velocity=)")  # fmt: skip
+                   f"not balanced; take more sweeps, a smaller time step{faster} or a larger "
+                   "Friction(velocity=)")  # fmt: skip
     return out
 
 
