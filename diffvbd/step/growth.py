@@ -89,6 +89,8 @@ def growth_message(model: Model, prepared: Prepared, integrator: Integrator) -> 
     if not any(isinstance(e, StableNeoHookean) for e in model.energies):
         return ""
     mu, lam = (m.detach().cpu() for m in (prepared.mu, prepared.lam))
+    if not (mu.numel() and lam.numel()):
+        return ""
     key = (type(integrator).__name__, h, sweeps, *_mark(mu), *_mark(lam))
     known = model._derived.setdefault(EIGENVALUES, {})
     if key not in known:
