@@ -55,6 +55,11 @@ def is_captured(value: Tensor) -> bool:
     return value.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
+def may_copy(value: Tensor) -> bool:
+    """Whether a value on CUDA may be copied to the host while the device works on."""
+    return value.is_cuda and not torch.compiler.is_compiling() and not is_captured(value) and not transformed()
+
+
 def transformed() -> bool:
     """Whether a transform of torch.func is under way. Under torch.compile one may be, unseen."""
     if torch.compiler.is_compiling():
@@ -141,6 +146,17 @@ def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
         with _lock:
             _recorders = tuple(r for r in _recorders if r[1] is not found)
         _recording.reset(token)
+
+
+@contextlib.contextmanager
+def unheard() -> Iterator[None]:
+    """Inside, steps are recorded nowhere and not checked: they are none of the caller's."""
+    checked, recording = _checking.set(False), _recording.set(())
+    try:
+        yield
+    finally:
+        _recording.reset(recording)
+        _checking.reset(checked)
 
 
 @contextlib.contextmanager

@@ -63,8 +63,8 @@ class Diagnosis:
         unbalanced: Left-over force of the step, |dG/dx| / h^2, over its inertial and all other forces (2-norms) [-];
             zero where no more is left than rounding leaves.
         residuals: The same for each body of ``model.body``, shape [..., bodies].
-        friction_residuals: Of a Model with Friction, the share of the friction on each body that is not balanced [-],
-            shape [..., bodies]: the left-over force across the contact over the friction forces, where friction acts.
+        friction_residuals: Of a Model with Friction, what is left over along the contact of each body, over the most
+            that friction can bear there [-], shape [..., bodies]; of forces summed where friction acts.
         errors: Estimate for each body, shapes [..., bodies], where ``sweeps`` was given.
         relative_error: The largest estimated error over motion [-], of bodies whose error is no rounding; NaN where a
             step has too few sweeps to tell.
@@ -344,8 +344,9 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
     slip = result.friction_residuals
     if slip is not None and not _largest(slip) <= UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
-        out.append(f"friction has not converged: {percent(_largest(slip))} of it on {_place(slip)} is not balanced; "
-                   f"take more sweeps, a smaller time step{faster} or a larger Friction(velocity=)")  # fmt: skip
+        out.append(f"friction has not converged: {percent(_largest(slip))} of what it can bear on {_place(slip)} is "
+                   f"not balanced; take more sweeps, a smaller time step{faster} or a larger "
+                   "Friction(velocity=)")  # fmt: skip
     return out
 
 

@@ -1,4 +1,4 @@
-"""How thin the tets of a mesh are, of large meshes a sample of them; and which tets of a state are inside out."""
+"""How thin the tets of a mesh are, and which tets of a state are inside out."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from torch import Tensor
 if TYPE_CHECKING:
     from .model import Model
 
-SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
+
+def height_of_tets(model: Model) -> np.ndarray:
+    """The shortest of each tet's four heights [m], [T]."""
+    return model.derived("shapes of tets", lambda: _shapes_of_tets(model))[0]
 
 
-def looked_at(model: Model) -> slice:
-    return slice(None, None, max(1, model.mesh.num_tets // SAMPLED))
+def thinness(model: Model) -> tuple[float, float]:
+    """Longest edge over shortest height [-], and that height [m], of the median tet."""
+    return model.derived("shapes of tets", lambda: _shapes_of_tets(model))[1:]
 
 
-def shapes_of_tets(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Longest edge over shortest height [-], and that height [m], of the tets that are looked at."""
-    return model.derived("shapes of tets", lambda: _shapes_of_tets(model))
-
-
-def _shapes_of_tets(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    corners = model.mesh.points[model.mesh.tets[looked_at(model)]]
+def _shapes_of_tets(model: Model) -> tuple[np.ndarray, float, float]:
+    corners = model.mesh.points[model.mesh.tets]
     edges = corners[:, 1:] - corners[:, :1]
     normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)
     volume = np.abs((edges[:, 0] * normals[:, 0]).sum(-1))
     normals = np.concatenate([normals, -normals.sum(1, keepdims=True)], 1)
-    height = volume / np.linalg.norm(normals, axis=-1).max(1)  # the shortest of a tet's four
+    height = volume / np.linalg.norm(normals, axis=-1).max(1)
     sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
-    return sides.max(1) / height, height
+    return height, float(np.median(sides.max(1) / height)), float(np.median(height))
 
 
 def inside_out(tets: Tensor, x: Tensor) -> Tensor:

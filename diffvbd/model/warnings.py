@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +12,8 @@ from torch import Tensor
 
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
-from ..said import page, warn
-from .growth import GROWS, STEPS_SEEN, warn_of_growth
-from .tet_shapes import inside_out, shapes_of_tets
+from ..said import page, silence, warn
+from .tet_shapes import inside_out, thinness
 
 if TYPE_CHECKING:
     from .model import Model
@@ -27,14 +25,16 @@ HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 # the wrong sign at 20 and at 40 was 7e5 times too large
 ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
+TOO_STIFF = 0.55  # times aspect^2: so much too stiff were sheets of one layer, from 3.4 to 24
+MOST_BODIES = 8  # whose bending is looked at
+BENT = 0.01  # of the height of a tet, by which a body is no longer an affine image of its rest shape
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 SOFTEST = 10.0  # [Pa] Young's modulus; soft gels have 100 Pa or more
 LONGEST_STEP = 1.0  # [s]
 
 # of a Model's _derived: what is said once, or ever more seldom
-THIN_SEEN, OVER_RELAXED, CONTACT_SEEN = "thin", "over-relaxed", "contact of rollouts"
-HELD_UP, HELD_UP_SEEN, ERRATIC = "held up", "steps held up", "erratic gradients"
-ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, CONTACT_SEEN, HELD_UP, HELD_UP_SEEN, ERRATIC)
+HELD_UP_SEEN, ERRATIC = "steps held up", "erratic gradients"
+ONCE = (HELD_UP_SEEN, ERRATIC)
 
 
 def warn_of(model: Model, pinned: Any) -> None:
@@ -106,30 +106,11 @@ def _bodies_of(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return names, first, of
 
 
-def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, scheme: str) -> None:
-    """Warns, once for each Model, of moduli that its settings do not suit.
-
-    Args:
-        mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
-        time_step, sweeps: Of the step.
-        scheme: Name of its integrator.
-    """
-    if sweeps == 0 or not model.mesh.num_tets:
-        return
-    _warn_of_units(model, mu, lam, time_step)
-    _warn_of_thin_tets(model, mu, lam, time_step, sweeps)
-    _warn_of_over_relaxation(model, mu, lam)
-    if model._derived.get(OVER_RELAXED) == 0:  # it has warned, of the same
-        return
-    warn_of_growth(model, mu, lam, time_step, sweeps, scheme)
-
-
 @contextlib.contextmanager
 def silent(model: Model) -> Iterator[None]:
     """Inside, nothing is warned of, and what would have been said once of this Model is still to be said after it."""
     before = {id(m): {name: m._derived[name] for name in ONCE if name in m._derived} for m in _with_settings(model)}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silence():
         try:
             yield
         finally:
@@ -149,7 +130,7 @@ def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
     return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
 
 
-def _warn_of_units(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> None:
+def warn_of_units(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> None:
     """Warns, in each call, of moduli and of a step that look as if they were in other units."""
     if time_step >= LONGEST_STEP:
         warn(f"time_step: {time_step:.4g} s is long for a step; times are in seconds: one of 1 ms is 0.001")
@@ -161,34 +142,31 @@ def _warn_of_units(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> N
         warn(f"mu: Young's modulus is at most {young:.4g} Pa, softer than any gel; moduli are in Pa: 1 MPa is 1e6")
 
 
-def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
-    """Moduli may change from step to step: those of the 1st, 2nd, 4th, 8th, ... are looked at."""
-    seen = model._derived.get(OVER_RELAXED, 0) + 1  # 0: it has warned
-    if seen == 1 and OVER_RELAXED in model._derived or model.relaxation <= 1:
-        return
-    model._derived[OVER_RELAXED] = seen
-    if seen & (seen - 1) or not any(isinstance(e, StableNeoHookean) for e in model.energies):
-        return
-    if is_nearly_incompressible(mu, lam):
-        model._derived[OVER_RELAXED] = 0
-        warn(
-            f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
-            "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
-            'coarse="auto" in place of it',
-        )
+def warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> bool:
+    """Warns of over-relaxed sweeps of what is nearly incompressible, whose growth may be too slow to be measured;
+    whether it did."""
+    if model.relaxation <= 1 or not any(isinstance(e, StableNeoHookean) for e in model.energies):
+        return False
+    if not is_nearly_incompressible(mu, lam):
+        return False
+    warn(
+        f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
+        "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
+        'coarse="auto" in place of it',
+    )
+    return True
 
 
-def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
-    """Tets so thin that few sweeps leave a sheet without stiffness.
+def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+    """Warns of tets so thin that few sweeps leave a sheet without stiffness; moduli [Pa] that may be looked at.
 
     The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
     sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
     corrections move them together.
     """
-    if THIN_SEEN in model._derived or model.coarse is not None:
+    if model.coarse is not None:
         return
-    model._derived[THIN_SEEN] = True
-    aspect, height = (float(np.median(value)) for value in shapes_of_tets(model))
+    aspect, height = thinness(model)
     if aspect < THIN:
         return
     needed = min(aspect, _crossed(model, mu, lam, time_step, height)) ** 2 * (2 - model.relaxation) / model.relaxation
@@ -199,6 +177,34 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
             f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
             "material. Linear tets this thin are also much too stiff in bending; " + page("numerics.md"),
         )
+
+
+def warn_of_bending(model: Model, x: Tensor) -> None:
+    """Warns of thin tets that a state x [..., V, 3] bends: linear ones lock."""
+    aspect, height = thinness(model) if model.num_tets else (0.0, 0.0)
+    if aspect < THIN:
+        return
+    for vertices, terms, inverse in model.derived("affine maps", lambda: _affine_maps(model)):
+        now = x.detach().reshape(-1, *x.shape[-2:])[:, vertices].double()
+        off = (now - terms @ (inverse @ now)).square().sum(-1).mean(-1).sqrt()
+        if float(off.max()) > BENT * height:
+            warn(
+                f"mesh: tets {aspect:.2g} times as wide as thick bend here: linear ones are too stiff for that, about "
+                f"{TOO_STIFF * aspect**2:.0f} times; divide Young's modulus by as much where only bending counts, or "
+                "take tets as wide as thick; " + page("numerics.md")
+            )
+            return
+
+
+def _affine_maps(model: Model) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Of each of the first bodies its vertices [n], the terms of an affine map of them [n, 4], and their inverse."""
+    out = []
+    for body in range(min(MOST_BODIES, int(model.body.max()) + 1)):
+        vertices = (model.body == body).nonzero()[:, 0]
+        rest = model._rest_points[vertices].double()
+        terms = torch.cat([torch.ones_like(rest[:, :1]), rest - rest.mean(0)], 1)
+        out.append((vertices, terms, torch.linalg.pinv(terms)))
+    return out
 
 
 def _crossed(model: Model, mu: Tensor, lam: Tensor, time_step: float, height: float) -> float:

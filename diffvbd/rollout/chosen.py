@@ -10,8 +10,8 @@ import torch
 
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail, is_word
-from ..model.growth import proven
 from ..step.arguments import check_state
+from ..step.growth import proven
 from ..step.met import outcomes
 from .pilots import GIVEN, of_time, pilots_of
 from .search import ERROR, PATIENCE, found
@@ -48,9 +48,8 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
     if is_word(given["checkpoint_every"], "auto"):
         chosen["checkpoint_every"] = settings.checkpoint_every
     sure = settings.predicted is not None and settings.predicted.reached
-    pilots = proven(chosen["model"], type(settings.integrator).__name__, settings.sweeps) if sure else nullcontext()
     try:
-        with pilots:
+        with proven() if sure else nullcontext():
             return rollout(**given | chosen)
     finally:  # the caller asks his own Model for the status of its steps
         if (outcome := outcomes.get(chosen["model"])) is not None:

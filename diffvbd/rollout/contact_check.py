@@ -8,14 +8,15 @@ import torch
 from torch import Tensor
 
 from ..model.model import Model
-from ..model.warnings import CONTACT_SEEN, HELD_UP
-from ..said import page, percent, warn
+from ..said import is_silent, page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
 from ..step.contact_cycles import CUT
 from ..step.held_up import what_helps
+from ..step.integrators import Solve
 from ..step.predict import begin
+from ..step.unsolved import unsolved
 
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 
@@ -29,12 +30,13 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
         return False
     if asked:
         return not is_captured(x)
-    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and CONTACT_SEEN not in model._derived
+    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and not is_silent()
 
 
 def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
                         given: dict[str, Any]) -> float:  # fmt: skip
-    """The largest share of the friction on a body that a step left unbalanced [-]; 0 where it cannot be told.
+    """What a step left unbalanced along the contact of a body, over the most that friction can bear there [-], the
+    largest; 0 where it cannot be told.
 
     Args:
         before: State (x, v) before the step.  x: Positions after it.  given: Its other arguments, as of advance().
@@ -64,19 +66,22 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     shares = torch.stack(cuts).tolist()
     cut = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
-    if cut > CUT or left > UNBALANCED_FRICTION:
-        model._derived[CONTACT_SEEN] = True
     if cut > CUT:
-        model._derived[HELD_UP] = True
         warn(
             f"pair_barrier: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
             f"{percent(CUT)}); " + what_helps(model),
         )
-    if left > UNBALANCED_FRICTION:
+    if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
         faster = ' a Model with coarse="auto",' if model.coarse is None else ""
         warn(
-            f"friction: {percent(left)} of it is not balanced in the last step: the sweeps have not converged, and "
-            f"the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a smaller "
-            "time_step or a larger Friction(velocity=); " + page("contact.md"),
+            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
+            f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
+            "smaller time_step or a larger Friction(velocity=); " + page("contact.md"),
         )
+
+
+def _matters(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]) -> bool:
+    """Whether what a step has left unbalanced would have moved a body, beside what forces do in a step."""
+    found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
+    return found is not None and found.error > UNBALANCED_FRICTION * found.forced

@@ -1,4 +1,4 @@
-"""What a rollout says of its end and of its energy: numbers that are not finite, more energy than there can be."""
+"""What a rollout says of its energy: more than there can be."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ..energies import Anchor
 from ..mask import ELASTIC
 from ..model.model import Model
 from ..model.rest import rest_metric
-from ..said import page, percent, warn
-from ..scopes import is_captured, looks_at
+from ..said import is_silent, page, percent, warn
+from ..scopes import looks_at, may_copy
 from ..step.arguments import Prepared, acceleration_of
 from ..step.met import outcomes
 from ..step.predict import energy_data
@@ -23,60 +23,10 @@ from ..step.predict import energy_data
 GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
 GAIN_PRESSED = 1.0  # the same where barriers push at the start: what they hold comes in
 MANY = 100.0  # times as much as there was: then the gain is said in J, since there may have been next to nothing
-WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
-ENDED = "ended"  # the same, on CUDA: whether its latest rollouts ended finite, on the way to the host
 LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 6, 12, 64  # at a rollout, unasked
-SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
 CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
 ROUNDING = 64.0  # times the energy of strains that are rounding
-
-
-# --- a state that is not finite ---------------------------------------------------------------------------------------
-
-
-def warn_of_end(model: Model, x: Tensor, v: Tensor) -> None:
-    """Warns (UserWarning) of a rollout that ended with numbers that are not finite.
-
-    On CUDA, where looking waits for the device, the answer is copied to the host meanwhile, and the Model's next
-    rollout that finds it there says what it was. Nothing that is compiled, transformed or captured is looked at.
-    """
-    if looks_at(x):
-        if not (bool(torch.isfinite(x).all()) and bool(torch.isfinite(v).all())):
-            _warn_not_finite("the rollout")
-    elif _copies(x):
-        good = torch.isfinite(x.detach()).all() & torch.isfinite(v.detach()).all()
-        said = torch.empty((), dtype=torch.bool, pin_memory=True)
-        said.copy_(good, non_blocking=True)
-        done = torch.cuda.Event()
-        done.record(torch.cuda.current_stream(x.device))
-        model._derived.setdefault(ENDED, []).append((said, done))
-
-
-def warn_of_last_end(model: Model, x: Tensor) -> None:
-    """Warns of the Model's rollouts before this one, on CUDA, as far as they are done."""
-    if not model._derived.get(ENDED) or not _copies(x):
-        return
-    ends = [(said, done.query()) for said, done in model._derived[ENDED]]
-    model._derived[ENDED] = [end for end, (_, there) in zip(model._derived[ENDED], ends, strict=True) if not there]
-    if not all(bool(said) for said, there in ends if there):
-        _warn_not_finite("a rollout of this Model before this one")
-
-
-def _copies(x: Tensor) -> bool:
-    if not x.is_cuda or torch.compiler.is_compiling() or is_captured(x):
-        return False
-    return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _warn_not_finite(which: str) -> None:
-    warn(
-        f"x: {which} ended with positions or velocities that are not finite; dv.debug_checks() says in which step, "
-        "sweep and vertex they began. Take a smaller time_step, more sweeps, or float64; " + page("numerics.md"),
-    )
-
-
-# --- energy from nowhere ----------------------------------------------------------------------------------------------
 
 
 # What of the tets, chunk by chunk, no look changes: mu, lam, rest scalars [7, 1 | B, t] and corners [4, t].
@@ -126,7 +76,6 @@ class EnergyLook:
         past = gain - torch.where(self.pressed, GAIN_PRESSED, GAIN)
         if not float(past.max()) > 0:
             return
-        self.model._derived[WARNED] = True
         look, scene = divmod(int(past.argmax()), gain.shape[-1])
         most, all_of = float(gain[look, scene]), float((begun + room + fallen.abs().amax(0))[scene])
         size = f"{percent(most)} of the energy that it had and that gravity gave it"
@@ -150,17 +99,21 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
 
     prepared: Arguments that all steps share; None: there are none, and nothing is looked at.
     """
-    if asked is False or steps == 0 or x.numel() == 0 or prepared is None or not model.energy_mask & ELASTIC:
+    if (
+        asked is False
+        or is_silent()
+        or steps == 0
+        or x.numel() == 0
+        or prepared is None
+        or not model.energy_mask & ELASTIC
+    ):
         return None
     if any(isinstance(e, Anchor) for e in model.energies):  # springs
         return None
     if asked is None:
-        if x.is_cuda or not looks_at(x) or steps < LEAST_STEPS or WARNED in model._derived:
+        if x.is_cuda or not looks_at(x) or steps < LEAST_STEPS:
             return None
-        model._derived[SEEN] = seen = model._derived.get(SEEN, 0) + 1
-        if seen & (seen - 1):  # not the 1st, 2nd, 4th, 8th: those of a training loop are looked at for next to nothing
-            return None
-    if not looks_at(x) and not _copies(x):
+    if not looks_at(x) and not may_copy(x):
         return None
     given = (x, v, prepared.mu, prepared.lam, prepared.mass)
     taped = torch.is_grad_enabled() and any(t.requires_grad for t in given)

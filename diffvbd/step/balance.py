@@ -18,8 +18,7 @@ from .predict import Begun, begin
 ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a
 # corrected start in free fall at 0.15
 UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
-UNBALANCED_FRICTION = 0.05  # share of friction; a grip with 0.1 bears 1.3 times its load, with 0.004 1.02 times
-LEAST_FRICTION = 0.01  # of the normal forces, to which friction is compared where it is less: what rests needs none
+UNBALANCED_FRICTION = 0.05  # of the most that friction can bear
 
 Norm = Callable[[Tensor], Tensor]  # [B, V, n] -> [B, groups]
 
@@ -103,17 +102,20 @@ def share(part: Tensor, whole: Tensor) -> Tensor:
 
 
 def friction_left_over(at: IncrementalPotential) -> Tensor:
-    """Share of the friction on each body that the step left unbalanced [-], [B, bodies]; 0 where there is none.
+    """What the step left unbalanced along the contact of each body, over the most that friction can bear there [-],
+    [B, bodies]; 0 where it can bear nothing.
 
-    The left-over force across the contact, over the friction forces; both over the vertices on which friction acts.
+    Of forces summed over the vertices on which friction acts: what they leave to one another moves no body.
     """
-    norm = of_bodies(at.model)
+    labels, count = at.model.body, at.model.derived("labelled", lambda: int(at.model.body.max()) + 1)
+    sums = at.x.new_zeros((len(at.x), count, 3), dtype=torch.float64)
     if not isinstance(at, ContactPotential):
-        return torch.zeros_like(norm(at.x))
+        return sums[..., 0]
     normal, friction = at.contact.on_vertices()
     acts = ((friction != 0).any(-1, keepdim=True) * at.free).double()
     left = acts * (at.inertia() + at.forces()).double() / at.h**2
-    size = normal.square().sum(-1, keepdim=True)
-    along = (left * normal).sum(-1, keepdim=True) / torch.where(size > 0, size, torch.ones_like(size))
-    least = LEAST_FRICTION * norm(acts * normal)
-    return share(norm(left - along * normal), torch.maximum(norm(acts * friction), least))
+    size = normal.norm(dim=-1, keepdim=True)
+    along = (left * normal).sum(-1, keepdim=True) / torch.where(size > 0, size.square(), 1.0)
+    force = sums.index_add(1, labels, left - along * normal).norm(dim=-1)
+    most = at.step_contact._number("friction.coefficient")[:, None] * (acts * size)[..., 0]
+    return share(force, torch.zeros_like(force).index_add(1, labels, most))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..model.model import Model
-from ..model.warnings import HELD_UP, HELD_UP_SEEN
+from ..model.warnings import HELD_UP_SEEN
 from ..said import page, percent, warn
 from ..scopes import looks_at
 from .contact_cycles import CUT
@@ -32,19 +32,18 @@ def what_helps(model: Model) -> str:
 
 
 def notice_step(model: Model, x: Tensor) -> None:
-    """Warns (UserWarning), once for each Model, when pairs have held up more than CUT of the vertices in SEVERAL steps
-    in a row.
+    """Warns (UserWarning) when pairs have held up more than CUT of the vertices in SEVERAL steps in a row, and after as
+    many more.
 
     For steps that are made one by one: a rollout looks at its own. Values on CUDA, which would have to be waited for,
     and those of compiled, transformed or captured steps are not looked at.
     """
-    if not looks_at(x) or x.is_cuda or not model.touches or HELD_UP in model._derived:
+    if not looks_at(x) or x.is_cuda or not model.touches:
         return
     share = float(cut_share(model))
     model._derived[HELD_UP_SEEN] = seen = model._derived.get(HELD_UP_SEEN, 0) + 1 if share > CUT else 0
-    if seen < SEVERAL:
+    if seen == 0 or seen % SEVERAL:
         return
-    model._derived[HELD_UP] = True
     warn(
         f"pair_barrier: pairs held up {percent(share)} of the vertices in this step, and more than {percent(CUT)} in "
         f"each of the last {seen}; they lose velocity and momentum; " + what_helps(model)

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..model.model import Model
-from ..model.warnings import warn_of_material
-from ..scopes import looks_at, refuse_refinement
+from ..scopes import refuse_refinement
 from .advance import advance
 from .arguments import GRAVITY, check_prescribed, check_state, prepare
+from .growth import warn_of_sweeps
 from .held_up import notice_step
 from .integrators import (
     BDF2,
@@ -26,6 +26,7 @@ from .integrators import (
     check_staged,
     take,
 )
+from .lost import notice_loss
 
 
 @overload
@@ -152,9 +153,8 @@ def step(
                        rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
         check_prescribed(model, value, x)
-    if looks_at(prepared.mu) and looks_at(prepared.lam):
-        warn_of_material(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps,
-                         type(scheme).__name__)  # fmt: skip
+    warn_of_sweeps(model, prepared, scheme)
     taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
     notice_step(model, taken.x)
+    notice_loss(model, prepared, scheme, v, force, taken.x)
     return (taken.x, taken.v) if taken.history is None else (taken.x, taken.v, taken.history)

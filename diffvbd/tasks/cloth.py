@@ -28,7 +28,8 @@ def few_sweeps() -> Iterator[None]:
     same."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "pair_barrier: pairs held up", UserWarning)
-        warnings.filterwarnings("ignore", "sweeps: .* (too few for tets|has gained)", UserWarning)
+        warnings.filterwarnings("ignore", "sweeps: .* (too few for tets|has gained|may be off by)", UserWarning)
+        warnings.filterwarnings("ignore", "mesh: tets .* bend", UserWarning)
         yield
 
 

@@ -111,11 +111,12 @@ class Drape:
         self.model = model_of(self.mesh, neck).to(settings.device)
         self.still = torch.zeros_like(self.model.rest_points)
         self.start, truth = (self.still.new_tensor(values) for values in (START, list(TRUTH.values())))
-        with torch.no_grad(), few_sweeps():
+        with torch.no_grad():
             self.target = self.fall(truth[0], truth[1])
             self.target_early, self.target_settled = self.first_frames(self.target), self.settled_drape(self.target)
         self.log_mu, self.log_lam = (value.log().requires_grad_() for value in self.start)
 
+    @few_sweeps()
     def fall(self, mu: Tensor, lam: Tensor, steps: int | None = None) -> Tensor:
         """Positions [m] of all frames, shape [steps + 1, V, 3]."""
         steps = self.version.steps if steps is None else steps

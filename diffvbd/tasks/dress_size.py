@@ -54,6 +54,7 @@ def problem(settings: Settings) -> Problem:
     hem = mean_weights(ring == rings - 1, v)
     neck = torch.tensor((0.0, NECK, 0.0), dtype=v.dtype, device=v.device)
 
+    @few_sweeps()
     def simulate(size: Tensor) -> Tensor:
         """Positions [m] after each step, shape [steps + 1, V, 3]."""
         shape = cut(model.rest_points, size, neck)
@@ -66,7 +67,7 @@ def problem(settings: Settings) -> Problem:
 
     start = torch.tensor(START_SIZE, dtype=v.dtype, device=v.device)
     true = torch.full_like(start, TRUE_SIZE)
-    with torch.no_grad(), few_sweeps():
+    with torch.no_grad():
         target = height(true)
     log_size = start.log().requires_grad_()
 

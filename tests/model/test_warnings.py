@@ -1,4 +1,4 @@
-"""What is legal and seldom meant is warned of (UserWarning), once, and nothing else is."""
+"""What is legal and seldom meant is warned of (UserWarning), each time, and nothing else is."""
 
 import warnings
 from collections.abc import Callable
@@ -71,7 +71,7 @@ RUNS: list[Callable[..., Any]] = [
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_thin_tets_and_few_sweeps_are_named_once_for_a_model(run: Callable[..., Any]) -> None:
+def test_thin_tets_and_few_sweeps_are_named_each_time(run: Callable[..., Any]) -> None:
     model = sheet(1e-3)
     x = model.rest_points
     with pytest.warns(
@@ -79,7 +79,8 @@ def test_thin_tets_and_few_sweeps_are_named_once_for_a_model(run: Callable[..., 
     ) as found:
         run(model, x, sweeps=20, **STEP)
         run(model, x, sweeps=20, **STEP)
-    assert len(found) == 1 and found[0].filename == __file__
+    thin = [w for w in found if "thin" in str(w.message) or "thick" in str(w.message)]
+    assert len(thin) == 2 and {w.filename for w in found} == {__file__}
 
 
 @pytest.mark.parametrize("run", RUNS)
@@ -140,7 +141,7 @@ def test_the_warning_is_right() -> None:
 
 
 @pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize(("relaxation", "poisson", "warned"), [(1.5, 0.495, 1), (1.0, 0.495, 0), (1.5, 0.49, 0)])
+@pytest.mark.parametrize(("relaxation", "poisson", "warned"), [(1.5, 0.495, 2), (1.0, 0.495, 0), (1.5, 0.49, 0)])
 def test_over_relaxation_of_nearly_incompressible_material(
     run: Callable[..., Any], relaxation: float, poisson: float, warned: int
 ) -> None:
@@ -154,7 +155,7 @@ def test_over_relaxation_of_nearly_incompressible_material(
         assert "take relaxation=1" in str(found[0].message) and found[0].filename == __file__
 
 
-def test_a_fit_that_comes_to_be_nearly_incompressible_is_warned_of_once() -> None:
+def test_a_fit_that_comes_to_be_nearly_incompressible_is_warned_of() -> None:
     model = dv.Model(dv.mesh.box(3, 0.1, split="kuhn"), relaxation=1.5)
     said = []
     for poisson in (0.3, 0.499, 0.499, 0.499, 0.499):
@@ -164,7 +165,7 @@ def test_a_fit_that_comes_to_be_nearly_incompressible_is_warned_of_once() -> Non
                 model, model.rest_points, 0 * model.rest_points, time_step=1e-3, sweeps=5, young=1e5, poisson=poisson
             )
         said.append(len(found))
-    assert said == [0, 1, 0, 0, 0]
+    assert said == [0, 1, 1, 1, 1]
 
 
 def test_what_it_warns_of_grows_and_the_remedy_does_not() -> None:
@@ -232,4 +233,4 @@ def is_thin_in_step_forward() -> None:
 def test_a_warning_points_at_the_line_that_called_the_package(run: Callable[[], Any], message: str) -> None:
     with pytest.warns(match=message) as found:
         run()
-    assert [w.filename for w in found if message in str(w.message)] == [__file__]
+    assert {w.filename for w in found if message in str(w.message)} == {__file__}
