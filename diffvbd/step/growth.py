@@ -26,7 +26,7 @@ from ..model.model import Model
 from ..model.replaced import replaced_arguments
 from ..model.tet_shapes import height_of_tets
 from ..model.warnings import warn_of_over_relaxation, warn_of_thin_tets, warn_of_units
-from ..said import is_silent, page, warn
+from ..said import is_silent, page, silence, warn
 from ..scopes import looks_at, unheard
 from ..tuples import replaced
 from .advance import advance
@@ -174,7 +174,8 @@ def _elastic(model: Model, mesh: TetMesh, pinned: Tensor, rows: np.ndarray | Non
     own = [e for e in model.energies if isinstance(e, StableNeoHookean)]
     changes = {"energies": own, "colliders": (), "dtype": torch.float64, "device": "cpu", "pinned": pinned,
                "density": density if rows is None else density[rows]}  # fmt: skip
-    return Model(mesh, **replaced_arguments(model, changes))
+    with silence():  # nobody has made this one
+        return Model(mesh, **replaced_arguments(model, changes))
 
 
 def growth(model: Model, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, integrator: Integrator,

@@ -20,7 +20,7 @@ MATERIAL: dict[str, Any] = {"mu": 8e3, "lam": 1.2e4, "gravity": (0.0, 0.0, 0.0)}
 
 def meeting(speed: float, device: str, dtype: torch.dtype = torch.float64, **options: Any) -> tuple[dv.Model, Any, Any]:
     """A small cube thrown at a larger one, off its center."""
-    lower, upper = box(4, 0.2), box(4, 0.12).translate((0.04, 0.22, 0.03))
+    lower, upper = box(4, 0.2, split="kuhn"), box(4, 0.12, split="kuhn").translate((0.04, 0.22, 0.03))
     barrier = dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False, **options)
     model = dv.Model(join([lower, upper]), energies=(dv.StableNeoHookean(), barrier), device=device, dtype=dtype)
     v = torch.zeros_like(model.rest_points)
@@ -76,7 +76,7 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
 def row(count: int, gap: float, speed: float, device: str, detections: int | None = None
         ) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Cubes of 0.1 m in a row that are not quite in line, of which the first is thrown at the others."""
-    cubes = [box(2, 0.1).translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)]
+    cubes = [box(2, 0.1, split="kuhn").translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)]
     barrier = dv.PairBarrier(kappa=1e5, dhat=1e-3, self_contact=False, detections=detections)
     model = dv.Model(join(cubes), energies=(dv.StableNeoHookean(), barrier), device=device)
     v = torch.zeros_like(model.rest_points)
@@ -138,7 +138,7 @@ def apart(rows: list[tuple[int, float]], device: str) -> tuple[dv.Model, torch.T
     first ones."""
     cubes, v, sizes = [], [], []
     for n, (count, speed) in enumerate(rows):
-        one = box(2, 0.1)
+        one = box(2, 0.1, split="kuhn")
         cubes += [one.translate((0.105 * i, 0.003 * i, 5.0 * n + 0.002 * i)) for i in range(count)]
         own = torch.zeros(count * one.num_vertices, 3, dtype=torch.float64)
         own[: one.num_vertices, 0] = speed

@@ -34,13 +34,16 @@ def stack(support: str, *more: Any, device: str = "cpu") -> dv.Model:
 def resting(support: str, device: str) -> dv.Model:
     """A box on a floor, a collider's plane, or one large triangle of a pinned body: every normal is y."""
     barrier: Any = dv.PairBarrier(2e3, 0.05, self_contact=False, detections=1, reach=0.4)
-    body, things, pinned = box(2, (0.2, 0.1, 0.2)), (), []
+    body, things, pinned = box(2, (0.2, 0.1, 0.2), split="kuhn"), (), []
     if support == "floor":
         barrier = dv.FloorBarrier(height=-0.025, kappa=2e3, dhat=0.05)
     elif support == "plane":
         things = (dv.colliders.Plane((0.0, -0.025, 0.0)),)
     else:
-        body, pinned = join([body, box(2, (6.0, 1.0, 6.0)).translate((-4.5, -1.025, -1.5))]), list(range(8, 16))
+        body, pinned = (
+            join([body, box(2, (6.0, 1.0, 6.0), split="kuhn").translate((-4.5, -1.025, -1.5))]),
+            list(range(8, 16)),
+        )
     return dv.Model(body, density=500.0, pinned=pinned, energies=(dv.StableNeoHookean(), barrier), colliders=things,
                     device=device)  # fmt: skip
 

@@ -73,7 +73,7 @@ def by_torch(c: Case) -> tuple[Tensor, Tensor]:
     total = c.force[:, :vertices]
     if c.planes.numel():
         size, normal = FLOOR.normal_force(c.x, c.planes, c.origin if c.origin.numel() else None)
-        total = total + (size[..., None] * normal[:, None]).sum(2)
+        total = total + (size[..., None] * normal).sum(2)
     mass = c.mass[..., None].expand(scenes, vertices, 1)
     columns = torch.cat([mass * c.lift, h * h * total, mass], -1)
     sums = columns.new_zeros((scenes, len(held), 7)).index_add(1, body, columns)

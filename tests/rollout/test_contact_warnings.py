@@ -26,7 +26,7 @@ def thrown() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
 
 def sliding(**friction: float) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
     floor = dv.FloorBarrier(height=-0.01, kappa=2e3)
-    model = dv.Model(box(3, 0.2), energies=(dv.StableNeoHookean(), floor, dv.Friction(**friction)))
+    model = dv.Model(box(3, 0.2, split="kuhn"), energies=(dv.StableNeoHookean(), floor, dv.Friction(**friction)))
     v = torch.zeros_like(model.rest_points)
     v[:, 0] = 1e-3
     return model, model.rest_points, v

@@ -128,7 +128,7 @@ def test_a_loop_of_steps_says_it_too() -> None:
 
 def test_a_flight_is_not_lost() -> None:
     model, x, v = bent()
-    flight: dict[str, Any] = {"mu": 1.0, "lam": 1.0, "time_step": 1.0, "sweeps": 1}
+    flight: dict[str, Any] = {"mu": 10.0, "lam": 10.0, "time_step": 0.9, "sweeps": 1}
     assert messages(lambda: dv.rollout(model, x, 0 * v + 500.0, steps=9, **flight)) == []
 
 

@@ -101,7 +101,7 @@ def test_slivers_ask_for_the_sweeps_that_they_need(dtype: torch.dtype) -> None:
     """Of a regular mesh eight sweeps of a step are enough; of one with a flat tet they are not, each time."""
     said = []
     for height in (1.0, 0.01):
-        mesh = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
+        mesh = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1), split="kuhn")
         points = mesh.points.copy()
         corners = mesh.tets[31]
         base = points[corners[:3]].mean(0)
