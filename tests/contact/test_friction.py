@@ -47,7 +47,7 @@ class Block:
 
 
 def block_on(support: str, *friction: dv.Friction, device: str = "cpu") -> Block:
-    block, pinned, floor, colliders = box(2, (0.2, 0.1, 0.2)), None, (), ()
+    block, pinned, floor, colliders = box(2, (0.2, 0.1, 0.2), split="kuhn"), None, (), ()
     if support == "floor":
         floor = (dv.FloorBarrier(height=-GAP, kappa=KAPPA, dhat=DHAT),)
     else:
@@ -55,7 +55,10 @@ def block_on(support: str, *friction: dv.Friction, device: str = "cpu") -> Block
     if support == "plane":
         colliders = (dv.colliders.Plane((0.0, -GAP, 0.0)),)
     elif support == "body":  # one triangle of it lies below the whole way: every normal is y
-        block, pinned = join([block, box(2, (6.0, 1.0, 6.0)).translate((-4.5, -1.0 - GAP, -1.5))]), range(8, 16)
+        block, pinned = (
+            join([block, box(2, (6.0, 1.0, 6.0), split="kuhn").translate((-4.5, -1.0 - GAP, -1.5))]),
+            range(8, 16),
+        )
     energies = (dv.StableNeoHookean(), *floor, *friction)
     model = dv.Model(block, density=500.0, pinned=None if pinned is None else list(pinned), energies=energies,
                      colliders=colliders, device=device)  # fmt: skip
