@@ -69,8 +69,12 @@ struct Line {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
         admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastShare);
+        rise += E::change(before, s * at(way + row(i)), data, count, size);
+      } else {
+        const double now = E::value(before, data, count), then = E::value(after, data, count);
+        rise += then - now;
+        size += std::abs(now) + std::abs(then);
       }
-      rise += E::change(before, s * at(way + row(i)), data, count, size);
     });
     return admitted ? rise : std::numeric_limits<double>::infinity();
   }

@@ -97,11 +97,6 @@ template <class R>
 DIFFVBD_FN R dot(const Vec3<R>& a, const Vec3<R>& b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
-// what rounding of dot(a, b) goes by
-template <class R>
-DIFFVBD_FN R sizes(const Vec3<R>& a, const Vec3<R>& b) {
-  return absolute(a.x * b.x) + absolute(a.y * b.y) + absolute(a.z * b.z);
-}
 template <class R>
 DIFFVBD_FN Vec3<R> cross(const Vec3<R>& a, const Vec3<R>& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};

@@ -32,14 +32,6 @@ struct Anchor {
     const Vec3<R> d = s.x - Vec3<R>{data[1], data[2], data[3]};
     return R(0.5) * s.h * s.h * data[0] * dot(d, d);
   }
-  // By how much it changes along a step; its terms' sizes are added to `size`.
-  template <class R>
-  DIFFVBD_FN static R change(const VertexState<R>& s, const Vec3<R>& step, const R* data, int, R& size) {
-    const R k = s.h * s.h * data[0], half = R(0.5) * k * dot(step, step);
-    const Vec3<R> force = k * (s.x - Vec3<R>{data[1], data[2], data[3]});
-    size = size + sizes(force, step) + half;
-    return dot(force, step) + half;
-  }
 };
 
 }  // namespace diffvbd

@@ -42,7 +42,7 @@ def test_page_says_what_its_numbers_say() -> None:
     better, same = said([0.010, 0.012, 0.011]), said([0.15, 0.2, 0.25])
     assert "5 and 100 sweeps differ" in better and "the effect is there" in better
     assert "no difference" in same and "the effect is absent" in same
-    assert depth.bound(14) == pytest.approx(2.145, abs=2e-3)  # of Student's table
+    assert depth.bound(14) == pytest.approx(2.145, abs=tolerance("student_table"))  # of Student's table
 
 
 def test_throw_of_a_batch_moves_as_if_alone(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_stacked_blocks_carry_each_other(support: str) -> None:
 def approaching(detections: int, **options: Any) -> tuple[dv.Model, Tensor, Tensor]:
     """Two boxes of different mass that meet off center at 0.8 m/s."""
     friction = options.pop("friction", ())
-    tets = join([box(2, 0.2), box(2, 0.2).translate((0.27, 0.02, 0.04))])
+    tets = join([box(2, 0.2, split="kuhn"), box(2, 0.2, split="kuhn").translate((0.27, 0.02, 0.04))])
     density = torch.tensor([500.0] * 6 + [300.0] * 6, dtype=torch.float64)
     barrier = dv.PairBarrier(2e3, 0.05, self_contact=False, detections=detections, **options)
     model = dv.Model(tets, density=density, energies=(dv.StableNeoHookean(), barrier, *friction))
@@ -160,7 +160,7 @@ def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
 def test_collision_in_one_dimension() -> None:
     """Head on: speeds (m1 - m2) / (m1 + m2) v and 2 m1 / (m1 + m2) v as h -> 0, in first order; K = 20."""
     speed, duration, errors = 0.3, 0.15, []
-    tets = join([box(2, 0.2), box(2, 0.2).translate((0.251, 0.0, 0.0))])
+    tets = join([box(2, 0.2, split="kuhn"), box(2, 0.2, split="kuhn").translate((0.251, 0.0, 0.0))])
     density = torch.tensor([500.0] * 6 + [250.0] * 6, dtype=torch.float64)
     energies = (dv.StableNeoHookean(), dv.PairBarrier(40.0, 0.05, self_contact=False, detections=1))
     model = dv.Model(tets, density=density, energies=energies)
