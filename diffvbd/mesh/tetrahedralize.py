@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-import warnings
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array
+from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array, warn
 from diffvbd.mesh.io import read_triangles
 from diffvbd.mesh.shapes import count, positive
 from diffvbd.mesh.tet_mesh import TetMesh
@@ -87,8 +86,7 @@ def warn_of_unit(points: FloatArray, cure: str) -> None:
     """Warn the caller of a function of this package of points [P, 3] that are hardly in metres."""
     extent = float(np.ptp(points, axis=0).max())
     if extent > UNLIKELY:
-        said = f"surface: its largest extent is {extent:.4g} m, if its unit is the metre, which is assumed; {cure}"
-        warnings.warn(said, stacklevel=3)
+        warn(f"surface: its largest extent is {extent:.4g} m, if its unit is the metre, which is assumed; {cure}")
 
 
 def surface_arrays(surface: str | PathLike[str] | tuple[Any, Any]) -> tuple[FloatArray, IntArray]:
