@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from meshio import ReadError
 
 
 class Counts(NamedTuple):
@@ -22,14 +23,14 @@ def counts(path: Path, kind: str) -> Counts:
     """The numbers of nodes and cells that a file of this kind of meshio names.
 
     Raises:
-        ValueError: more of them than the file has bytes, or several blocks of nodes that cannot be told apart.
+        ReadError: more of them than the file has bytes, or several blocks of nodes that cannot be told apart.
     """
     reader = _READERS.get(kind)
     data = path.read_bytes() if reader else b""
     found = reader(data) if reader else Counts()
     for name, number in found._asdict().items():
         if number is not None and number > len(data) and kind != "vtu":  # whose arrays may be compressed
-            raise ValueError(f"truncated: it names {number} {name} and has {len(data)} bytes")
+            raise ReadError(f"truncated: it names {number} {name} and has {len(data)} bytes")
     return found
 
 
@@ -43,14 +44,14 @@ def faces(path: Path) -> int | None:
             return number
         text = len(re.findall(rb"^\s*endfacet", data, re.M | re.I))
         if text == 0 and not data[:5].lower() == b"solid":
-            raise ValueError(f"truncated: {len(data)} bytes are no binary STL of a whole number of triangles")
+            raise ReadError(f"truncated: {len(data)} bytes are no binary STL of a whole number of triangles")
         return text
     if suffix == ".off":
         head = re.match(rb"\s*\w*OFF\w*\s+(?:#[^\n]*\s+)*(\d+)\s+(\d+)", data)
     else:
         end = data.find(b"end_header")
         if end < 0:
-            raise ValueError("truncated: its header has no end")
+            raise ReadError("truncated: its header has no end")
         head = re.search(rb"element\s+(face)\s+(\d+)", data[:end])
     return int(head.group(2)) if head else None
 
@@ -59,27 +60,28 @@ def msh_version(data: bytes) -> str:
     """'2.2', '4', '4.1', ... of a Gmsh file, '1' of the oldest.
 
     Raises:
-        ValueError: it is none.
+        ReadError: it is none.
     """
     head = re.match(rb"\s*(?:\$Comments.*?\$EndComments\s*)?(\$MeshFormat\s+([\d.]+)|\$NOD\s)", data, re.S)
     if head:
         return head.group(2).decode() if head.group(2) else "1"
     if data.lstrip()[:1] == b"(":
-        raise ValueError("it is a mesh of Ansys Fluent, which has faces and no tets: export one of Gmsh or VTK")
+        raise ReadError("it is a mesh of Ansys Fluent, which has faces and no tets: export one of Gmsh or VTK")
     shown = data[:40].split(b"\n")[0].decode(errors="replace").strip()
-    raise ValueError(f"expected a Gmsh file, which begins with $MeshFormat or $NOD, got {shown!r}")
+    raise ReadError(f"expected a Gmsh file, which begins with $MeshFormat or $NOD, got {shown!r}")
 
 
 def _msh(data: bytes) -> Counts:
     version = msh_version(data)
     if version == "1":
-        return Counts(*(_only(re.findall(rb"^\$%s\s+(\d+)" % name, data, re.M), "$") for name in (b"NOD", b"ELM")))
+        heads = (re.findall(rb"^\$%s\s+(\d+)" % name, data, re.M) for name in (b"NOD", b"ELM"))
+        return Counts(*(_only(found, "sections of one kind") for found in heads))
     binary = re.match(rb"\s*\$MeshFormat\s+\S+\s+1", data) is not None
     found = []
     for name in (b"Nodes", b"Elements"):
         sections = [m.end() for m in re.finditer(rb"^\$%s[ \t]*\r?\n" % name, data, re.M)]
         if len(sections) > 1:
-            raise ValueError(f"it has {len(sections)} sections ${name.decode()}, whose numbers cannot be told apart")
+            raise ReadError(f"it has {len(sections)} sections ${name.decode()}, whose numbers cannot be told apart")
         if not sections:
             found.append(None)
         elif version.startswith("4") and binary:
@@ -90,10 +92,10 @@ def _msh(data: bytes) -> Counts:
     if version.startswith("4"):
         for head in found:
             if head and head[0] > len(data):
-                raise ValueError(f"truncated: it names {head[0]} blocks and has {len(data)} bytes")
+                raise ReadError(f"truncated: it names {head[0]} blocks and has {len(data)} bytes")
         nodes, cells = (head[1] if head and len(head) > 1 else None for head in found)
         if version != "4" and found[0] and len(found[0]) == 4 and found[0][1] > found[0][3] - found[0][2] + 1:
-            raise ValueError("blocks of its nodes have the same numbers, so that they cannot be told apart")
+            raise ReadError("blocks of its nodes have the same numbers, so that they cannot be told apart")
         return Counts(nodes, cells)
     if not binary and found[0]:
         start = data.index(b"\n", data.index(b"$Nodes")) + 1
@@ -106,7 +108,7 @@ def _check_numbers(section: bytes) -> None:
     lines = section.split(b"\n")[1:]
     numbers = np.array([line.split(None, 1)[0] for line in lines if line.strip()])
     if len(np.unique(numbers)) < len(numbers):
-        raise ValueError("some of its nodes have the same number, so that they cannot be told apart")
+        raise ReadError("some of its nodes have the same number, so that they cannot be told apart")
 
 
 def _vtk(data: bytes) -> Counts:
@@ -118,7 +120,7 @@ def _vtk(data: bytes) -> Counts:
 def _vtu(data: bytes) -> Counts:
     pieces = re.findall(rb"<Piece\b[^>]*>", data)
     if len(pieces) > 1:
-        raise ValueError(f"it has {len(pieces)} pieces, of which meshio keeps the last: write it as one piece")
+        raise ReadError(f"it has {len(pieces)} pieces, of which meshio keeps the last: write it as one piece")
     heads = (re.search(rb"%s\s*=\s*[\"']\s*(\d+)" % name, b"".join(pieces)) for name in _OF_PIECE)
     return Counts(*(int(head.group(1)) if head else None for head in heads))
 
@@ -136,7 +138,7 @@ def _medit(data: bytes) -> Counts:
 
 def _only(found: list[Any], what: str) -> int | None:
     if len(found) > 1:
-        raise ValueError(f"it has {len(found)} {what}, whose numbers cannot be told apart")
+        raise ReadError(f"it has {len(found)} {what}, whose numbers cannot be told apart")
     return int(found[0]) if found else None
 
 
@@ -147,10 +149,10 @@ def abaqus_text(text: str) -> str:
     """An Abaqus file with all its nodes in the first block: of several, meshio keeps the last.
 
     Raises:
-        ValueError: nodes of several parts with the same numbers, or parts that are placed more than once.
+        ReadError: nodes of several parts with the same numbers, or parts that are placed more than once.
     """
     if len(re.findall(r"^\*instance\b", text, re.M | re.I)) > 1:
-        raise ValueError("it places parts (*INSTANCE), which the reader does not: write it flat, without parts")
+        raise ReadError("it places parts (*INSTANCE), which the reader does not: write it flat, without parts")
     blocks = list(_abaqus_blocks(text))
     nodes = [block for block in blocks if re.match(r"\*node\s*(,|$)", block.split("\n", 1)[0], re.I)]
     if len(nodes) < 2:
@@ -158,7 +160,7 @@ def abaqus_text(text: str) -> str:
     rows = [row for block in nodes for row in block.split("\n")[1:] if row.strip() and not row.startswith("**")]
     numbers = [int(row.split(",", 1)[0]) for row in rows]
     if len(set(numbers)) < len(numbers):
-        raise ValueError(
+        raise ReadError(
             f"its {len(nodes)} blocks *NODE use the same numbers, so that they cannot be told apart: write it flat, "
             "without parts"
         )

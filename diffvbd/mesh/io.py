@@ -201,7 +201,7 @@ def _mesh_of(
         kept, tets = _used(first[tets])
         points, vertices = points[kept], vertices[kept]
     name, body = _body_labels(content, found.rows, tets)
-    if name == "body" and not weld:  # bodies that touch, as they were saved
+    if name in ("body", "medit:ref") and not weld:  # bodies that touch, as `save` writes them
         doubled = doubled[body[doubled] == body[first[doubled]]]
     return TetMesh(points, oriented(points, tets) if orient else tets, body), vertices, name, len(doubled)
 

@@ -78,10 +78,7 @@ def _read_cells(path: Path) -> tuple[meshio.Mesh, list[str]]:
     kind = _kind(path)
     if kind == "tetgen":
         return read_tetgen(path), []
-    try:
-        named = headers.counts(path, kind)
-    except ValueError as failure:
-        raise meshio.ReadError(str(failure)) from None
+    named = headers.counts(path, kind)
     content, notes = _read_msh(path) if kind == "gmsh" else (_read_as(kind, path), [])
     nodes, cells = len(content.points), sum(len(block.data) for block in content.cells)
     if named.nodes is not None and nodes != named.nodes:
@@ -109,10 +106,7 @@ def _kind(path: Path) -> str:
 def _read_as(kind: str, path: Path) -> meshio.Mesh:
     if kind == "abaqus":
         text = path.read_text(encoding="utf-8", errors="replace")
-        try:
-            merged = headers.abaqus_text(text)
-        except ValueError as failure:
-            raise meshio.ReadError(str(failure)) from None
+        merged = headers.abaqus_text(text)
         if merged is not text:
             return meshio.read(io.StringIO(merged), kind)
     if kind in _TEXT and path.suffix.lower() not in (".gz", ".meshb"):

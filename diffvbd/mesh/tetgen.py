@@ -16,6 +16,9 @@ def read_tetgen(path: Path) -> meshio.Mesh:
     if dimension != 3:
         raise meshio.ReadError(f"expected nodes in 3 dimensions, got {dimension}")
     (_, corners, *_), cells = _table(path.with_suffix(".ele"))
+    if corners not in (4, 10) or nodes.shape[1] < 4 or cells.shape[1] < 1 + corners:
+        got = f"{corners} nodes a tet, rows of {nodes.shape[1]} and {cells.shape[1]} numbers"
+        raise meshio.ReadError(f"expected 4 or 10 nodes a tet, and rows with all of their numbers, got {got}")
     first = int(nodes[0, 0]) if len(nodes) else 0
     if not np.array_equal(nodes[:, 0], np.arange(first, first + len(nodes))):
         raise meshio.ReadError("expected nodes that are numbered one after another")
