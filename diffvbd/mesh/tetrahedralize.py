@@ -34,8 +34,8 @@ def tetrahedralize(
     Every call makes another mesh, with other vertices and about as many: save the one that results belong to.
 
     Args:
-        surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3] in metres, triangles [F, 3]), such as
-            the `surface` of what `repair` returns.
+        surface: A file (STL, PLY, OBJ, OFF, or what meshio reads), or (points [P, 3] in metres, triangles [F, 3]), such
+            as the `surface` of what `repair` returns.
             A file is taken to be in metres, with a UserWarning if it is larger than 5.
         edge_length: Wanted edge length [m], at most the diagonal of the bounding box; default 1/20 of it.
         epsilon: Largest distance from the input surface [m]; default 1/20 of `edge_length`.

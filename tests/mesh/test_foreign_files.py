@@ -59,7 +59,7 @@ def test_other_cells_are_cut(tmp_path: Path, cell: str, volume: float) -> None:
     ("files", "tets"),
     [
         ({"a.msh": V1}, 1),
-        ({"a.node": f"4 3 0 0\n{ROWS}", "a.ele": "1 4 1\n1 1 2 3 4 1.5\n"}, 1),
+        ({"a.node": f"5 3 0 0\n{ROWS}5 1 1 1\n", "a.ele": "2 4 1\n1 1 2 3 4 1.5\n2 2 3 4 5 2.5\n"}, 2),
         ({"a.inp": f"*NODE\n{ROWS}*ELEMENT, TYPE=C3D4\n1,1,2,3,4\n*NODE\n5,1,1,1\n".replace(" ", ",")}, 1),
     ],
 )
