@@ -38,7 +38,7 @@ def read_frames(path: Path) -> Frames:
     if not listed:
         raise ValueError(f"series {path}: expected at least one frame, got none")
     listed.sort(key=lambda entry: entry[0])
-    mesh, vertices = load(listed[0][1], return_vertices=True)
+    mesh, vertices = load(listed[0][1], return_vertices=True, weld=0)
     points = [mesh.points]
     for _, file in listed[1:]:
         frame = read_points(file)

@@ -1,4 +1,4 @@
-"""Mesh files read through meshio."""
+"""Meshes from files: what a reader found, made one mesh of tets, and what is not in it said."""
 
 from __future__ import annotations
 
@@ -10,45 +10,61 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import IntArray, check_flag, float_array, to_path
-from diffvbd.mesh.tet_mesh import TetMesh, oriented
-from diffvbd.mesh.write import PREFERRED_FORMAT, quiet
+from diffvbd.mesh import cells
+from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, float_array, listed, to_path, warn
+from diffvbd.mesh.pieces import connected, together
+from diffvbd.mesh.read import SURFACES, read_cells, read_surface
+from diffvbd.mesh.shapes import positive
+from diffvbd.mesh.tet_mesh import TetMesh, oriented, signed_volume
 
 # Cell data that may hold body labels: ours, and the integer labels of Gmsh and Medit files.
 _BODY_DATA = ("body", "gmsh:physical", "medit:ref")
 
 
 @overload
-def load(path: str | PathLike[str], *, orient: bool = True, return_vertices: Literal[False] = False) -> TetMesh: ...
+def load(
+    path: str | PathLike[str],
+    *,
+    orient: bool = True,
+    return_vertices: Literal[False] = False,
+    weld: float | None = None,
+) -> TetMesh: ...
 @overload
 def load(
-    path: str | PathLike[str], *, orient: bool = True, return_vertices: Literal[True]
+    path: str | PathLike[str], *, orient: bool = True, return_vertices: Literal[True], weld: float | None = None
 ) -> tuple[TetMesh, IntArray]: ...
 
 
 def load(
-    path: str | PathLike[str], *, orient: bool = True, return_vertices: bool = False
+    path: str | PathLike[str], *, orient: bool = True, return_vertices: bool = False, weld: float | None = None
 ) -> TetMesh | tuple[TetMesh, IntArray]:
-    """Read the tets of a mesh file: Gmsh, VTK, VTU, Medit, Abaqus, XDMF and whatever else meshio reads.
+    """Read the tets of a mesh file: Gmsh, VTK, VTU, Medit, Abaqus, TetGen, XDMF and whatever else meshio reads.
 
-    All blocks of tets are taken, in the order of the file; of second-order tets the four corners. Other cells are
-    ignored and vertices without tets dropped. Cell data `body`, or the labels of Gmsh and Medit files, become
-    `TetMesh.body` where no vertex is shared between two labels; otherwise all labels are 0.
+    All volume cells are taken, in the order of the file; of cells of higher order the corners. Hexahedra, wedges and
+    pyramids are cut into tets, with a UserWarning. Faces and lines are ignored and vertices without tets dropped.
+    A UserWarning says what else of a file is not in the mesh.
+
+    Cell data `body`, or the labels of Gmsh and Medit files, become `TetMesh.body` where there are at least two and no
+    vertex is shared between them. Otherwise each connected piece is a body.
 
     Args:
         path: The file; its extension tells the format. Coordinates are taken as metres.
         orient: Exchange two vertices of every tet of negative volume: files often mix orientations.
         return_vertices: Also return the index in the file of each vertex of the mesh, shape [V].
+        weld: Vertices that are at most so far apart become one [m]: where two parts were meshed each for itself, they
+            do not hold together. By default they stay as they are, with a UserWarning where some lie in one place; 0
+            does the same without it.
 
     Raises:
         TypeError: no path.
         FileNotFoundError: no such file.
-        ValueError: unreadable or truncated file, unknown format, no tets in it, or tets that TetMesh refuses.
+        ValueError: unreadable or truncated file, unknown format, one of which not all nodes arrive, no tets in it, or
+            tets that TetMesh refuses, also once they are welded; hexahedra that are too distorted to be cut.
         ImportError: the format needs a package that is not installed.
     """
     check_flag("return_vertices", return_vertices)
-    _, mesh, vertices, _ = _tets_of(to_path("path", path), orient)
-    return (mesh, vertices) if return_vertices else mesh
+    found = _read_tets(to_path("path", path), orient, weld)
+    return (found.mesh, found.vertices) if return_vertices else found.mesh
 
 
 class Fields(NamedTuple):
@@ -59,14 +75,15 @@ class Fields(NamedTuple):
     cell_data: dict[str, NDArray[Any]]
 
 
-def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
+def load_fields(path: str | PathLike[str], *, orient: bool = True, weld: float | None = None) -> Fields:
     """Read the tets of a mesh file and the values that it has for vertices and tets, as `save` writes them.
 
     Rows follow the vertices and tets of the mesh: values of dropped vertices and of other cells are left out. Units are
     those of the file. Cell data `body` is not repeated here where it has become `TetMesh.body`.
 
     Args:
-        path, orient: As in `load`.
+        path, orient, weld: As in `load`. A tet cut out of a cell has the values of the cell, a welded vertex those of
+            the first one in its place.
 
     Returns:
         `Fields`: the mesh, point_data of shape [V] or [V, C] and cell_data of shape [T] or [T, C], by name.
@@ -76,18 +93,19 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
         ValueError: As `load`, and for values of another number of rows, or that are no numbers.
     """
     path = to_path("path", path)
-    content, mesh, vertices, blocks = _tets_of(path, orient)
+    content, mesh, vertices, rows, labels = _read_tets(path, orient, weld)
     points: dict[str, NDArray[Any]] = {}
     for name, values in content.point_data.items():
         if name == "gmsh:dim_tags":  # bookkeeping of meshio, which .msh files have always
             continue
         points[name] = _rows(path, f"point_data[{name!r}]", values, len(content.points))[vertices]
-    cells: dict[str, NDArray[Any]] = {}
+    of_tets: dict[str, NDArray[Any]] = {}
     for name, values in content.cell_data.items():
-        if name != "body" or mesh.num_bodies == 1:
+        if name != labels or name != "body":
             label = f"cell_data[{name!r}]"
-            cells[name] = np.concatenate([_rows(path, label, values[k], len(content.cells[k].data)) for k in blocks])
-    return Fields(mesh, points, cells)
+            found = [_rows(path, label, values[k], len(content.cells[k].data))[parents] for k, parents in rows]
+            of_tets[name] = np.concatenate(found)
+    return Fields(mesh, points, of_tets)
 
 
 def _rows(path: Path, label: str, values: Any, rows: int) -> NDArray[Any]:
@@ -99,75 +117,146 @@ def _rows(path: Path, label: str, values: Any, rows: int) -> NDArray[Any]:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def _tets_of(path: Path, orient: bool) -> tuple[meshio.Mesh, TetMesh, IntArray, list[int]]:
-    """A file's content, its mesh, the index in the file of each vertex [V], and the blocks of tets."""
+class _Found(NamedTuple):
+    """A file's content, its mesh, the index in the file of each vertex [V], the block and the rows in it of its tets,
+    and the name of the cell data that its labels are from."""
+
+    content: meshio.Mesh
+    mesh: TetMesh
+    vertices: IntArray
+    rows: list[tuple[int, IntArray]]
+    labels: str
+
+
+def _read_tets(path: Path, orient: bool, weld: float | None) -> _Found:
     check_flag("orient", orient)
-    content = _read(path)
-    blocks = [k for k, cells in enumerate(content.cells) if cells.type in ("tetra", "tetra10")]
-    found = [content.cells[k].data[:, :4] for k in blocks]
-    if sum(map(len, found)) == 0:
-        others = ", ".join(sorted({cells.type for cells in content.cells})) or "no cells at all"
-        fill = ": a surface is filled by `diffvbd mesh` or dv.mesh.tetrahedralize" if "triangle" in others else ""
-        raise ValueError(f"mesh file {path} has no tets (it has {others}){fill}")
+    distance = positive("weld", weld) if weld else weld
+    if path.suffix.lower() in SURFACES and path.is_file():
+        raise ValueError(f"mesh file {path} has no tets: {path.suffix} files hold surfaces, which {_FILLED}")
+    content, notes = read_cells(path)
+    found = cells.tets_of(content)
+    if len(found.tets) == 0:
+        others = ", ".join(sorted({block.type for block in content.cells})) or "no cells at all"
+        surface = len(cells.triangles_of(content)) > 0 and not found.left_out
+        raise ValueError(f"mesh file {path} has no tets (it has {others}){f': a surface {_FILLED}' if surface else ''}")
+    if found.cut:
+        notes.append(f"{cells.listed_kinds(found.cut)} cells are cut into tets")
+    if found.left_out:
+        notes.append(f"{cells.listed_kinds(found.left_out)} cells are left out")
     try:
-        mesh, vertices = _mesh_of_used_vertices(content, np.concatenate(found), blocks, orient)
+        mesh, vertices, labels, doubled = _mesh_of(content, found, orient, distance)
     except (TypeError, ValueError) as failure:
         raise ValueError(f"mesh file {path}: {failure}") from None
-    return content, mesh, vertices, blocks
-
-
-def _read(path: Path) -> meshio.Mesh:
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"mesh file {path} is not a file" if path.exists() else f"mesh file {path} does not exist"
+    if doubled and distance is None:
+        step = float(f"{1e-6 * np.linalg.norm(np.ptp(mesh.points, axis=0)):.1g}")
+        notes.append(
+            f"{doubled} vertices lie where another one does, and the mesh does not hold together there: weld={step:g} "
+            "joins those that are closer than that [m], weld=0 keeps them"
         )
-    return quiet(lambda: meshio.read(path, file_format=PREFERRED_FORMAT.get(path.suffix.lower())), f"read {path}")
+    for note in notes:
+        warn(f"mesh file {path}: {note}")
+    return _Found(content, mesh, vertices, found.rows, labels)
+
+
+_FILLED = "is filled by `diffvbd mesh` or dv.mesh.tetrahedralize"
 
 
 def read_triangles(path: Path) -> tuple[NDArray[Any], IntArray]:
-    """Points and triangles of a surface file; quads are cut in two. Raises as `load` does."""
-    content = _read(path)
-    found = [cells.data for cells in content.cells if cells.type == "triangle"]
-    found += [cells.data[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3) for cells in content.cells if cells.type == "quad"]
-    if sum(map(len, found)) == 0:
+    """Points and triangles of a surface file; faces of more corners are cut. Raises as `load` does."""
+    if path.suffix.lower() in SURFACES:
+        points, triangles = read_surface(path)
+    else:
+        content, notes = read_cells(path)
+        points, triangles = content.points, cells.triangles_of(content)
+        for note in notes:
+            warn(f"surface file {path}: {note}")
+    if len(triangles) == 0:
         raise ValueError(f"surface file {path} has no triangles")
-    return content.points, np.concatenate(found).astype(np.int64)
+    return points, triangles
 
 
 def read_points(path: Path) -> NDArray[Any]:
     """Points [P, 3] of a mesh file, as they stand in it. Raises as `load` does."""
+    content, _ = read_cells(path)
     try:
-        return float_array("points", _read(path).points, (None, 3))
+        return float_array("points", content.points, (None, 3))
     except (TypeError, ValueError) as failure:
         raise ValueError(f"mesh file {path}: {failure}") from None
 
 
-def _mesh_of_used_vertices(
-    content: meshio.Mesh, cells: NDArray[Any], blocks: list[int], orient: bool
-) -> tuple[TetMesh, IntArray]:
-    cells = cells.astype(np.int64)
-    if cells.min() < 0 or cells.max() >= len(content.points):
-        raise ValueError(
-            f"expected vertex indices from 0 to {len(content.points) - 1}, got {cells.min()}..{cells.max()}"
-        )
-    used = np.zeros(len(content.points), dtype=bool)
-    used[cells] = True
-    vertices = np.nonzero(used)[0]
+def _mesh_of(
+    content: meshio.Mesh, found: cells.Tets, orient: bool, weld: float | None
+) -> tuple[TetMesh, IntArray, str, int]:
+    """The mesh, the index in the file of each of its vertices, the name of the cell data that its labels are from, and
+    how many vertices lie where another one does."""
+    tets = found.tets
+    if tets.min() < 0 or tets.max() >= len(content.points):
+        raise ValueError(f"expected vertex indices from 0 to {len(content.points) - 1}, got {tets.min()}..{tets.max()}")
+    vertices, tets = _used(tets)
     points = float_array("points", content.points[vertices], (None, 3))
-    tets = (np.cumsum(used) - 1)[cells]
-    return TetMesh(points, oriented(points, tets) if orient else tets, _body_labels(content, blocks, tets)), vertices
+    _check_cut(points, tets, content, found)
+    if weld and weld >= (shortest := _shortest_edge(points, tets)):
+        raise ValueError(f"weld: expected less than the shortest edge, {shortest:.3g} m, got {weld:g}")
+    first = together(points, weld or 1e-8 * float(np.linalg.norm(np.ptp(points, axis=0))))
+    doubled = np.flatnonzero(first != np.arange(len(first)))
+    if weld:
+        kept, tets = _used(first[tets])
+        points, vertices = points[kept], vertices[kept]
+    name, body = _body_labels(content, found.rows, tets)
+    if name in ("body", "medit:ref") and not weld:  # bodies that touch, as `save` writes them
+        doubled = doubled[body[doubled] == body[first[doubled]]]
+    return TetMesh(points, oriented(points, tets) if orient else tets, body), vertices, name, len(doubled)
 
 
-def _body_labels(content: meshio.Mesh, blocks: list[int], tets: IntArray) -> IntArray | None:
-    """Labels per vertex from the first cell data that keeps to whole bodies."""
+def _shortest_edge(points: FloatArray, tets: IntArray) -> float:
+    lengths = [
+        np.linalg.norm(points[tets[:, i]] - points[tets[:, j]], axis=1).min() for i in range(4) for j in range(i)
+    ]
+    return float(min(lengths))
+
+
+def _used(tets: IntArray) -> tuple[IntArray, IntArray]:
+    """The vertices that tets [T, 4] have, ascending, and the tets in terms of these."""
+    used = np.zeros(tets.max() + 1, dtype=bool)
+    used[tets] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[tets]
+
+
+def _check_cut(points: FloatArray, tets: IntArray, content: meshio.Mesh, found: cells.Tets) -> None:
+    """Raises where a cell is cut into tets that do not lie side by side: some would be turned and overlap."""
+    start = 0
+    for k, parents in found.rows:
+        part, start = tets[start : start + len(parents)], start + len(parents)
+        kind = cells.kind_of(content.cells[k])
+        if kind in found.cut:
+            volume, _ = signed_volume(points, part)
+            cell_volume = np.bincount(parents, volume)
+            bad = np.unique(parents[volume * cell_volume[parents] < 0])
+            if len(bad):
+                raise ValueError(f"cells: expected {kind} cells that can be cut, got distorted {listed(bad, 'cell')}")
+
+
+def _body_labels(content: meshio.Mesh, rows: list[tuple[int, IntArray]], tets: IntArray) -> tuple[str, IntArray]:
+    """The name of the first cell data that tells whole bodies apart, and its labels per vertex; or those of pieces."""
     for name in _BODY_DATA:
-        if name not in content.cell_data:
-            continue
-        labels = np.concatenate([np.asarray(content.cell_data[name][k]).ravel() for k in blocks])
-        if len(labels) != len(tets) or not np.array_equal(labels, labels.astype(np.int64)):
+        labels = _labels(content, name, rows)
+        if labels is None or len(labels) != len(tets) or labels.min() == labels.max():
             continue
         body = np.zeros(tets.max() + 1, dtype=np.int64)
-        body[tets] = labels.astype(np.int64)[:, None]
+        body[tets] = labels[:, None]
         if np.array_equal(body[tets], np.broadcast_to(labels[:, None], tets.shape)):
-            return body
-    return None
+            return name, body
+    return "", np.unique(connected(tets, int(tets.max()) + 1), return_inverse=True)[1]
+
+
+def _labels(content: meshio.Mesh, name: str, rows: list[tuple[int, IntArray]]) -> IntArray | None:
+    """Integer cell data by that name of each tet, or None."""
+    if name not in content.cell_data:
+        return None
+    given = [np.asarray(content.cell_data[name][k]) for k, _ in rows]
+    if any(len(values) != values.size or values.dtype.kind not in "iuf" for values in given):
+        return None
+    labels = np.concatenate([values.ravel()[parents] for values, (_, parents) in zip(given, rows, strict=True)])
+    with np.errstate(invalid="ignore"):
+        whole = labels.astype(np.int64)
+    return whole if np.array_equal(whole, labels) else None

@@ -77,7 +77,7 @@ def repair(
     `tetrahedralize` spans them.
 
     Args:
-        surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3], triangles [F, 3]).
+        surface: A file (STL, PLY, OBJ, OFF, or what meshio reads), or (points [P, 3], triangles [F, 3]).
         size: Largest extent that the surface shall have [m]. Or
         scale: Metres per unit of the file, 0.001 for mm; default 1, with a UserWarning if the surface is then larger
             than 5 m.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-import warnings
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array
+from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array, warn
 from diffvbd.mesh.io import read_triangles
 from diffvbd.mesh.shapes import count, positive
 from diffvbd.mesh.tet_mesh import TetMesh
@@ -35,8 +34,8 @@ def tetrahedralize(
     Every call makes another mesh, with other vertices and about as many: save the one that results belong to.
 
     Args:
-        surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3] in metres, triangles [F, 3]), such as
-            the `surface` of what `repair` returns.
+        surface: A file (STL, PLY, OBJ, OFF, or what meshio reads), or (points [P, 3] in metres, triangles [F, 3]), such
+            as the `surface` of what `repair` returns.
             A file is taken to be in metres, with a UserWarning if it is larger than 5.
         edge_length: Wanted edge length [m], at most the diagonal of the bounding box; default 1/20 of it.
         epsilon: Largest distance from the input surface [m]; default 1/20 of `edge_length`.
@@ -87,8 +86,7 @@ def warn_of_unit(points: FloatArray, cure: str) -> None:
     """Warn the caller of a function of this package of points [P, 3] that are hardly in metres."""
     extent = float(np.ptp(points, axis=0).max())
     if extent > UNLIKELY:
-        said = f"surface: its largest extent is {extent:.4g} m, if its unit is the metre, which is assumed; {cure}"
-        warnings.warn(said, stacklevel=3)
+        warn(f"surface: its largest extent is {extent:.4g} m, if its unit is the metre, which is assumed; {cure}")
 
 
 def surface_arrays(surface: str | PathLike[str] | tuple[Any, Any]) -> tuple[FloatArray, IntArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from os import PathLike
@@ -162,15 +163,20 @@ def checked_fields(
     return found
 
 
-def quiet(action: Callable[[], Result], purpose: str) -> Result:
-    """Run meshio with its printing kept back, and every way it fails turned into one line.
+def quiet(action: Callable[[], Result], purpose: str, warned: list[str] | None = None) -> Result:
+    """Run a reader or a writer with its printing kept back, and every way it fails turned into one line.
 
     meshio ends the process on files it cannot read, and a damaged file raises whatever the parser stumbles over.
+    What it warned of goes into `warned`.
     """
     said = io.StringIO()
     try:
-        with redirect_stdout(said), redirect_stderr(said), np.errstate(all="ignore"):
-            return action()
+        with redirect_stdout(said), redirect_stderr(said), np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            result = action()
+        if warned is not None:
+            warned += [" ".join(each.split()) for each in said.getvalue().split("Warning:")[1:]]
+        return result
     except ImportError as failure:
         raise ImportError(f"cannot {purpose}: {failure}") from None
     except (meshio.ReadError, meshio.WriteError) as failure:
@@ -182,5 +188,6 @@ def quiet(action: Callable[[], Result], purpose: str) -> Result:
         # The system's own errors (no permission, disk full) are clear already; they carry an error number.
         if isinstance(failure, OSError) and failure.errno:
             raise
-        reason = f"damaged or truncated ({type(failure).__name__}: {failure})"
+        said_why = f"{type(failure).__name__}: {failure}"
+        reason = f"truncated ({said_why})" if isinstance(failure, EOFError) else f"the reader fails on it ({said_why})"
     raise ValueError(f"cannot {purpose}: {' '.join(reason.split())[:300] or 'damaged or truncated'}")

@@ -45,6 +45,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "energy_gain": (1e-9, "share of its energy that a drop may gain: rounding of a sum of large terms"),
     "impact": (1e-6, "ways in an impact of short steps at K = 5 beside K = 15, measured 4e-9 and 3e-7; 0.2 before"),
     "impact_of_two_sweeps": (0.1, "the same at K = 2, measured 0.02 and 0.03; 0.4 and 1.4 before"),
+    "potential": (1e-12, "a potential that no update may raise, but for rounding of the sum over all tets"),
     "few_sweeps_rebound": (0.01, "a rebound at K = 8 and 20 beside K = 100; measured 1e-4, with coarse 0.65 before"),
     "few_sweeps_force": (0.02, "the force of a floor at K = 8 beside K = 400; measured 6e-3, 1.2 before"),
     "student_table": (2e-3, "three decimals of a printed table"),

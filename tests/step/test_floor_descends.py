@@ -66,7 +66,7 @@ def test_the_potential_never_rises(coarse: Any) -> None:
             end, _ = dv.step(model, x, v, time_step=time_step, sweeps=sweeps, gravity=(0, 0, 0), **moduli)
             y = x + time_step * v
             values.append(float(incremental_potential(model, end, y, **moduli, time_step=time_step, x_prev=x)))
-        assert (np.diff(values) <= 1e-12 * max(values)).all(), values
+        assert (np.diff(values) <= tolerance("potential") * max(values)).all(), values
         assert values[-1] < 0.99 * values[0]
 
 
