@@ -26,8 +26,8 @@ def read_tetgen(path: Path) -> meshio.Mesh:
     values = {f"tetgen:attr{k + 1}": nodes[:, 4 + k] for k in range(attributes)}
     values |= _marks(nodes[:, 4 + attributes :])
     block = (("tetra", "tetra10")[corners == 10], cells[:, 1 : 1 + corners].astype(np.int64) - first)
-    marks = {name: [column] for name, column in _marks(cells[:, 1 + corners :]).items()}
-    return meshio.Mesh(nodes[:, 1:4], [block], point_data=values, cell_data=marks)
+    marks: dict[str, Any] = {name: [column] for name, column in _marks(cells[:, 1 + corners :]).items()}
+    return meshio.Mesh(nodes[:, 1:4], [block], point_data=dict(values), cell_data=marks)
 
 
 def _marks(columns: NDArray[Any]) -> dict[str, NDArray[Any]]:

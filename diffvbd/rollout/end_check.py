@@ -23,7 +23,7 @@ from ..step.lost import FAR, fault_of, reach_of, size_of
 from ..step.unsolved import Unsolved, unsolved
 from ..tuples import replaced
 
-WRONG = 0.05  # of the motion: an estimate above it is warned of
+WRONG = 0.02  # of the motion: an estimate above it is warned of; impacts were off by two to five times as much
 MADE_GOOD = 2.5  # with coarse corrections the next steps make good most of an error: it was 1 / 2.4 to 1 / 40 as large
 UNSEEN = 1e-6  # of the Model's size: by less nothing is wrong
 LEAST_STEPS = 10  # of a rollout whose sweeps are looked at unasked: a look costs as much as some steps
