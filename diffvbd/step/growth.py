@@ -147,7 +147,7 @@ def _crossed(model: Model, mu: Tensor, lam: Tensor, h: float) -> Tensor:
 
 
 def _part_of(model: Model, crossed: Tensor) -> _Part:
-    plain = model.dtype == torch.float64 and len(model.energies) == 1
+    plain = model.dtype == torch.float64 and model.device.type == "cpu" and len(model.energies) == 1
     if model.num_tets <= MOST_TETS:
         if plain:
             return _Part(model, None)
