@@ -71,7 +71,7 @@ class Refinement:
 
     @property
     def tested(self) -> str:
-        """What was tested, and what came of it: "K, h: stable; gradient, mesh: not tested"."""
+        """A sentence on the tests and their outcome, such as ``K, h: stable; gradient, mesh: not tested``."""
         tests = ["K", "h"] + ["mesh"] * (self.mesh is not None) + ["gradient"] * bool(self.gradients)
         unstable = self._unstable
         found = {
