@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.marks import slow
 from helpers.spreads import assert_near_reference
 from torch import Tensor
 
@@ -44,13 +43,13 @@ def check(case: str, kind: str, space: int, window: int, sweeps: int, steps: int
 
 
 def rows() -> list[Any]:
-    """Each case once, with space, window, sweeps, mesh and tape in turn; the others are slow."""
+    """Each case once, with space, window, sweeps, mesh and tape in turn; the others are run before a release."""
     out = []
     for i, (case, (j, sweeps)) in enumerate(itertools.product(EXACT, enumerate(SWEEPS))):
         at = (case, testing.KINDS[(i + j) % 3], (i + j) % len(SPACES), 1 + i % 3, sweeps, (1, 2)[i % 2],
               ("full", "compact", "recompute")[(i // 2) % 3])  # fmt: skip
         quick = j == 3 + (EXACT.index(case) % 4 == 1) or case in ("plain", "free")  # twenty sweeps of every fourth
-        out.append(at if quick else slow(*at))
+        out.append(at if quick else pytest.param(*at, marks=pytest.mark.hours))
     return out
 
 
