@@ -19,7 +19,7 @@ from .. import ops
 from ..checks import check_count, is_word
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
-MOST_FUNCTIONS, MOST_OF_ANY = 4096, 2**20  # that a CoarseSpace may ask for
+MOST_FUNCTIONS, MOST_OF_ANY = 3840, 2**20  # that a CoarseSpace may ask for
 PER_FUNCTION = 25  # vertices of a large body for each function
 PER_FUNCTION_SMALL = 6  # and of a small one
 PER_FUNCTION_SHEET = 18
@@ -38,7 +38,7 @@ class CoarseSpace:
     """Coarse correction between sweeps: what few sweeps do badly, the motion of large parts, done by one small system.
 
     Args:
-        functions: Of each body, at most; up to 4096, one dense system. ``"auto"``: a 25th of its vertices, 32 to
+        functions: Of each body, at most; up to 3840, one dense system. ``"auto"``: a 25th of its vertices, 32 to
             128; small bodies fewer, down to affine functions and constants.
         degree: Of the splines on the body's rest box, 1 to 3. ``"auto"``: 1, in the plane of a sheet 3.
         groups: Sets of neighbouring tets of a body with one rotation each. ``"auto"``: a quarter of its functions.

@@ -46,7 +46,8 @@ def predict(
     Returns:
         A dict of bytes:
             model: index data and rest scalars of the Model;
-            tape: of one step, scenes x sweeps x active vertices x 72 (full), 24 (compact) or 0 bytes in float64;
+            tape: of one step, scenes x sweeps x active vertices x 72 (full), 24 (compact) or 0 bytes in float64
+                (104 and 32 with a floor);
             step: what one step keeps for its backward beside the state it starts from, tape included;
             kept: the largest amount kept at once: all steps without checkpoints; states plus the steps of one segment
                 with checkpoints every n; states plus one step with BinomialCheckpoints. The state of the random number
@@ -133,8 +134,8 @@ def predict(
 
 
 def coarse_scalars(model: Model, sweeps: int) -> int:
-    """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrix's factors, and
-    what each correction has done; with a floor also where it began."""
+    """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrices or
+    their factors, and what each correction has done; with a floor also where it began."""
     if model.coarse is None or not model.coarse_geometry.bodies:
         return 0
     geometry, plan = model.coarse_geometry, model._coarse_plan

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.sweep import is_out_of_memory
+from ..mask import VERTEX_ENERGIES
+from ..model.coarse_plan import TILE
 from ..model.model import Model
 from ..ops import regimes
 
@@ -66,5 +68,9 @@ def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = T
     if corrects:
         sizes = model._coarse_plan.sizes
         one += 8 * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)
+        if model.energy_mask & VERTEX_ENERGIES and not model.touches:  # in float64: blocks, matrices, their inversion
+            double, tile = 8 // model._mass.element_size(), sizes.functions * 6 + TILE * sizes.bodies
+            one += double * (6 * positions + 9 * sizes.cells + TILE * tile)
+            one += 9 * sizes.cells + (4 * positions if reverse else 0)
     one *= model._mass.element_size()
     return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))

@@ -21,8 +21,8 @@ from ..ops.segments import sum_by
 from .pair_values import barrier_values, floor_friction_values, lagged_values
 from .rigid_terms import Scenes, corners_of
 
-LENGTHS = 8  # 1, 1/2, ..., 1/128; twin of kLengths in csrc/coarse/length.h, as the next
-DECREASE = 1e-4  # share of what the slope promises
+LENGTHS = 8  # 1, 1/2, ..., 1/128; twin of kFractions in csrc/core/safeguards.h
+DECREASE = 1e-4  # share of what the slope promises; twin of kDecrease in csrc/coarse/length.h
 EDGES = 1  # the kind of a pair of two edges
 
 
