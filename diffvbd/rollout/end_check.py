@@ -132,12 +132,12 @@ class EndLook:
         if not (error > WRONG and distance > UNSEEN * size_of(self.model)):
             return
         worst = max(found, key=lambda u: u.error)
-        of = f"body {worst.body}" + (f" of scene {worst.scene}" if worst.scene else "")
+        of = f", worst in body {worst.body}" if int(self.model.body.max()) else ""
+        of += f" of scene {worst.scene}" if worst.scene else ""
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
         warn(
-            f"sweeps: they leave about {percent(share)} of what forces do in a step undone, worst in {of}, by which "
-            f"the motion may be off by some {percent(min(error, 1.0))}; take more sweeps{faster} or a smaller "
-            "time_step, and compare; " + page("numerics.md")
+            f"sweeps: they leave steps unsolved{of}, by which the motion may be off by some {percent(min(error, 1.0))}; "
+            f"take more sweeps{faster} or a smaller time_step, and compare; " + page("numerics.md")
         )
 
 
