@@ -65,6 +65,16 @@ def pytest_pyfunc_call() -> Generator[None, Any, Any]:
 
 
 @pytest.fixture(autouse=True)
+def growth_is_measured_where_asked(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Whether vibrations grow takes up to 24 steps of each new scene, and there are thousands: tests of it ask for it
+    by MEASURES_GROWTH."""
+    from diffvbd.step import growth
+
+    with contextlib.nullcontext() if getattr(request.module, "MEASURES_GROWTH", False) else growth.proven():
+        yield
+
+
+@pytest.fixture(autouse=True)
 def seeded() -> None:
     torch.manual_seed(0)
 

@@ -136,7 +136,7 @@ class EndLook:
         of += f" of scene {worst.scene}" if worst.scene else ""
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
         warn(
-            f"sweeps: they leave steps unsolved{of}, by which the motion may be off by some {percent(min(error, 1.0))}; "
+            f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
             f"take more sweeps{faster} or a smaller time_step, and compare; " + page("numerics.md")
         )
 

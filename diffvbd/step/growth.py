@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
+from ..mask import EXACT_BLOCK
 from ..mesh import TetMesh
 from ..model.model import Model
 from ..model.replaced import replaced_arguments
@@ -131,7 +132,8 @@ def _message(model: Model, mu: Tensor, lam: Tensor, h: float, sweeps: int, integ
             break
     calmer = (r for r in CALMER if r < model.relaxation)
     take_these += [f"relaxation={r:g}" for r in calmer if measure(part.model, sweeps=sweeps, relaxation=r) <= 1][:1]
-    if model.coarse is None and measure(part.model.replace(coarse="auto"), sweeps=sweeps) <= 1:
+    corrects = model.coarse is None and model.saturation is None and model.energy_mask & EXACT_BLOCK
+    if corrects and measure(part.model.replace(coarse="auto"), sweeps=sweeps) <= 1:
         take_these.append('coarse="auto"')
     advice = f"{', '.join(take_these)} or a shorter time step" if take_these else "a shorter time step"
     return (

@@ -10,6 +10,8 @@ import torch
 
 import diffvbd as dv
 
+MEASURES_GROWTH = True  # see conftest.py
+
 STEP: dict[str, Any] = {"mu": 1e5, "lam": 1e5, "time_step": 1 / 60}
 FLOOR = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1.0), dv.Friction(0.5))
 

@@ -17,6 +17,8 @@ from diffvbd.step.lost import FAR
 from diffvbd.step.unsolved import unsolved
 from diffvbd.testing import tolerance
 
+MEASURES_GROWTH = True  # see conftest.py
+
 SOFT: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 10}
 
 

@@ -13,6 +13,8 @@ import torch
 import diffvbd as dv
 from diffvbd.step import growth
 
+MEASURES_GROWTH = True  # see conftest.py
+
 STILL, GROWN = 5.0, 1e3  # speeds [m/s] of a bar that sags under its weight, and of one that grows from that
 BODY = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1), split="kuhn")
 
