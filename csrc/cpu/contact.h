@@ -27,8 +27,7 @@ class ContactScene {
   // After the first sweep, which goes farthest: what is near by the ways that are left.
   void settle(Team::Member& member) const;
   // Reverse, before a color's turn: its vertices go back to the positions before their update, which the tape of `rows`
-  // scalars for each vertex has, and
-  // collect what pairs have sent them since their last turn.
+  // scalars for each vertex has, and collect what pairs have sent them since their last turn.
   void prepare(int sweep, int64_t rows, int64_t begin, int64_t end, const uint8_t* limits) const;
   // Reverse, after the turn: the adjoint of assemble().
   void reverse(int64_t begin, int64_t end) const;

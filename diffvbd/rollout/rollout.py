@@ -122,8 +122,8 @@ def rollout(
             A look costs about a step and on CUDA waits for the device; nothing that is compiled or captured is looked
             at.
         check_energy: Whether to warn (UserWarning) where a scene that only gravity drives has 5 % more energy (where
-            barriers push at the start, twice as much) than it began with and gravity gave it; where, without pairs and
-            friction, the sweeps leave the motion off by an estimated 2 %; where thin tets bend. True: energy after any
+            barriers push at the start, twice as much) than it began with and gravity gave it; where, without pairs, the
+            sweeps leave the motion off by an estimated 2 %; where thin tets bend. True: energy after any
             step. None: on the CPU, of ten steps or more, after six of them, most of them early (with a floor 12, with
             contact up to 64). A rollout that ends with what is not finite, or too far away, always warns.
         check_start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or
