@@ -106,7 +106,7 @@ class PairBarrier:
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:
         self.weight, self.pairs, self.colliders = scene.time_step**2, pairs, colliders
-        self.kappa = pairs.per_pair(scene.parameter("pair_barrier", scene.model.contact, "kappa"))
+        self.kappa = pairs.per_pair(scene.parameter(scene.model.contact, "kappa"))
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         pair, local, _, together = self.pairs.entries[k]
@@ -150,16 +150,16 @@ class LaggedPairForces:
         # Weights of the first primitive sum to 1, so the gradients w_k n of its corners sum to the normal.
         both = (pairs.kind == EDGE_EDGE)[:, None]
         self.normal = self.slope[:, 0] + torch.where(both, self.slope[:, 1], 0.0)
-        kappa = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "kappa"))
+        kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
         force = -e * first
         whole = force + FADE * kappa * pairs.dhat
         share = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
-        self.damping = share * pairs.per_pair(scene.parameter("pair_barrier", model.contact, "damping"))
+        self.damping = share * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
-            self.largest = -pairs.per_pair(scene.parameter("friction", friction, "coefficient")) * e * first
+            self.largest = -pairs.per_pair(scene.parameter(friction, "coefficient")) * e * first
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -246,7 +246,7 @@ def contact_step(
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
     permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation; chord:
     how far back along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h.
-    parameters may hold "pair_barrier.kappa" [N/m], "pair_barrier.damping" [N s/m] and "friction.coefficient".
+    parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction".
     Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
     Returns (x', v').
     """

@@ -6,11 +6,11 @@ import torch
 
 from .. import ops
 from ..adjoint.anderson import run_sweeps
-from ..model.model import Model
+from ..model.system import System
 from ..tuples import replaced
 
 
-def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
+def check_on_cpu(model: System, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
     """The CPU repeats a step and names what is wrong with it."""
     twin = model._on_cpu()
     settings = replaced(settings, sizes=twin._sizes, launch=())

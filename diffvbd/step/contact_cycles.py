@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.anderson import _Combine, cycles_of, none_taken
-from ..model.model import Model
+from ..model.system import System
 from ..ops import SweepSettings, broadcast
 from ..scopes import recorders
 from ..tuples import replaced
@@ -99,7 +99,7 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     return SweptPart(x, torch.cat(limits, 1), iterates.combined(), torch.stack(lengths) if lengths else None)
 
 
-def _cycles(model: Model, sweeps: int) -> list[int]:
+def _cycles(model: System, sweeps: int) -> list[int]:
     """Sweeps of each cycle of a part, with corrections the first sweep alone; [sweeps] where nothing is done between
     them."""
     if model.coarse is None or not model.coarse_geometry.bodies:
@@ -111,7 +111,7 @@ def _cycles(model: Model, sweeps: int) -> list[int]:
 class _Iterates:
     """The last iterates of a part, and what was combined of them."""
 
-    def __init__(self, model: Model, judge: Trials, mass: Tensor, cycles: int) -> None:
+    def __init__(self, model: System, judge: Trials, mass: Tensor, cycles: int) -> None:
         self.window = 0 if model.acceleration is None else model.acceleration.window
         self.judge, self.mass = judge, mass
         self.before: list[Tensor] = []
@@ -158,7 +158,7 @@ def of_going(part: SweptPart, going: Tensor) -> SweptPart:
     )
 
 
-def record_parts(model: Model, x: Tensor, parts: Sequence[SweptPart]) -> None:
+def record_parts(model: System, x: Tensor, parts: Sequence[SweptPart]) -> None:
     """For acceleration.record() and coarse.record(): what the parts of a step that ends at x have done."""
     if model.acceleration is not None:
         for found in recorders("anderson"):

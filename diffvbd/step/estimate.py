@@ -11,7 +11,7 @@ from .. import ops
 from ..adjoint.anderson import COARSE_FIELDS, combinations_of, run_sweeps
 from ..adjoint.sweep import sweep
 from ..model.anderson import moving_vertices
-from ..model.model import Model
+from ..model.system import System
 from ..ops.detect import segment_sum
 from ..tuples import replaced
 from .arguments import Prepared, acceleration_of
@@ -50,13 +50,13 @@ class ErrorEstimate(NamedTuple):
     lengths: Tensor
 
 
-def check_estimable(model: Model, name: str) -> None:
+def check_estimable(model: System, name: str) -> None:
     """Raises where steps of the Model have no estimate; ``name``: of the argument that asks for one."""
     if model.touches:
         raise NotImplementedError(f"{name}: the error of a step with contact or friction is not estimated")
 
 
-def error_of(model: Model, x: Tensor, v: Tensor, prepared: Prepared, *, force: Any, gravity: Any, prescribed: Any
+def error_of(model: System, x: Tensor, v: Tensor, prepared: Prepared, *, force: Any, gravity: Any, prescribed: Any
              ) -> ErrorEstimate:  # fmt: skip
     """Sweeps the step once more, without gradients. Arguments as of advance()."""
     lead = x.shape[:-2]
@@ -82,7 +82,7 @@ def error_of(model: Model, x: Tensor, v: Tensor, prepared: Prepared, *, force: A
         return ErrorEstimate(*(t.reshape(*lead, *t.shape[1:]) for t in (change, ratio, error, relative, lengths)))
 
 
-def of_steps(estimates: list[ErrorEstimate], model: Model, x: Tensor, sweeps: int) -> ErrorEstimate:
+def of_steps(estimates: list[ErrorEstimate], model: System, x: Tensor, sweeps: int) -> ErrorEstimate:
     """Those of several steps, [steps, ...]; x: the state [..., V, 3] before the first."""
     if estimates:
         return ErrorEstimate(*(torch.stack(tensors) for tensors in zip(*estimates, strict=True)))
@@ -97,7 +97,7 @@ def _quotient(a: Tensor, b: Tensor) -> Tensor:
     return torch.where((a == 0) & (b == 0), 0, a / b)
 
 
-def _iterates(model: Model, begun: Begun, prepared: Prepared) -> tuple[list[Tensor], list[Tensor]]:
+def _iterates(model: System, begun: Begun, prepared: Prepared) -> tuple[list[Tensor], list[Tensor]]:
     """The last iterates of the step [B, V, 3], at most three, the end of the sweeps last; and what coarse corrections
     did, as sweep() returns it."""
     fields, settings = begun.fields(model, prepared), prepared.settings
@@ -158,11 +158,11 @@ class _Bodies(NamedTuple):
         return (segment_sum(squares, self.order, self.ptr)[..., 0] / self.size).sqrt()
 
 
-def _bodies_of(model: Model) -> _Bodies:
+def _bodies_of(model: System) -> _Bodies:
     return model.derived("bodies_that_move", lambda: _find_bodies(model))
 
 
-def _find_bodies(model: Model) -> _Bodies:
+def _find_bodies(model: System) -> _Bodies:
     of = moving_vertices(model.tets.cpu(), model._pinned.cpu())
     count = of.ptr.diff()
     corrected = torch.arange(len(count))

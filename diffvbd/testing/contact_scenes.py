@@ -66,9 +66,9 @@ def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float =
         "force": noise(name, "force", shape=shape, size=0.5),
         "density": 1000 * torch.exp(noise(name, "density", shape=tet_shape, size=0.1)),
     }
-    constants = {f"{e.name}.{k}": v for e in model.parametric_energies for k, v in model.constants(e).items()}
-    wanted = ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient", "floor_barrier.kappa",
-              "floor_barrier.height")  # fmt: skip
+    constants = {input_name(e, k): v for e in model.parametric_energies for k, v in model.constants(e).items()}
+    wanted = ("pair_kappa", "pair_damping", "friction", "floor_kappa",
+              "floor_height")  # fmt: skip
     parameters = {k: v.clone() for k, v in constants.items() if k in wanted}
     return Scene(model, x, v, inputs=inputs, parameters=parameters, **scene_options)
 
@@ -146,7 +146,7 @@ def batched() -> Scene:
     scene = build("batched", boxes((0, 0, 0), (0.04, 0.212, -0.03), points=2), (
         FloorBarrier(height=-0.012, kappa=2e4, dhat=0.02), PairBarrier(kappa=2e4, dhat=0.02, damping=1.0),
         Friction(0.3, 0.05)), batch=(3,), jitter=4e-3)  # fmt: skip
-    for name in ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient"):
+    for name in ("pair_kappa", "pair_damping", "friction"):
         scene.parameters[name] = scene.parameters[name] * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)
     return scene
 

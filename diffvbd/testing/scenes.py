@@ -211,10 +211,10 @@ class Scene:
             floor = {"normal": (0.0, 1.0, 0.0), "kappa": 400.0, "dhat": 0.02} | self.case.floor
             floor["height"] = np.atleast_1d(floor["height"])
             floor["normal"] = np.atleast_2d(floor["normal"])
-            parameters |= {f"floor_barrier.{k}": torch.as_tensor(value, dtype=dtype) for k, value in floor.items()}
+            parameters |= {f"floor_{k}": torch.as_tensor(value, dtype=dtype) for k, value in floor.items()}
         if self.case.anchor is not None:
-            parameters["anchor.stiffness"] = torch.full((len(self.points),), self.case.anchor, dtype=dtype)
-            parameters["anchor.points"] = torch.tensor(self.points, dtype=dtype)
+            parameters["anchor_stiffness"] = torch.full((len(self.points),), self.case.anchor, dtype=dtype)
+            parameters["anchor_points"] = torch.tensor(self.points, dtype=dtype)
         if parameters:
             tensors["parameters"] = parameters
         return on_device(tensors, device) | {"time_step": self.case.time_step}
