@@ -22,6 +22,7 @@ from .solver import VBD
 
 
 class System(Model):
+    acceleration = None
     """A Model with the attributes that a solver decides; it shares all tensors of the Model.
 
     Attributes:
@@ -117,4 +118,5 @@ def system_of(model: Model, solver: VBD) -> System:
     """The System of a Model and a solver, built at its first use and kept with the Model."""
     check_kind("model", model, Model)
     check_kind("solver", solver, VBD)
+    model = model.model if isinstance(model, System) else model
     return model.derived(solver.key, partial(System, model, solver))

@@ -21,7 +21,7 @@ from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, outer6
 from .rigid_contact import Correction
 from .scene import Scene, build_scene
-from .sweep import check_start, color_masses, predictor, run_sweeps, started
+from .sweep import check_start, color_masses, executed, predictor, run_sweeps, started
 
 
 class Part(NamedTuple):
@@ -221,23 +221,22 @@ def contact_step(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     parts: Sequence[Part],
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     colliders: Tensor | None = None,
     colliders_before: Tensor | None = None,
     order: Sequence[Tensor] | None = None,
     tet_order: Tensor | None = None,
     chord: float = 1.0,
+    **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
 
@@ -250,6 +249,7 @@ def contact_step(
     Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
     Returns (x', v').
     """
+    model, time_step, sweeps = executed(model, solver), solver.time_step, solver.sweeps
     count = model.contact.detections or len(parts)
     stages = model.contact.detections or 1  # of what is prescribed
     for name, value in (("parts", parts), ("order", order)):

@@ -36,7 +36,7 @@ class StableNeoHookean:
 
     def __init__(self, energy: Any, scene: Scene) -> None:
         self.scene = scene
-        self.exact = exact = scene.model.block == "exact"
+        self.exact = exact = getattr(scene.model, "block", "exact") == "exact"
         weight = scene.time_step**2 * scene.volume
         lb = scene.mu + scene.lam
         per_tet = torch.stack(torch.broadcast_tensors(weight * scene.mu, weight * lb, weight * scene.lam), -2)
@@ -278,7 +278,7 @@ class Anchor:
 
 ENERGIES: dict[str, type] = {
     "stable_neo_hookean": StableNeoHookean,
-    "floor_barrier": FloorBarrier,
+    "floor": FloorBarrier,
     "anchor": Anchor,
 }
 

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..model.model import Model
+from ..model.system import system_of
 from .anderson import Anderson
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
 from .energies import StableNeoHookean, build_energies
@@ -25,27 +27,31 @@ class Trajectory(NamedTuple):
     v: Tensor
 
 
+def executed(model: Any, solver: Any) -> Any:
+    """The model with the attributes that the solver decides; what is no Model has them already."""
+    return system_of(model, solver) if isinstance(model, Model) else model
+
+
 def step(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     coarse_steps: Tensor | None = None,
     taken: Tensor | None = None,
     record: list[Tensor] | None = None,
+    **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
-    """One time step; every tensor argument is differentiable by autograd.
+    """One time step of a model by a solver (`diffvbd.VBD`); every tensor argument is differentiable by autograd.
 
     x, v: positions [m] and velocities [m/s], [..., V, 3]; leading dimensions are scenes. mu, lam [Pa] broadcast to
     x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
@@ -53,10 +59,13 @@ def step(
     coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
     given; taken: which bodies took the combinations of a model.acceleration [combinations, ..., bodies], bool, which is
     decided if not given; record: a list, to which the step appends the lengths that it took.
-    Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
+    parameters: of energies, as `floor_kappa`. Raises ValueError when an unpinned vertex starts below a floor plane.
+    Returns (x', v').
     """
-    layout = build_layout(model, tet_order)
-    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
+    system = executed(model, solver)
+    layout = build_layout(system, tet_order)
+    numbers = solver.time_step, solver.sweeps
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
     return advance(x, v, force, gravity, prescribed, (coarse_steps, taken), record)
 
 
@@ -64,30 +73,31 @@ def rollout(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
     steps: int,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     force_per_step: Tensor | Sequence[Tensor] | None = None,
     prescribed_per_step: Tensor | Sequence[Tensor] | None = None,
     coarse_steps: Tensor | Sequence[Tensor] | None = None,
     taken: Tensor | Sequence[Tensor] | None = None,
     record: list[Tensor] | None = None,
+    **parameters: Any,
 ) -> Trajectory:
     """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
     dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps` and `taken`, and
     `record` gets an entry for each step. Other arguments as in `step`."""
-    layout = build_layout(model, tet_order)
-    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
+    system = executed(model, solver)
+    layout = build_layout(system, tet_order)
+    numbers = solver.time_step, solver.sweeps
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]

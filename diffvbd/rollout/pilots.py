@@ -295,7 +295,7 @@ class Pilots:
         load = self.model.mass.double()[:, None] * torch.as_tensor(self.gravity, device=x.device).double()
         if self.given.get("force") is not None:
             load = load + torch.as_tensor(self.given["force"]).to(load)
-        stored = mechanical_energy(self.model, self.prepared, x, v).reshape(x.shape[:-2])
+        stored = mechanical_energy(system_of(self.model, VBD(1.0, 1)), self.prepared, x, v).reshape(x.shape[:-2])
         return stored - (load * x.double()).sum((-1, -2))
 
     def lost(self, run: Pilot, seconds: float) -> float:
