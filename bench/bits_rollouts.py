@@ -37,7 +37,6 @@ def rows(device: str) -> dict[str, Callable[[], Values]]:
         "coarse, float32": lambda: end(bar(**corrected, **low)),
         "coarse, three bodies over a floor": lambda: end(three(coarse=SPACE, energies=(NEAR,))),
         "coarse, a batch": lambda: end(three(coarse=SPACE), batch=(2,)),
-        "coarse and acceleration": lambda: end(bar(**corrected, acceleration=dv.Anderson(2)), sweeps=9),
         "SDIRK2": lambda: end(bar(), sweeps=8, integrator=sdirk2),
         "SDIRK2, coarse": lambda: end(bar(**corrected), sweeps=12, integrator=sdirk2),
         "SDIRK2, pairs": lambda: end(three(energies=TOUCHING), sweeps=8, integrator=sdirk2),

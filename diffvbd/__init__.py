@@ -12,13 +12,12 @@ from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .inspect import acceleration, coarse, integrators
+from .inspect import coarse, integrators
 from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
 from .inspect.forces import Stress, reactions, stress
 from .inspect.gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
-from .model.anderson import Anderson
 from .model.coarse import CoarseSpace
 from .model.model import Model
 from .model.moduli import lame, young_poisson
@@ -40,7 +39,6 @@ __all__ = [
     "BDF2",
     "SDIRK2",
     "Anchor",
-    "Anderson",
     "BinomialCheckpoints",
     "Candidate",
     "CoarseSpace",
@@ -68,7 +66,6 @@ __all__ = [
     "TetMesh",
     "Trajectory",
     "Unrolled",
-    "acceleration",
     "advise",
     "check_gradients",
     "coarse",

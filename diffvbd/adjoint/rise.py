@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..model.anderson import MovingBodies
 from ..model.model import Model
-from ..ops.anderson import potential_rise
+from ..model.moving import MovingBodies
+from ..ops.rise import potential_rise
 
 ROUNDINGS = 8  # ulps of the terms by which a sum may rise all the same; twin of kRounding in csrc/coarse/length.h
 

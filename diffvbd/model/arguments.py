@@ -11,7 +11,6 @@ from .. import ops
 from ..checks import check_positive, check_readable, fail, is_word, refuse_gradient, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
-from .anderson import Anderson
 from .coarse import CoarseSpace
 
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
@@ -88,15 +87,13 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
 
 
 def checked_steps(
-    relaxation: Any, rigid: Any, start: Any, coarse: Any, acceleration: Any, energies: tuple[Energy, ...],
-    saturation: float | None,
-) -> tuple[float, bool, str, CoarseSpace | None, Anderson | None]:  # fmt: skip
+    relaxation: Any, rigid: Any, start: Any, coarse: Any, energies: tuple[Energy, ...], saturation: float | None,
+) -> tuple[float, bool, str, CoarseSpace | None]:  # fmt: skip
     """What steps do besides plain sweeps: the relaxation, whether free bodies are corrected, where the sweeps of the
-    others start, the coarse space and the acceleration."""
+    others start, and the coarse space."""
     rigid, start = checked_correction(rigid, start, energies)
     coarse = checked_coarse(coarse, energies, saturation)
-    acceleration = checked_acceleration(acceleration, energies, saturation)
-    return checked_relaxation(relaxation), rigid, start, coarse, acceleration
+    return checked_relaxation(relaxation), rigid, start, coarse
 
 
 def checked_relaxation(relaxation: Any) -> float:
@@ -138,16 +135,3 @@ def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float 
     if saturation is not None:
         fail("coarse", "None with saturation, which a correction would go around", repr(coarse))
     return coarse
-
-
-def checked_acceleration(acceleration: Any, energies: tuple[Energy, ...], saturation: float | None) -> Anderson | None:
-    """Anderson's method, where the other arguments allow it."""
-    if acceleration is None:
-        return None
-    if not isinstance(acceleration, Anderson):
-        raise TypeError(f"acceleration: expected a diffvbd.Anderson or None, got {acceleration!r}")
-    if any(isinstance(e, StableNeoHookean) and e.block != "exact" for e in energies):
-        fail("acceleration", "None without the exact block", repr(acceleration))
-    if saturation is not None:
-        fail("acceleration", "None with saturation, which an accelerated iterate would go around", repr(acceleration))
-    return acceleration

@@ -12,7 +12,6 @@ def describe(model: Any) -> str:
     safeguards += ["rigid=False"] if not model.rigid and not model.touches else []
     safeguards += [f'start="{model.start}"'] if model.start != "auto" else []
     safeguards += [f"coarse={model.coarse}"] if model.coarse is not None else []
-    safeguards += [f"acceleration={model.acceleration}"] if model.acceleration is not None else []
     return (
         f"Model({model.num_vertices} vertices, {model.num_tets} tets, {int(model._pinned.sum())} pinned, "
         f"{model.num_colors} colors, mass {float(model._mass.sum()):.4g} kg, "

@@ -21,12 +21,12 @@ from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
 from ..scopes import is_captured
-from .anderson import Anderson, moving_bodies
 from .arguments import Energy, check_isolated, checked_device, checked_energies, checked_steps, per_tet_density
 from .bodies import find_bodies, first_of_body
 from .coarse import CoarseSpace
 from .coarse_plan import check_coupled, plan_of
 from .describe import describe
+from .moving import moving_bodies
 from .replaced import replaced_arguments
 from .rest import lumped_mass, rest_metric
 from .warnings import warn_of
@@ -64,7 +64,6 @@ class Model:
             the one of lower incremental potential; with coarse x + h v. Beside pairs it is decided of gravity alone.
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
             :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
-        acceleration: None, or a :class:`diffvbd.Anderson`, which combines the iterates of each step.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier.
         dtype, device: torch.float64 or torch.float32; where the tensors live.
 
@@ -100,7 +99,6 @@ class Model:
         colliders: Sequence[Collider] = (),
         *,
         coarse: CoarseSpace | Literal["auto"] | None = None,
-        acceleration: Anderson | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -114,8 +112,8 @@ class Model:
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
-        checked = checked_steps(relaxation, rigid, start, coarse, acceleration, self.energies, self.saturation)
-        self.relaxation, self.rigid, self.start, self.coarse, self.acceleration = checked
+        checked = checked_steps(relaxation, rigid, start, coarse, self.energies, self.saturation)
+        self.relaxation, self.rigid, self.start, self.coarse = checked
         self._asked_rigid = rigid
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
@@ -259,8 +257,7 @@ class Model:
             given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._rest, self._plan)
             self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given, device.type)
             check_coupled(self.coarse_geometry, self.touches)
-        decides = self.contact is not None or (self.coarse is not None and self.touches)
-        if self.acceleration is not None or decides:  # by potentials of bodies
+        if self.contact is not None or (self.coarse is not None and self.touches):  # decides by potentials of bodies
             elastic = bool(self.energy_mask & ELASTIC)
             self._moving = moving_bodies(self._rest_points, self._topology[0], self._pinned, elastic)
 

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts grew; 49 did not
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
-# of accelerated plain sweeps, from which on gradients are erratic: that of docs/contact.md was a third off at 15, had
-# the wrong sign at 20 and at 40 was 7e5 times too large
-ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 TOO_STIFF = 0.55  # times aspect^2: so much too stiff were sheets of one layer, from 3.4 to 24
 MOST_BODIES = 8  # whose bending is looked at
@@ -33,8 +30,8 @@ SOFTEST = 10.0  # [Pa] Young's modulus; soft gels have 100 Pa or more
 LONGEST_STEP = 1.0  # [s]
 
 # of a Model's _derived: what is said once, or ever more seldom
-HELD_UP_SEEN, ERRATIC = "steps held up", "erratic gradients"
-ONCE = (HELD_UP_SEEN, ERRATIC)
+HELD_UP_SEEN = "steps held up"
+ONCE = (HELD_UP_SEEN,)
 
 
 def warn_of(model: Model, pinned: Any) -> None:
@@ -63,19 +60,6 @@ def warn_of(model: Model, pinned: Any) -> None:
             f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
             "lightest vertex; the sweeps converge that much more slowly"
         )
-
-
-def warn_of_erratic_gradients(model: Model, sweeps: int) -> None:
-    """Warns, once, of gradients through sweeps that are accelerated without coarse corrections. To be called where a
-    step of so many sweeps is differentiated."""
-    if model.acceleration is None or model.coarse is not None or sweeps < ERRATIC_SWEEPS or ERRATIC in model._derived:
-        return
-    model._derived[ERRATIC] = True
-    warn(
-        "acceleration: gradients through accelerated plain sweeps are exact for what ran, but may depend erratically "
-        "on the input and be wrong by orders of magnitude where positions are right; for gradients add "
-        'coarse="auto" to the Model, or take plain sweeps and more of them; ' + page("numerics.md")
-    )
 
 
 def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:

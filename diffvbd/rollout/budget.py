@@ -144,7 +144,7 @@ def error_budget(
         fail("part", "a number in (0, 1]", repr(part))
     steps = FRAMES * max(1, round(part * duration / (h * FRAMES)))
     pilots = pilots_of(rollout, model, x, v, steps * h, quantity, gradient, given)
-    own = Settings(h, sweeps, check_integrator(integrator), model.relaxation, model.coarse, model.acceleration)
+    own = Settings(h, sweeps, check_integrator(integrator), model.relaxation, model.coarse)
     return _Budget(pilots, own, steps).run(mesh)
 
 

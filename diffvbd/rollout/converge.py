@@ -237,8 +237,7 @@ class _Sweeping:
         outcome = outcomes.get(self.model)
         if outcome is not None and bool(outcome.cut.any()):
             return "more detections or a larger reach of the PairBarrier, whose pairs have held this step up"
-        unused = "acceleration=Anderson() or " if self.model.acceleration is None else ""
-        unused += 'coarse="auto" or ' if self.model.coarse is None else ""
+        unused = 'coarse="auto" or ' if self.model.coarse is None else ""
         return unused + "a larger Friction(velocity=)"
 
     def run(self, max_sweeps: int, check_every: int) -> None:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import combinations_of, cycles_of
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_bool, check_count, is_word
 from ..mask import KEEPS_POSITIONS
@@ -77,7 +76,6 @@ def predict(
     per_step = (5 if local else 3) * state + tape_bytes
     per_step += scenes * sum(model._data_count) * item if local else 0
     per_step += scenes * coarse_scalars(model, sweeps) * item
-    per_step += accelerated_states(model, sweeps) * state + scenes * accelerated_scalars(model, sweeps) * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
@@ -121,7 +119,6 @@ def predict(
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
     parts += () if model.coarse is None else (model._coarse_plan,)
-    parts += () if model.acceleration is None else (model._moving,)
     tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
     return {
         "model": sum(t.numel() * t.element_size() for t in tensors),
@@ -145,21 +142,6 @@ def coarse_scalars(model: Model, sweeps: int) -> int:
     positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0
     of_one = 3 * geometry.functions + geometry.bodies + positions
     return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
-
-
-def accelerated_states(model: Model, sweeps: int) -> int:
-    """States that an accelerated step keeps besides its own start and end: of each cycle, and each combination."""
-    return sum(len(cycles_of(model, n)) - 1 + combinations_of(model, n)
-               for n in _parts(model, sweeps) if combinations_of(model, n))  # fmt: skip
-
-
-def accelerated_scalars(model: Model, sweeps: int) -> int:
-    """Scalars of the small systems of its bodies, for each scene."""
-    if model.acceleration is None:
-        return 0
-    window = model.acceleration.window
-    sizes = [min(n + 1, window) for part in _parts(model, sweeps) for n in range(combinations_of(model, part))]
-    return model._moving.number * sum(n * (n + 1) for n in sizes)
 
 
 def _parts(model: Model, sweeps: int) -> list[int]:

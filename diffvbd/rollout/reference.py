@@ -38,7 +38,7 @@ def is_balanced(left: float) -> bool:
 
 
 def takes_corrections(model: Model) -> bool:
-    """Whether coarse corrections and acceleration are defined."""
+    """Whether coarse corrections are defined."""
     elastic = next((e for e in model.energies if isinstance(e, StableNeoHookean)), None)
     return elastic is not None and elastic.block == "exact" and model.saturation is None
 
@@ -48,7 +48,7 @@ def with_other_sweeps(model: Model) -> Model:
     if model.coarse is None and (model.touches or not takes_corrections(model)):
         return model
     coarse = "auto" if model.coarse is None else None
-    return Settings(1.0, 1, coarse=coarse, acceleration=model.acceleration).applied(model)
+    return Settings(1.0, 1, coarse=coarse).applied(model)
 
 
 def with_more_sweeps(settings: Settings, left: float, before: float) -> Settings:

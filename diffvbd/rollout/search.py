@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..model.anderson import Anderson
 from ..model.warnings import is_nearly_incompressible
 from ..step.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
 from .pilots import FRAMES, Pilot, Pilots, changes, relative
@@ -79,8 +78,6 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
         out += [*coarse(sdirk, 2), *coarse(euler, 2), *coarse(bdf, 2), *coarse(sdirk, 5)]
     out += [*plain(sdirk, 10), *plain(euler, 5), *plain(bdf, 5), *plain(sdirk, 5, 20), *plain(bdf, 10, 20),
             *plain(euler, 10, 20)]  # fmt: skip
-    if takes_corrections(model) and touches:
-        out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
 
 

@@ -12,8 +12,7 @@ import torch
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_kind, check_positive, fail, is_word
 from ..energies import StableNeoHookean
-from ..model.anderson import Anderson
-from ..model.arguments import checked_acceleration, checked_coarse, checked_relaxation
+from ..model.arguments import checked_coarse, checked_relaxation
 from ..model.coarse import CoarseSpace
 from ..model.model import Model
 from ..step.integrators import ImplicitEuler, Integrator, check_integrator
@@ -85,7 +84,7 @@ class Settings:
         time_step: h [s], at most; a rollout over ``duration`` takes steps of equal length.
         sweeps: K, of each solve.
         integrator: As in :func:`diffvbd.step`.
-        relaxation, coarse, acceleration: As in :class:`diffvbd.Model`.
+        relaxation, coarse: As in :class:`diffvbd.Model`.
         block: Of StableNeoHookean: ``"exact"`` or ``"paper"``; None: the Model's.
         dtype: The Model's has to be this one; None: any.
         tape: Of :class:`diffvbd.ReverseSweep`.
@@ -102,7 +101,6 @@ class Settings:
     integrator: Integrator = ImplicitEuler()
     relaxation: float = 1.0
     coarse: CoarseSpace | Literal["auto"] | None = None
-    acceleration: Anderson | None = None
     block: Literal["exact", "paper"] | None = None
     dtype: torch.dtype | None = None
     tape: Literal["auto", "full", "compact", "recompute"] = "auto"
@@ -115,7 +113,6 @@ class Settings:
         object.__setattr__(self, "integrator", check_integrator(self.integrator))
         object.__setattr__(self, "relaxation", checked_relaxation(self.relaxation))
         checked_coarse(self.coarse, (StableNeoHookean(),), None)  # this and what follows raises
-        checked_acceleration(self.acceleration, (), None)
         ReverseSweep(self.tape)
         checked_schedule(self.checkpoint_every)
         if self.block is not None and not is_word(self.block, "exact", "paper"):
@@ -130,7 +127,7 @@ class Settings:
         return max(1, math.ceil(check_positive("duration", duration, "s") / self.time_step - 1e-6))
 
     def applied(self, model: Model) -> Model:
-        """The Model that runs: ``model`` with relaxation, coarse, acceleration and block of these settings. It is
+        """The Model that runs: ``model`` with relaxation, coarse and block of these settings. It is
         made once for each Model and kept with it."""
         check_kind("model", model, Model)
         if self.dtype is not None and self.dtype != model.dtype:
@@ -138,7 +135,6 @@ class Settings:
         changes: dict[str, Any] = {
             "relaxation": self.relaxation,
             "coarse": CoarseSpace() if self.coarse == "auto" else self.coarse,
-            "acceleration": self.acceleration,
         }
         if self.block is not None:
             energies = [StableNeoHookean(self.block) if isinstance(e, StableNeoHookean) else e for e in model.energies]
@@ -147,7 +143,7 @@ class Settings:
         own = next((e.block for e in model.energies if isinstance(e, StableNeoHookean)), None)
         if all(same.values()) and self.block in (None, own):
             return model
-        key = f"settings {self.relaxation} {changes['coarse']} {self.acceleration} {self.block}"
+        key = f"settings {self.relaxation} {changes['coarse']} {self.block}"
         return model.derived(key, lambda: _replaced(model, changes))
 
     def on(self, steps: int, duration: float) -> Settings:
@@ -159,7 +155,6 @@ class Settings:
         parts = [f"h = {self.time_step:.3g} s", type(self.integrator).__name__, f"K = {self.sweeps}"]
         parts += [f"relaxation {self.relaxation:g}"] if self.relaxation != 1 else []
         parts += ["coarse"] if self.coarse is not None else []
-        parts += [f"Anderson({self.acceleration.window})"] if self.acceleration is not None else []
         line = ", ".join(parts)
         return line if self.predicted is None else f"{line}\n{_told(line, self.predicted)}"
 

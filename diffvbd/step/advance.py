@@ -14,12 +14,10 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import none_taken, run_sweeps
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..adjoint.sweep import fused_step
+from ..adjoint.sweep import fused_step, sweep
 from ..model.model import Model
-from ..model.warnings import warn_of_erratic_gradients
 from ..scopes import checking, recorders
 from ..tuples import replaced
 from .arguments import (
@@ -88,8 +86,6 @@ def swept(
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())
     policy = _tape_policy(model, (*fields, *more), settings, adjoint)
-    if isinstance(adjoint, ReverseSweep) and not torch.compiler.is_compiling() and _is_differentiated((*fields, *more)):
-        warn_of_erratic_gradients(model, settings.sweeps)
     debug_step = index if checking() else -1
     try:
         if colliders is not None:
@@ -101,14 +97,12 @@ def swept(
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            done = run_sweeps(model, fields, settings, tape_policy=policy, debug_step=debug_step)
-            if done.corrections:
+            end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                                        debug_step=debug_step)  # fmt: skip
+            if corrections.numel():
                 for found in recorders("coarse"):
-                    found.append(lengths_of(model, torch.cat(done.corrections, 1)))
-            if model.acceleration is not None and prepared.unrolled is None:
-                for found in recorders("anderson"):
-                    found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
-            return done.x
+                    found.append(lengths_of(model, corrections))
+            return end
     except ValueError as error:
         raise named(model, error, given) from None  # the frames of operators say nothing to who gave the argument
 
@@ -121,7 +115,6 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
         simple
         and not model.corrects
         and model.coarse is None
-        and model.acceleration is None
         and model.starts_from == "predictor"
         and not ops.TET_READS_X_PREV
     )

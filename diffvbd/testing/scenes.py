@@ -325,7 +325,7 @@ def _turned(model: Any) -> Any:
     """What the reference reads of a model, each tet listed from another corner (an even permutation)."""
     names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
     names += ("saturation", "regularization", "relaxation", "rigid", "starts_from")
-    names += ("coarse", "coarse_geometry", "acceleration")
+    names += ("coarse", "coarse_geometry")
     return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name, None) for name in names})
 
 
