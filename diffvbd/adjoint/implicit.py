@@ -24,9 +24,9 @@ from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
 from ..said import warn
 from ..scopes import is_captured
-from .anderson import run_sweeps
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
+from .sweep import sweep
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
@@ -50,7 +50,8 @@ class _GlobalSweep(Function):
     def forward(ctx: Any, *args: Any) -> Tensor:
         others, model, settings, adjoint, debug_step = args[_FIELDS:-1]
         fields = ops.SweepFields(*args[:_FIELDS], *others)
-        x = run_sweeps(model, fields, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step).x
+        x, _, _ = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE,
+                        debug_step=debug_step)  # fmt: skip
         x = args[-1](x)
         ctx.save_for_backward(*fields[:_FIELDS], x)
         ctx.model, ctx.h, ctx.adjoint = model, settings.numbers.time_step, adjoint

@@ -117,7 +117,9 @@ def forces(
     start = None if previous is None else previous[0]
     _refuse_non_finite(model, {"x": x, "previous: x": start,
                                **{name: given_inputs.loads[name] for name in COLLIDERS}})  # fmt: skip
-    given = widen(model, x, solver, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, given_inputs.loads))
+    given = widen(
+        model, x, solver, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, given_inputs.loads)
+    )
     _refuse_below(given, {"x": x, "previous: x": start})
     state = _contact_at(given, x, previous)
     lead, dtype = x.shape[:-2], x.dtype

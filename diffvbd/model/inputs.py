@@ -119,7 +119,9 @@ def sorted_inputs(model: Model, inputs: dict[str, Any], gravity: Any = None) -> 
 
 def _meant(model: Model, name: str) -> str:
     """The nearest input of any Model, and the energy that would declare it."""
-    kinds = {input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters}
+    kinds = {
+        input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
+    }
     if name in MODULI:
         return ", which has no elastic law among its energies"
     if name in kinds:

@@ -278,10 +278,6 @@ class Model:
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
 
-    def _on_cpu(self) -> Model:
-        """The same Model on the CPU: what debug_checks() asks about a step on CUDA."""
-        return self.derived("on_cpu", lambda: self.to("cpu"))
-
     def derived(self, name: str, build: Callable[[], Any]) -> Any:
         """Something that follows from the Model alone, built at its first use and kept."""
         if name not in self._derived:

@@ -79,7 +79,9 @@ class VBD:
         if is_word(self.subspace, "coarse"):
             keep("subspace", CoarseSpace())
         if not (self.subspace is None or is_word(self.subspace, "rigid") or isinstance(self.subspace, CoarseSpace)):
-            raise TypeError(f'subspace: expected "rigid", "coarse", a diffvbd.CoarseSpace or None, got {self.subspace!r}')
+            raise TypeError(
+                f'subspace: expected "rigid", "coarse", a diffvbd.CoarseSpace or None, got {self.subspace!r}'
+            )
         check_integrator(self.integrator)
         for name, words in (("block", ("exact", "paper")), ("start", ("auto", "predictor", "inertia")),
                             ("tape", ("auto", "full", "compact", "recompute"))):  # fmt: skip
@@ -91,7 +93,9 @@ class VBD:
         if self.coarse is not None and self.block != "exact":
             fail("subspace", 'no coarse space with block="paper"', repr(self.subspace))
         if self.coarse is not None and self.saturation is not None:
-            fail("subspace", "no coarse space with saturation, which its corrections would not obey", repr(self.subspace))
+            fail(
+                "subspace", "no coarse space with saturation, which its corrections would not obey", repr(self.subspace)
+            )
         parts = (self.relaxation, self.subspace, self.block, self.start, self.saturation, self.regularization)
         keep("key", f"system {parts}")
 

@@ -10,19 +10,19 @@ import torch
 
 from .. import ops
 from ..checks import check_kind, fail
+from ..contact.surface import ContactSurface
 from ..mask import CONTACT, ELASTIC, EXACT_BLOCK, PAPER_BLOCK
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
-from .anderson import moving_bodies
 from .bodies import find_bodies
 from .coarse_plan import check_coupled, plan_of
 from .model import Model
+from .moving import moving_bodies
 from .rest import lumped_mass, rest_metric
 from .solver import VBD
 
 
 class System(Model):
-    acceleration = None
     """A Model with the attributes that a solver decides; it shares all tensors of the Model.
 
     Attributes:
@@ -32,9 +32,14 @@ class System(Model):
     """
 
     def __init__(self, model: Model, solver: VBD) -> None:
-        self.__dict__.update(model.__dict__)
+        self.__dict__.update({name: value for name, value in vars(model).items() if name != "surface_of_contact"})
         self.model, self.solver, self._derived = model, solver, {}
-        self.relaxation, self.start, self.block, self.coarse = solver.relaxation, solver.start, solver.block, solver.coarse
+        self.relaxation, self.start, self.block, self.coarse = (
+            solver.relaxation,
+            solver.start,
+            solver.block,
+            solver.coarse,
+        )
         self.saturation, self.regularization = solver.saturation, solver.regularization
         self.rigid = self.may_correct and solver.subspace is not None
         self._check()
@@ -42,10 +47,10 @@ class System(Model):
             self.energy_mask ^= EXACT_BLOCK | PAPER_BLOCK
         if self.rigid != self.may_correct:
             arrays = torch.from_numpy(self.mesh.points.copy()), self._topology[0].cpu(), self._pinned.cpu()
-            bodies = find_bodies(*arrays, self.rigid, self.floor is not None)
-            self._bodies, self._other_bodies = (b.to(self.device) for b in bodies)
+            bodies, others = find_bodies(*arrays, self.rigid, self.floor is not None)
+            self._bodies, self._other_bodies = bodies.to(self.device), others.to(self.device)
         if self.coarse is not None or self.contact is not None:
-            self._arrange()
+            self._arrange_bodies()
 
     def _check(self) -> None:
         """Raises where a solver does not suit the Model."""
@@ -58,7 +63,7 @@ class System(Model):
         if ops.TET_READS_X_PREV:
             fail("subspace", "no coarse space with a law of tets that reads where a step began", repr(self.coarse))
 
-    def _arrange(self) -> None:
+    def _arrange_bodies(self) -> None:
         """The coarse space, and the bodies whose potentials decide; in float64, on the CPU, then placed."""
         points = torch.from_numpy(self.mesh.points.copy())
         tets, *star = (t.cpu() for t in self._topology)
@@ -73,6 +78,10 @@ class System(Model):
         if self.contact is not None or (self.coarse is not None and self.touches):
             moving = moving_bodies(points, tets, pinned, bool(self.energy_mask & ELASTIC))
             self._moving = moving.to(device, self.dtype)
+
+    @property
+    def surface_of_contact(self) -> ContactSurface | None:  # the Model may replace it, with room for more pairs
+        return self.model.surface_of_contact
 
     @property
     def corrects(self) -> bool:
@@ -97,6 +106,10 @@ class System(Model):
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> System:
         return system_of(self.model.to(device, dtype), self.solver)
+
+    def _on_cpu(self) -> System:
+        """The same System on the CPU: what debug_checks() asks about a step on CUDA."""
+        return self.derived("on_cpu", lambda: self.to("cpu"))
 
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
         """What the kernels execute besides tensors; ``scenes`` chooses the regime on CUDA."""

@@ -36,8 +36,6 @@ class Part(NamedTuple):
     corrections: Tensor
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
     frames: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
-    # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
-    combined: Any = None
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
     sweeps: int | None = None  # None: its share of those of the step

@@ -48,7 +48,7 @@ def advise(
         duration: Of the motion [s].
         error: Wanted relative error, in (0, 1): of positions, root mean square over vertices and four times, over that
             of the way from the start.
-        quantity: A function of the last x and v, [..., V, 3], that returns a scalar which shall stay within the error, too.
+        quantity: A function of the last x and v, [..., V, 3], that returns a scalar, which shall stay within the error.
         gradient: Whether the gradient of ``quantity`` shall stay within it, and its time be counted: with respect to
             each modulus and to a velocity that is added to all vertices. Without a quantity it is the mean squared way.
         device: Where the trials run; None: the Model's.

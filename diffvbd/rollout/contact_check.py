@@ -81,7 +81,9 @@ def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Ten
         )
 
 
-def _matters(model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]) -> bool:
+def _matters(
+    model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]
+) -> bool:
     """Whether what a step has left unbalanced would have moved a body, beside what forces do in a step."""
     found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
     return found is not None and found.error > UNBALANCED_FRICTION * found.forced

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from ..mask import ELASTIC
+from ..model.integrators import Integrator
 from ..model.system import System
 from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
 from ..said import is_silent, page, percent, warn
 from ..scopes import looks_at, may_copy
 from ..step.arguments import Prepared
-from ..model.integrators import Integrator
 from ..step.integrators import Solve
 from ..step.lost import FAR, fault_of, reach_of, size_of
 from ..step.unsolved import Unsolved, unsolved

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..energies import Anchor
 from ..mask import ELASTIC
-from ..model.system import System
 from ..model.rest import rest_metric
+from ..model.system import System
 from ..said import is_silent, page, percent, warn
 from ..scopes import looks_at, may_copy
 from ..step.arguments import Prepared, acceleration_of

@@ -12,11 +12,11 @@ from .. import ops
 from ..adjoint.routes import TapedSweep
 from ..checks import check_bool, check_count, is_word
 from ..mask import KEEPS_POSITIONS
+from ..model.integrators import BDF2
 from ..model.model import Model
 from ..model.solver import VBD
 from ..model.system import System, system_of
 from ..step.contact_cycles import sweeps_of_parts
-from ..model.integrators import BDF2
 from ..step.integrators import solves_of
 from ..step.memory import cuda_scratch
 from .checkpoints import BinomialCheckpoints, _left, choose_schedule
@@ -66,7 +66,9 @@ def memory(
     for name, asked in (("material", material), ("rest", rest)):
         check_bool(name, asked)
     solves = solves_of(scheme)
-    schedule, adjoint = choose_schedule(checkpoint_every, TapedSweep(solver.tape), model, scenes, steps, solves * sweeps)
+    schedule, adjoint = choose_schedule(
+        checkpoint_every, TapedSweep(solver.tape), model, scenes, steps, solves * sweeps
+    )
     assert isinstance(adjoint, TapedSweep)
     scalars = scenes * sweeps * model.num_active
     policy = adjoint.policy(scalars, item, model.energy_mask, model.device)

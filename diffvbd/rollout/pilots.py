@@ -24,8 +24,8 @@ from ..said import silence
 from ..scopes import record_to, refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, material_of, prepare
 from .between import SWINGS, unseen
-from .energy_check import mechanical_energy
 from .checks import NONE
+from .energy_check import mechanical_energy
 from .prediction import on
 from .reference import unbalanced
 from .trajectory import PerStep, StepAverage, Trajectory, refuse_average
@@ -310,7 +310,8 @@ class Pilots:
 
 
 def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Tensor, duration: float,
-              quantity: Quantity | None, gradient: bool, given: dict[str, Any], progress: bool = False) -> Pilots:  # fmt: skip
+              quantity: Quantity | None, gradient: bool, given: dict[str, Any], progress: bool = False
+              ) -> Pilots:  # fmt: skip
     """Pilot runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
     of the arguments."""
     refuse_transforms("dv.advise and dv.error_budget, which look at values")

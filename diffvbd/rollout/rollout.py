@@ -23,7 +23,15 @@ from ..model.warnings import warn_of_inverted_bodies
 from ..said import is_own
 from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
-from ..step.arguments import acceleration_of, check_prescribed, check_state, given_of, prepare, step_settings, system_for
+from ..step.arguments import (
+    acceleration_of,
+    check_prescribed,
+    check_state,
+    given_of,
+    prepare,
+    step_settings,
+    system_for,
+)
 from ..step.estimate import ErrorEstimate, error_of, of_steps
 from ..step.growth import proven, warn_of_sweeps
 from ..step.held_up import cut_share
@@ -261,7 +269,8 @@ def _check_values(inputs: Given, steps: int) -> None:
 
 def _at_step(material: dict[str, Any], own: dict[str, Any], k: int, x: Tensor, v: Tensor) -> Given:
     """The material and the parameters of energies in step k."""
-    return Given(*({name: _at(name, value, k, x, v) for name, value in part.items()} for part in (material, own)), {})
+    now = [{name: _at(name, value, k, x, v) for name, value in part.items()} for part in (material, own)]
+    return Given(now[0], now[1], {})
 
 
 def _to_advance(model: System, loads: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor) -> dict[str, Any]:

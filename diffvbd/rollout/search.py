@@ -19,12 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..model.warnings import is_nearly_incompressible
 from ..model.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
 from ..model.solver import VBD
+from ..model.warnings import is_nearly_incompressible
 from .pilots import FRAMES, Pilot, Pilots, changes, relative
-from .reference import MOST_SWEEPS, is_balanced, takes_corrections, unreached, with_more_sweeps
 from .prediction import Candidate, Prediction, on
+from .reference import MOST_SWEEPS, is_balanced, takes_corrections, unreached, with_more_sweeps
 
 LONGEST = 0.1  # [s] of the first time step of the ladder
 MOST_STEPS = 2**17

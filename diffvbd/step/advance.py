@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import none_taken, run_sweeps
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep, check_adjoint
-from ..adjoint.sweep import fused_step
+from ..adjoint.sweep import fused_step, sweep
 from ..model.system import System
 from ..scopes import checking, recorders
 from ..tuples import replaced
@@ -98,11 +97,12 @@ def swept(
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            done = run_sweeps(model, fields, settings, tape_policy=policy, debug_step=debug_step)
-            if done.corrections:
+            end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                                        debug_step=debug_step)  # fmt: skip
+            if corrections.numel():
                 for found in recorders("subspace"):
-                    found.append(lengths_of(model, torch.cat(done.corrections, 1)))
-            return done.x
+                    found.append(lengths_of(model, corrections))
+            return end
     except ValueError as error:
         raise named(model, error, given) from None  # the frames of operators say nothing to who gave the argument
 

@@ -44,7 +44,9 @@ def may_touch(model: System, begun: Begun, prepared: Prepared, where: tuple[Tens
 
 def _extrapolates(model: System, prepared: Prepared) -> bool:
     """Whether contact has forces of gaps alone: those of velocities are measured from the start of a solve."""
-    damped = (input_name(e, "damping") in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e)
+    damped = (
+        input_name(e, "damping") in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e
+    )
     return model.friction is None and not any(damped)
 
 

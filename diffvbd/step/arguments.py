@@ -16,7 +16,7 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..checks import (
     NUMBERS,
     check_broadcast,
-        check_kind,
+    check_kind,
     check_readable,
     check_tensor,
     check_time_step,

@@ -15,8 +15,8 @@ from torch.autograd import Function
 
 from .. import ops
 from ..mask import VERTEX_ENERGIES
-from ..model.system import System
 from ..model.rest import shape_gradients
+from ..model.system import System
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 from ..tuples import replaced
@@ -34,8 +34,8 @@ class CoarseParts(NamedTuple):
     rest: Tensor  # [1 | B, blocks, 7, lanes], see CoarsePlan
 
 
-def coarse_parts(model: System, mu: Tensor, lam: Tensor, mass: Tensor | None, rest: Tensor | None, corners: Tensor | None
-                 ) -> CoarseParts:  # fmt: skip
+def coarse_parts(model: System, mu: Tensor, lam: Tensor, mass: Tensor | None, rest: Tensor | None,
+                 corners: Tensor | None) -> CoarseParts:  # fmt: skip
     """mu, lam [1 | B, 1 | T]; mass [B, V], rest [B, T, 7] and the tets' corners at rest [B, T, 4, 3] where a step is
     given them, else None."""
     with torch.autocast(mu.device.type, enabled=False):  # which would take the products in half precision

@@ -258,7 +258,9 @@ class _Elastic(Function):
     """The gradient of the tets' energy times h^2 [B, V, 3]."""
 
     @staticmethod
-    def forward(x: Tensor, mu: Tensor, lam: Tensor, rest: Tensor | None, fields: Any, model: System, h: float) -> Tensor:
+    def forward(
+        x: Tensor, mu: Tensor, lam: Tensor, rest: Tensor | None, fields: Any, model: System, h: float
+    ) -> Tensor:
         return IncrementalPotential(model, x, fields, h).elastic()
 
     @staticmethod

@@ -203,12 +203,12 @@ class ContactStep:
             room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
             near, kept = self._narrowed(detection.listed, x, now, room)
             swept_from = replaced(start, center=x.detach(), room=room)
-            limits, combined, lengths, held, cut = None, None, None, start.short, start.short
+            limits, lengths, held, cut = None, None, start.short, start.short
             if sweeps:
                 part = replaced(settings, sweeps=sweeps)
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
-                x, limits, combined, lengths = swept
+                x, limits, lengths = swept
                 x, shares, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.parts)
                 taken.extend(shares)
                 # what the start has held up, sweeps may have made good, and corrections, what these have
@@ -222,8 +222,8 @@ class ContactStep:
                 held = held & going[..., 0]
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=tuple(taken), limits=limits,
-                                    kept=kept, frames=start.frames, combined=combined, lengths=lengths,
-                                    sweeps=sweeps, going=going, resting=resting)  # fmt: skip
+                                    kept=kept, frames=start.frames, lengths=lengths, sweeps=sweeps, going=going,
+                                    resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.parts < MOST_DETECTIONS:

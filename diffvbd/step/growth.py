@@ -23,6 +23,7 @@ from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
 from ..mask import EXACT_BLOCK
 from ..mesh import TetMesh
+from ..model.integrators import Integrator
 from ..model.model import Model
 from ..model.system import System, system_of
 from ..model.tet_shapes import height_of_tets
@@ -32,7 +33,6 @@ from ..scopes import looks_at, unheard
 from ..tuples import replaced
 from .advance import advance
 from .arguments import Prepared, acceleration_of, material_of, prepare
-from ..model.integrators import Integrator
 from .integrators import take
 from .predict import begin
 

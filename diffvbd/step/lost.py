@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..model.integrators import Integrator
 from ..model.system import System
 from ..ops import broadcast
 from ..said import is_silent, page, warn
 from ..scopes import looks_at
 from .arguments import Prepared
 from .growth import growth_message
-from ..model.integrators import Integrator
 
 FAR = 1e3  # sizes of the Model at rest
 

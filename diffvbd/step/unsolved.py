@@ -21,8 +21,8 @@ from torch import Tensor
 
 from ..adjoint.contact_potential import ContactPotential
 from ..adjoint.potential import IncrementalPotential
-from ..model.system import System
 from ..model.rest import shape_gradients
+from ..model.system import System
 from .arguments import Prepared, acceleration_of, collider_state
 from .balance import contact_of_step, of_bodies, potential_of_step, rounding, share
 from .integrators import Solve

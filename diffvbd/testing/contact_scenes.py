@@ -212,7 +212,6 @@ def part_of(detection: Any) -> reference.Part:
                           torch.stack(detection.corrections).cpu(), limits,
                           None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
                           lengths=None if detection.lengths is None else detection.lengths.cpu(),
-                          combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined),
                           sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu(),
                           resting=None if detection.resting is None else detection.resting.cpu())  # fmt: skip
 

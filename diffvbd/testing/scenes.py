@@ -279,9 +279,7 @@ def relative_error(value: Tensor | np.ndarray, expected: Tensor | np.ndarray) ->
     return error / scale if scale else (0.0 if error == 0 else float("inf"))
 
 
-def evaluate(
-    run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any], time_step: float
-) -> dict[str, Tensor]:
+def evaluate(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any], time_step: float) -> dict[str, Tensor]:
     """Final state and gradients of a fixed random linear loss of x and time_step times v.
 
     `run(**inputs)` returns the final (x, v). The result holds "x", "v" and a "grad_<name>" for every tensor in inputs
