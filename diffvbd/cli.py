@@ -15,13 +15,14 @@ import torch
 import diffvbd as dv
 from diffvbd import cli_mesh, cli_scene, cli_view
 from diffvbd.mesh.series import EXTENSIONS, check_extension
-from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.said import PAGES
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import Row, versions
 from diffvbd.tasks.ranks import joined
 from diffvbd.tasks.scene import MOST_STEPS, Observation, Scene
+
+from .rollout.tune import ERROR, PATIENCE
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
