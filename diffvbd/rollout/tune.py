@@ -171,7 +171,7 @@ def _value(function: Callable[[float], Any], time: float) -> Tensor:
     return torch.where(torch.isfinite(value), value, 0.0)  # prescribed positions of what is not pinned may be NaN
 
 
-# --- pilot runs -------------------------------------------------------------------------------------------------------
+# --- trial runs -------------------------------------------------------------------------------------------------------
 
 LOGGER = logging.getLogger("diffvbd")
 SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
@@ -184,7 +184,7 @@ Quantity = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass
-class Pilot:
+class TrialRun:
     """A run: its frames, and what it took."""
 
     settings: VBD
@@ -198,14 +198,13 @@ class Pilot:
 
 
 @dataclass
-class Pilots:
-    """Runs of one scene. ``rollout`` is diffvbd.rollout.
+class TrialRuns:
+    """Runs of one scene.
 
     What changes in time is a function of the time [s]: it is asked for loads at the middle of each step, for prescribed
     vertices and colliders at its end.
     """
 
-    rollout: Callable[..., Trajectory]
     model: Model
     x: Tensor
     v: Tensor
@@ -240,7 +239,7 @@ class Pilots:
     def execute(self, *arguments: Any, **options: Any) -> Trajectory:
         """A rollout as it stands, also inside dv.refine."""
         with refined(None):
-            return self.rollout(*arguments, **options)
+            return rollout(*arguments, **options)
 
     def check(self) -> None:
         """One short step: raises what rollout raises of the arguments."""
@@ -266,7 +265,7 @@ class Pilots:
         if all(gradient is None for gradient in found):
             fail("quantity", "a function that torch can differentiate, beside gradient=True", "one without a graph")
 
-    def run(self, settings: VBD, steps: int, quarter: int | None = None, start: Pilot | None = None) -> Pilot:
+    def run(self, settings: VBD, steps: int, quarter: int | None = None, start: TrialRun | None = None) -> TrialRun:
         """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
         settings = on(settings, steps, self.duration)
         part, first = (steps, 0) if quarter is None else (steps // FRAMES, quarter)
@@ -280,7 +279,7 @@ class Pilots:
                 out = self._rollout(settings, x, v, part, began, FRAMES if quarter is None else 1, differentiate)
                 self._wait()
             except (RuntimeError, ValueError, torch.OutOfMemoryError) as error:
-                return Pilot(settings, steps, None, None, math.inf, failure=f"{settings}: {error}")
+                return TrialRun(settings, steps, None, None, math.inf, failure=f"{settings}: {error}")
         seconds = time.perf_counter() - clock
         self.spent += seconds
         self.runs += 1
@@ -289,11 +288,11 @@ class Pilots:
         traj, value, gradient = out
         x, v = traj.x.detach(), traj.v.detach()
         if not bool(torch.isfinite(x[-1]).all()):
-            return Pilot(settings, steps, None, None, seconds, failure=f"{settings}: positions that are not finite")
+            return TrialRun(settings, steps, None, None, seconds, failure=f"{settings}: positions that are not finite")
         if value is not None and not bool(torch.isfinite(value)):
             failure = f"{settings}: quantity is {float(value)} after {part} steps"
-            return Pilot(settings, steps, None, None, seconds, failure=failure)
-        return Pilot(settings, steps, x, v, seconds * steps / part, value, gradient)
+            return TrialRun(settings, steps, None, None, seconds, failure=failure)
+        return TrialRun(settings, steps, x, v, seconds * steps / part, value, gradient)
 
     def _rollout(self, settings: VBD, x: Tensor, v: Tensor, steps: int, began: float, frames: int, differentiate: bool
                  ) -> tuple[Trajectory, Tensor | None, tuple[Tensor, ...]]:  # fmt: skip
@@ -384,7 +383,7 @@ class Pilots:
         worst = float((distance / self.motion(b)).max())
         return worst if math.isfinite(worst) else math.inf
 
-    def gradients_apart(self, a: Pilot, b: Pilot) -> list[float]:
+    def gradients_apart(self, a: TrialRun, b: TrialRun) -> list[float]:
         """Relative distances of the gradients of two runs. With respect to moduli that have no part in the motion, as
         of a body in free fall, they are rounding: what is below a tiny part of quantity over modulus counts as that."""
         out = []
@@ -441,7 +440,7 @@ class Pilots:
         stored = mechanical_energy(system_of(self.model, VBD(1.0, 1)), self.prepared, x, v).reshape(x.shape[:-2])
         return stored - (load * x.double()).sum((-1, -2))
 
-    def lost(self, run: Pilot, seconds: float) -> float:
+    def lost(self, run: TrialRun, seconds: float) -> float:
         """How far the energy E that a run has lost would carry the scene in some seconds, sqrt(2 E / m) t, over its
         motion. Zero where energy says nothing."""
         if not self.conserves or run.x is None or run.v is None:
@@ -452,10 +451,10 @@ class Pilots:
         return float((way / self.motion(run.x)).max())
 
 
-def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Tensor, duration: float,
+def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
               quantity: Quantity | None, gradient: bool, given: dict[str, Any], progress: bool = False
-              ) -> Pilots:  # fmt: skip
-    """Pilot runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
+              ) -> TrialRuns:  # fmt: skip
+    """TrialRun runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
     of the arguments."""
     refuse_transforms("dv.advise and dv.error_budget, which look at values")
     sorted_inputs(model, given)
@@ -475,9 +474,9 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
     material = [name for name in MODULI if given.get(name) is not None]
     wrt = [name for name in material if not of_time(given[name])]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
-    pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None, progress=progress)
-    pilots.check()
-    return pilots
+    trials = TrialRuns(model, x, v, duration, given, quantity, wrt if gradient else None, progress=progress)
+    trials.check()
+    return trials
 
 
 def of_time(value: Any) -> bool:
@@ -530,9 +529,9 @@ def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:
     return 0.0 if apart == 0 else apart / size if size > 0 else math.inf
 
 
-# --- the search for settings that keep an error -----------------------------------------------------------------------
+# --- the search for solvers that stay within an error -----------------------------------------------------------------------
 
-LONGEST = 0.1  # [s] of the first time step of the ladder
+LONGEST = 0.1  # [s] of the first time step of the refinement
 MOST_STEPS = 2**17
 FEWEST_THAT_RUN = 256  # steps: fewer than these may fail
 ORDERS = (0.5, 2.0)  # that are believed
@@ -540,40 +539,40 @@ CLEAN = 0.6  # least order of two levels in a row from which contact counts as r
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 1.0  # [s] or so long,
-MORE = 2.0  # or so many times what the ladder has taken: where that is long, much faster settings are worth a look
+MORE = 2.0  # or so many times what the refinement has taken: where that is long, much faster settings are worth a look
 LIKELY = 4  # of the candidates, at which that much is spent
 MUCH = 0.5  # of the time of the fastest proven, that what is run to the end beyond the usual may take
-NEAR = 10.0  # times the wanted error: runs of the ladder that are shown
-ROUNDING = 1e-3  # of the wanted error: runs of the ladder below that, as of a free fall, compare with nothing
+NEAR = 10.0  # times the wanted error: runs of the refinement that are shown
+ROUNDING = 1e-3  # of the wanted error: runs of the refinement below that, as of a free fall, compare with nothing
 SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it is held against show less than there is
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
 WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
 ERROR, TIME_BUDGET = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
 PLAIN = VBD(1.0, 1)
-STUCK = 6  # levels of the ladder that do not come closer: there is no limit to find
+STUCK = 6  # levels of the refinement that do not come closer: there is no limit to find
 
 
-def found(pilots: Pilots, error: float, time_budget: float) -> VBD:
-    """The settings that take the least time and keep the error, with their Prediction."""
-    return _Search(pilots, error, time_budget).run()
+def found(trials: TrialRuns, error: float, time_budget: float) -> VBD:
+    """The settings that take the least time and stay within the error, with their Prediction."""
+    return _Search(trials, error, time_budget).run()
 
 
-def start_of(pilots: Pilots) -> VBD:
-    """What the ladder runs with: well converged and never far from the fastest."""
-    model = pilots.model
+def start_of(trials: TrialRuns) -> VBD:
+    """What the refinement runs with: well converged and never far from the fastest."""
+    model = trials.model
     if not takes_corrections(model, PLAIN):
         return VBD(1.0, 40, integrator=SDIRK2())
     if model.touches:
         return VBD(1.0, 20, integrator=SDIRK2())
-    relaxation = 1.5 if _may_over_relax(pilots) else 1.0
+    relaxation = 1.5 if _may_over_relax(trials) else 1.0
     return VBD(1.0, 8, integrator=SDIRK2(), relaxation=relaxation, subspace="coarse")
 
 
-def candidates_of(pilots: Pilots) -> list[VBD]:
-    """What might be faster than the ladder's settings, the likeliest first."""
-    model, sdirk, bdf, euler = pilots.model, SDIRK2(), BDF2(), ImplicitEuler()
+def candidates_of(trials: TrialRuns) -> list[VBD]:
+    """What might be faster than the refinement's settings, the likeliest first."""
+    model, sdirk, bdf, euler = trials.model, SDIRK2(), BDF2(), ImplicitEuler()
     touches, corrects = model.touches, takes_corrections(model, PLAIN)
-    free = not touches and corrects and _may_over_relax(pilots)
+    free = not touches and corrects and _may_over_relax(trials)
     over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
 
     def plain(scheme: Integrator, *sweeps: int) -> list[VBD]:
@@ -590,27 +589,27 @@ def candidates_of(pilots: Pilots) -> list[VBD]:
     return out
 
 
-def _may_over_relax(pilots: Pilots) -> bool:
+def _may_over_relax(trials: TrialRuns) -> bool:
     """Whether no tet comes near incompressible, at any of some times where moduli change."""
-    if pilots.model.mesh.num_tets == 0:
+    if trials.model.mesh.num_tets == 0:
         return True
-    times = [pilots.duration * k / FRAMES for k in range(FRAMES + 1)] if pilots.material_changes else [0.0]
-    return not any(is_nearly_incompressible(p.mu, p.lam) for p in map(pilots.prepared_at, times))
+    times = [trials.duration * k / FRAMES for k in range(FRAMES + 1)] if trials.material_changes else [0.0]
+    return not any(is_nearly_incompressible(p.mu, p.lam) for p in map(trials.prepared_at, times))
 
 
 class _Search:
-    def __init__(self, pilots: Pilots, error: float, time_budget: float) -> None:
-        self.pilots, self.error, self.time_budget = pilots, error, time_budget
+    def __init__(self, trials: TrialRuns, error: float, time_budget: float) -> None:
+        self.trials, self.error, self.time_budget = trials, error, time_budget
         self.order = 1.0
         # impacts come early or late by up to a step: nothing can be extrapolated until steps resolve them
-        self.smooth = not (pilots.model.touches or pilots.model.floor is not None)
+        self.smooth = not (trials.model.touches or trials.model.floor is not None)
         self.most = error if self.smooth else SAFE * error  # that a run may show
         self.clean = self.smooth  # whether the last two runs can be extrapolated
-        self.ladder: list[Pilot] = []
-        self.estimates: list[tuple[float, Pilot]] = []  # of levels from the third on: what is asked for, and the run
+        self.levels: list[TrialRun] = []
+        self.estimates: list[tuple[float, TrialRun]] = []  # of levels from the third on: what is asked for, and the run
         self.proven: list[Candidate] = []
         self.predicted: list[Candidate] = []
-        others = ", quantity and gradient" if pilots.wrt is not None else " and quantity" if pilots.quantity else ""
+        others = ", quantity and gradient" if trials.wrt is not None else " and quantity" if trials.quantity else ""
         self.of = f"(the largest of motion{others})" if others else "of the motion"
 
     def run(self) -> VBD:
@@ -622,9 +621,9 @@ class _Search:
             best = next(c for c in self.proven if c.error <= self.most)
             why = self._reason()
         else:
-            least = (math.inf, self.ladder[-1] if self.ladder else None)
+            least = (math.inf, self.levels[-1] if self.levels else None)
             error, now = min(self.estimates, key=lambda e: e[0], default=least)
-            settings = on(start_of(self.pilots), FRAMES, self.pilots.duration) if now is None else now.settings
+            settings = on(start_of(self.trials), FRAMES, self.trials.duration) if now is None else now.settings
             best = Candidate(settings, error, math.inf if now is None else now.seconds, now is not None)
             self.proven = [Candidate(r.settings, e, r.seconds, True) for e, r in self.estimates if r is not now]
         once = {str(c.solver): c for c in sorted(self.proven, key=lambda c: -c.seconds)}  # of two runs the faster
@@ -632,54 +631,54 @@ class _Search:
         tried = {str(best.solver), *once}
         rest = [*once.values(), *(c for c in self.predicted if str(c.solver) not in tried)]
         others = tuple(sorted(rest, key=lambda c: c.seconds))
-        p = self.pilots
+        p = self.trials
         told = Prediction(
             self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, self.of
         )
         return replace(best.solver, prediction=told)
 
     def _reason(self) -> str:
-        last, before = (run.settings for run in self.ladder[:-3:-1])
+        last, before = (run.settings for run in self.levels[:-3:-1])
         limit = f"the limit of {before} and {last}" if self.clean else f"{last}"
         why = (
-            f"the fastest of the runs below that keep the error; their errors are distances to {limit}, "
+            f"the fastest of the runs below that stay within the error; their errors are distances to {limit}, "
             f"and {self.uncertain:.1g} by which that may be off"
         )
-        if self.pilots.spent > 0.9 * self.time_budget:
-            why += f"; {self.time_budget:g} s of pilot runs (time_budget) ended the search for faster ones"
+        if self.trials.spent > 0.9 * self.time_budget:
+            why += f"; {self.time_budget:g} s of trial runs (time_budget) ended the search for faster ones"
         return why
 
-    # --- the ladder ---------------------------------------------------------------------------------------------------
+    # --- the refinement ---------------------------------------------------------------------------------------------------
 
     def _climb(self) -> tuple[bool, str]:
-        """Runs with more steps each time until the last one has half of the wanted error, or why that cannot be had."""
-        p, settings = self.pilots, start_of(self.pilots)
+        """Runs with more steps each time until the last one has half of the wanted error, or why that cannot be reached."""
+        p, settings = self.trials, start_of(self.trials)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []
         left = math.inf  # of forces, by the run that was last taken for the reference
         unseen = "what changes in time" if changes(p.given) else ""
         while True:
-            if steps > MOST_STEPS and unseen and self.ladder:
+            if steps > MOST_STEPS and unseen and self.levels:
                 return False, f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
             if steps > MOST_STEPS:
                 return False, f"{MOST_STEPS} steps are not enough"
             if p.spent > self.time_budget:
-                return False, f"{self.time_budget:g} s of pilot runs were not enough (time_budget)"
+                return False, f"{self.time_budget:g} s of trial runs were not enough (time_budget)"
             now = p.run(settings, steps)
-            if now.x is None and not self.ladder and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
+            if now.x is None and not self.levels and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
                 steps *= 2
                 continue
             if now.x is None:
                 return False, f"a run failed: {now.failure}"
             if unseen:
                 unseen, apart = p.swinging(steps), []
-                self.ladder = [now] if unseen else []  # runs that do not see it tell nothing of others
+                self.levels = [now] if unseen else []  # runs that do not see it tell nothing of others
                 if unseen:
                     steps *= 2
                     continue
-            self.ladder.append(now)
-            if len(self.ladder) > 1:
-                apart.append(self._distance(self.ladder[-2], now))
+            self.levels.append(now)
+            if len(self.levels) > 1:
+                apart.append(self._distance(self.levels[-2], now))
             if len(apart) > 1:
                 self._see_order(apart)
                 error = max(self._remaining(apart), self._unresolved())
@@ -695,8 +694,8 @@ class _Search:
                         return False, f"a run failed: {more.failure}"
                     settings = more.settings
                     self.estimates.pop()  # more sweeps moved it: it was none
-                    self.ladder[-2:] = [more]
-                    apart[-2:] = [self._distance(self.ladder[-2], more)]
+                    self.levels[-2:] = [more]
+                    apart[-2:] = [self._distance(self.levels[-2], more)]
                     continue
                 if self._is_rounding():
                     return False, (f"shorter steps than those of {min(self.estimates, key=lambda e: e[0])[1].settings} "
@@ -723,20 +722,20 @@ class _Search:
         """Motion that is lost with energy, and that runs which agree may therefore both lack. Vibrations swing within a
         step: they are resolved once halving it halves the energy lost. A rebound lasts: none is resolved while as much
         is lost as in the longest steps."""
-        p, last = self.pilots, self.ladder[-1]
+        p, last = self.trials, self.levels[-1]
         if self.smooth:
             # the root of the energy times the step: sqrt(2) x 2 where the energy halves
-            now, before = (p.lost(run, p.duration / run.steps) for run in (last, self.ladder[-2]))
+            now, before = (p.lost(run, p.duration / run.steps) for run in (last, self.levels[-2]))
             return 0.0 if now < before / (2 * math.sqrt(2)) else now
-        now, first = (p.lost(run, 0.5 * p.duration) for run in (last, self.ladder[0]))
+        now, first = (p.lost(run, 0.5 * p.duration) for run in (last, self.levels[0]))
         return 0.0 if now < WHOLE * first else now
 
-    def _with_more_sweeps(self, settings: VBD, left: float, before: float) -> Pilot | None:
+    def _with_more_sweeps(self, settings: VBD, left: float, before: float) -> TrialRun | None:
         """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the
-        error: with the sweeps of the ladder it might come close to a limit of its own. Or if the last run left forces
+        error: with the sweeps of the refinement it might come close to a limit of its own. Or if the last run left forces
         over; then with plain sweeps where more of them with corrections have left as much."""
-        last = self.ladder[-2]
-        more = self.pilots.run(with_more_sweeps(settings, left, before), last.steps)
+        last = self.levels[-2]
+        more = self.trials.run(with_more_sweeps(settings, left, before), last.steps)
         if is_balanced(left) and (more.x is None or self._distance(last, more) <= 0.25 * self.error):
             return None
         return more
@@ -744,7 +743,7 @@ class _Search:
     def _is_rounding(self) -> bool:
         """Whether the last runs are further from one another than longer steps were."""
         errors = [error for error, _ in self.estimates]
-        single = self.pilots.model.dtype == torch.float32
+        single = self.trials.model.dtype == torch.float32
         return single and self.smooth and len(errors) > 2 and min(errors[-2:]) > 2 * min(errors[:-2])
 
     @staticmethod
@@ -758,19 +757,19 @@ class _Search:
             cause = "what touches when, and what sticks, depends on ever smaller differences"
         return f"runs of h and h/2 stay {apart:.2g} {self.of} apart however small h is: {cause}"
 
-    def _distance(self, a: Pilot, b: Pilot) -> float:
+    def _distance(self, a: TrialRun, b: TrialRun) -> float:
         """Of motion, quantity and gradient, the largest."""
         assert a.x is not None and b.x is not None
-        out = [self.pilots.apart(a.x, b.x)]
-        out += self.pilots.gradients_apart(a, b)
+        out = [self.trials.apart(a.x, b.x)]
+        out += self.trials.gradients_apart(a, b)
         if a.quantity is not None and b.quantity is not None:
             out.append(relative(a.quantity, b.quantity))
         return max(out)
 
     @property
-    def reference(self) -> Pilot:
-        """The last run of the ladder; where the motion is smooth or resolved, extrapolated from the last two."""
-        a, b = self.ladder[-2], self.ladder[-1]
+    def reference(self) -> TrialRun:
+        """The last run of the refinement; where the motion is smooth or resolved, extrapolated from the last two."""
+        a, b = self.levels[-2], self.levels[-1]
         assert a.x is not None and b.x is not None
         share = 1 / (2**self.order - 1) if self.clean else 0.0
 
@@ -783,19 +782,19 @@ class _Search:
     # --- candidates ---------------------------------------------------------------------------------------------------
 
     def _rank(self) -> None:
-        p, last = self.pilots, self.ladder[-1]
+        p, last = self.trials, self.levels[-1]
         reference = self.reference
         uncertain = (0.5 if self.clean else 1.0) * self.estimates[-1][0]
         self.aim = AIM * (self.error - uncertain)
-        for run in self.ladder:
+        for run in self.levels:
             error = self._distance(run, reference) + uncertain
             if error <= NEAR * self.error or run is last:
                 self.proven.append(Candidate(run.settings, error, run.seconds, True))
         self.uncertain, self.truth = uncertain, reference
         self.climbed = p.spent
-        # with as many steps as the ladder takes for an error as wanted
+        # with as many steps as the refinement takes for an error as wanted
         level, near = self._level_near(reference)
-        # a quarter says what a candidate's error is over that of the ladder, which must be an error then, no rounding
+        # a quarter says what a candidate's error is over that of the refinement, which must be an error then, no rounding
         compares = self.smooth and level > ROUNDING * self.error
         predict = self._by_quarter(level, near) if compares else self._by_whole
         if self.smooth and not compares:
@@ -809,9 +808,9 @@ class _Search:
             if math.isfinite(error):
                 self._plan(settings, near.steps, error, per_step)
 
-    def _by_quarter(self, level: float, near: Pilot) -> Callable[[VBD, int], tuple[float, float]]:
+    def _by_quarter(self, level: float, near: TrialRun) -> Callable[[VBD, int], tuple[float, float]]:
         """The error of settings, and the time of a step, by the quarter of the duration in which steps matter most."""
-        p, last, before = self.pilots, self.ladder[-1], self.ladder[-2]
+        p, last, before = self.trials, self.levels[-1], self.levels[-2]
         assert last.x is not None and before.x is not None
         quarter = p.hardest(before.x, last.x)
         target = last.x[quarter + 1]
@@ -825,19 +824,19 @@ class _Search:
 
     def _by_whole(self, settings: VBD, steps: int) -> tuple[float, float]:
         """The same by the whole duration: after an impact that no step resolves a quarter says nothing of the rest."""
-        run = self.pilots.run(settings, steps)
+        run = self.trials.run(settings, steps)
         if run.x is None:
             return math.inf, 0.0
         error = self._distance(run, self.truth)
         self.proven.append(Candidate(run.settings, error + self.uncertain, run.seconds, True))
         return error, run.seconds / steps
 
-    def _level_near(self, reference: Pilot) -> tuple[float, Pilot]:
-        """The error nearest to the wanted one of a run of the ladder before its last, and that run."""
-        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.ladder[:-1]]
+    def _level_near(self, reference: TrialRun) -> tuple[float, TrialRun]:
+        """The error nearest to the wanted one of a run of the refinement before its last, and that run."""
+        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.levels[:-1]]
         return min(levels, key=lambda level: abs(math.log(level[0] / self.error)))
 
-    def _of_quarter(self, run: Pilot, target: Tensor) -> float:
+    def _of_quarter(self, run: TrialRun, target: Tensor) -> float:
         return math.inf if run.x is None else float((run.x[-1] - target).square().mean().sqrt())
 
     def _plan(self, settings: VBD, steps: int, error: float, per_step: float) -> None:
@@ -846,7 +845,7 @@ class _Search:
         wanted = self._rounded(steps * more)
         if wanted <= MOST_STEPS:
             self.plans.append((wanted * per_step, wanted, settings))
-            planned = on(settings, wanted, self.pilots.duration)
+            planned = on(settings, wanted, self.trials.duration)
             self.predicted.append(Candidate(planned, self.aim + self.uncertain, wanted * per_step, False))
 
     def _order_of(self, settings: VBD) -> float:
@@ -857,7 +856,7 @@ class _Search:
         return FRAMES * max(1, math.ceil(min(steps, 2.0 * MOST_STEPS) / FRAMES))
 
     def _least(self) -> float:
-        """Time of the fastest proven candidate that keeps the error."""
+        """Time of the fastest proven candidate that stays within the error."""
         return min((c.seconds for c in self.proven if c.error <= self.most), default=math.inf)
 
     def _allowed(self, seconds: float, more: bool) -> float:
@@ -865,7 +864,7 @@ class _Search:
         return min(max(COSTS * seconds, FREE, MORE * self.climbed if more else 0.0), self.time_budget)
 
     def _prove(self) -> None:
-        p = self.pilots
+        p = self.trials
         for seconds, steps, settings in sorted(self.plans, key=lambda plan: plan[0]):
             for _ in range(3):
                 least = self._least()
@@ -947,7 +946,7 @@ def advise(
     if device is not None:
         model = model.to(device)
         x, v, inputs = (converted(value, device=model.device) for value in (x, v, inputs))
-    return found(pilots_of(rollout, model, x, v, duration, quantity, gradient, inputs, progress), error, time_budget)
+    return found(trials_of(model, x, v, duration, quantity, gradient, inputs, progress), error, time_budget)
 
 
 # --- where the error of a rollout comes from --------------------------------------------------------------------------
@@ -966,7 +965,7 @@ class Share:
         motion: Root mean square distance of positions, over vertices and four times, over the way from the start [-].
         quantity: Relative difference of the quantity [-]; None without one.
         gradient: That of its gradient [-]; None where none was asked for.
-        seconds: What the pilot runs took that tell it [s].
+        seconds: What the trial runs took that tell it [s].
         note: With what was compared.
     """
 
@@ -1038,7 +1037,7 @@ def error_budget(
     progress: bool = False,
     **inputs: Any,
 ) -> ErrorBudget:
-    """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
+    """Splits the error of a rollout by cause, by trial runs that have less of one error at a time.
 
     sweeps: the same steps with sweeps until more change nothing and their forces balance. time step: those against
     SDIRK2 with four times the steps. precision: the same run in double precision. contact: the converged steps with
@@ -1068,18 +1067,18 @@ def error_budget(
     if not 0 < fraction <= 1:
         fail("fraction", "a number in (0, 1]", repr(fraction))
     steps = FRAMES * max(1, round(fraction * duration / (h * FRAMES)))
-    pilots = pilots_of(rollout, model, x, v, steps * h, quantity, gradient, inputs, progress)
-    return _Budget(pilots, replace(solver, prediction=None), steps).run(mesh)
+    trials = trials_of(model, x, v, steps * h, quantity, gradient, inputs, progress)
+    return _Budget(trials, replace(solver, prediction=None), steps).run(mesh)
 
 
 class _Budget:
-    def __init__(self, pilots: Pilots, own: VBD, steps: int) -> None:
-        self.pilots, self.own, self.steps = pilots, own, steps
+    def __init__(self, trials: TrialRuns, own: VBD, steps: int) -> None:
+        self.trials, self.own, self.steps = trials, own, steps
         self.shares: list[Share] = []
         self.failed: dict[str, str] = {}  # by cause: why its reference is none
 
     def run(self, mesh: bool) -> ErrorBudget:
-        p = self.pilots
+        p = self.trials
         run = self._run(p, self.own, self.steps)
         cut, friction = self._contact_of()
         self._precision(run)
@@ -1093,18 +1092,18 @@ class _Budget:
         return ErrorBudget(self.own, (*shares, whole), p.duration, cut, friction, not self.failed)
 
     @staticmethod
-    def _run(pilots: Pilots, settings: VBD, steps: int) -> Pilot:
-        done = pilots.run(settings, steps)
+    def _run(trials: TrialRuns, settings: VBD, steps: int) -> TrialRun:
+        done = trials.run(settings, steps)
         if done.x is None:
             raise RuntimeError(f"error_budget: expected a rollout that runs to its end; {done.failure}")
         return done
 
-    def _settled(self, pilots: Pilots, settings: VBD, steps: int, cause: str) -> tuple[Pilot, str]:
+    def _settled(self, trials: TrialRuns, settings: VBD, steps: int, cause: str) -> tuple[TrialRun, str]:
         """A run with sweeps until its steps balance their forces, and a note: its settings, or why that failed."""
         left, before = math.inf, math.inf
         while True:
-            done = self._run(pilots, settings, steps)
-            left, before = pilots.left(), left
+            done = self._run(trials, settings, steps)
+            left, before = trials.left(), left
             if is_balanced(left):
                 self.failed.pop(cause, None)
                 return done, f"{done.settings}"
@@ -1113,21 +1112,21 @@ class _Budget:
                 return done, self.failed[cause]
             settings = with_more_sweeps(settings, left, before)
 
-    def _share(self, cause: str, a: Pilot, b: Pilot, seconds: float, note: str) -> Share:
+    def _share(self, cause: str, a: TrialRun, b: TrialRun, seconds: float, note: str) -> Share:
         assert a.x is not None and b.x is not None
         quantity = None if a.quantity is None or b.quantity is None else relative(a.quantity, b.quantity)
-        gradients = self.pilots.gradients_apart(a, b)
-        motion = self.pilots.apart(a.x, b.x)
+        gradients = self.trials.gradients_apart(a, b)
+        motion = self.trials.apart(a.x, b.x)
         return Share(cause, motion, quantity, max(gradients) if gradients else None, seconds, note)
 
-    def _counted(self, others: Pilots) -> float:
-        """Adds what other pilot runs, which began as copies of these, have taken, and returns it [s]."""
-        seconds = others.spent - self.pilots.spent
-        self.pilots.spent, self.pilots.runs = others.spent, others.runs
+    def _counted(self, others: TrialRuns) -> float:
+        """Adds what other trial runs, which began as copies of these, have taken, and returns it [s]."""
+        seconds = others.spent - self.trials.spent
+        self.trials.spent, self.trials.runs = others.spent, others.runs
         return seconds
 
-    def _precision(self, run: Pilot) -> None:
-        p = self.pilots
+    def _precision(self, run: TrialRun) -> None:
+        p = self.trials
         if p.model.dtype == torch.float64:
             return
         given = converted(p.given, dtype=torch.float64)
@@ -1142,14 +1141,14 @@ class _Budget:
                          quantity=None if run.quantity is None else run.quantity.double())  # fmt: skip
         self.shares.append(self._share("precision", single, done, seconds, "the same in float64"))
 
-    def _contact(self, converged: Pilot, cut: float | None) -> None:
+    def _contact(self, converged: TrialRun, cut: float | None) -> None:
         """Detections share the sweeps of a step: only where each has enough do they tell what pairs have held up."""
-        model, seconds, done, note = self.pilots.model, 0.0, converged, "pairs held up nothing"
+        model, seconds, done, note = self.trials.model, 0.0, converged, "pairs held up nothing"
         if cut is None:
             return
         if cut > 0:
             energies = [replace(e, detections=DETECTIONS) if isinstance(e, PairBarrier) else e for e in model.energies]
-            others = replace(self.pilots, model=model.replace(energies=energies))
+            others = replace(self.trials, model=model.replace(energies=energies))
             done, note = self._settled(others, converged.settings, self.steps, "contact")
             seconds = self._counted(others)
             note += f", detections={DETECTIONS}"
@@ -1158,7 +1157,7 @@ class _Budget:
     def _contact_of(self) -> tuple[float | None, float | None]:
         """The largest share of vertices that pairs held up in a step, and of friction left unbalanced by the last one;
         None where there are no pairs, no friction, or it cannot be told."""
-        p, model = self.pilots, self.pilots.model
+        p, model = self.trials, self.trials.model
         if not model.touches:
             return None, None
         settings, cuts, before = self.own, list[Tensor](), [(p.x, p.v)]
@@ -1178,41 +1177,41 @@ class _Budget:
         prepared = prepare(system, tuple(p.x.shape[:-2]), inputs, time_step=settings.time_step, sweeps=settings.sweeps)
         return cut, unbalanced_friction(system, before[0], end.x[-1], prepared, inputs.loads)
 
-    def _sweeps(self, run: Pilot) -> Pilot:
+    def _sweeps(self, run: TrialRun) -> TrialRun:
         """The same steps with sweeps enough that more change little."""
-        began = self.pilots.spent
-        settings = replace(start_of(self.pilots), integrator=self.own.integrator)
-        now, note = self._settled(self.pilots, replace(settings, sweeps=max(17, 2 * self.own.sweeps)), self.steps,
+        began = self.trials.spent
+        settings = replace(start_of(self.trials), integrator=self.own.integrator)
+        now, note = self._settled(self.trials, replace(settings, sweeps=max(17, 2 * self.own.sweeps)), self.steps,
                                   "sweeps")  # fmt: skip
         while True:
             settings = replace(now.settings, sweeps=2 * now.settings.sweeps + 1)
-            before, (now, note) = now, self._settled(self.pilots, settings, self.steps, "sweeps")
+            before, (now, note) = now, self._settled(self.trials, settings, self.steps, "sweeps")
             assert before.x is not None and now.x is not None and run.x is not None
-            left = self.pilots.apart(before.x, now.x)
-            moves = left > max(ENOUGH * self.pilots.apart(run.x, now.x), 1e-9)
+            left = self.trials.apart(before.x, now.x)
+            moves = left > max(ENOUGH * self.trials.apart(run.x, now.x), 1e-9)
             if not moves or now.settings.sweeps > MOST_SWEEPS:
                 break
         note += f", which still move it by {left:.1e}" if moves else ""
-        self.shares.append(self._share("sweeps", run, now, self.pilots.spent - began, note))
+        self.shares.append(self._share("sweeps", run, now, self.trials.spent - began, note))
         return now
 
-    def _time(self, run: Pilot, converged: Pilot) -> Pilot:
+    def _time(self, run: TrialRun, converged: TrialRun) -> TrialRun:
         """SDIRK2 with more steps; their sweeps are as many as converge here."""
-        began = self.pilots.spent
+        began = self.trials.spent
         settings = replace(converged.settings, integrator=SDIRK2())
-        fine, note = self._settled(self.pilots, settings, FINER * self.steps, "time step")
+        fine, note = self._settled(self.trials, settings, FINER * self.steps, "time step")
         share = self._share("time step", converged, fine, 0.0, "")
-        half = self._run(self.pilots, fine.settings, FINER // 2 * self.steps)
+        half = self._run(self.trials, fine.settings, FINER // 2 * self.steps)
         assert half.x is not None and fine.x is not None
-        left = self.pilots.apart(half.x, fine.x)
+        left = self.trials.apart(half.x, fine.x)
         note += f", itself off by some {left:.0e}" if left > 0.3 * share.motion else ""
-        if unseen := self.pilots.swinging(FINER * self.steps):
+        if unseen := self.trials.swinging(FINER * self.steps):
             note += f", whose steps do not see how {unseen} swings"
-        self.shares.append(replace(share, seconds=self.pilots.spent - began, note=note))
+        self.shares.append(replace(share, seconds=self.trials.spent - began, note=note))
         return fine
 
-    def _mesh(self, converged: Pilot) -> None:
-        p, vertices = self.pilots, self.pilots.model.num_vertices
+    def _mesh(self, converged: TrialRun) -> None:
+        p, vertices = self.trials, self.trials.model.num_vertices
         finer = finer_mesh(p)
         fine, note = self._settled(finer, converged.settings, self.steps, "mesh")
         assert fine.x is not None
@@ -1228,8 +1227,8 @@ def _of_parts(value: Any, tets: int) -> Any:
     return (lambda t: of_parts(value(t), tets)) if of_time(value) else of_parts(value, tets)
 
 
-def finer_mesh(p: Pilots) -> Pilots:
-    """Pilot runs on the subdivided mesh, whose first vertices are those of the mesh."""
+def finer_mesh(p: TrialRuns) -> TrialRuns:
+    """TrialRun runs on the subdivided mesh, whose first vertices are those of the mesh."""
     given = dict(p.given)
     for name in given:
         if given[name] is not None and name not in (*MODULI, "density", "gravity", "colliders", "colliders_before"):
