@@ -454,8 +454,8 @@ class TrialRuns:
 def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
               quantity: Quantity | None, gradient: bool, given: dict[str, Any], progress: bool = False
               ) -> TrialRuns:  # fmt: skip
-    """TrialRun runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
-    of the arguments."""
+    """Trial runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises of
+    the arguments."""
     refuse_transforms("dv.advise and dv.error_budget, which look at values")
     sorted_inputs(model, given)
     if not isinstance(gradient, bool):
@@ -529,7 +529,7 @@ def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:
     return 0.0 if apart == 0 else apart / size if size > 0 else math.inf
 
 
-# --- the search for solvers that stay within an error -----------------------------------------------------------------------
+# --- the search for solvers that stay within an error -----------------------------------------------------------------
 
 LONGEST = 0.1  # [s] of the first time step of the refinement
 MOST_STEPS = 2**17
@@ -648,10 +648,10 @@ class _Search:
             why += f"; {self.time_budget:g} s of trial runs (time_budget) ended the search for faster ones"
         return why
 
-    # --- the refinement ---------------------------------------------------------------------------------------------------
+    # --- the refinement -----------------------------------------------------------------------------------------------
 
     def _climb(self) -> tuple[bool, str]:
-        """Runs with more steps each time until the last one has half of the wanted error, or why that cannot be reached."""
+        """Runs with more steps each time until the last one has half of the wanted error; or why it cannot be reached."""
         p, settings = self.trials, start_of(self.trials)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []
@@ -732,8 +732,8 @@ class _Search:
 
     def _with_more_sweeps(self, settings: VBD, left: float, before: float) -> TrialRun | None:
         """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the
-        error: with the sweeps of the refinement it might come close to a limit of its own. Or if the last run left forces
-        over; then with plain sweeps where more of them with corrections have left as much."""
+        error: with the sweeps of the refinement it might come close to a limit of its own. Or if the last run left
+        forces over; then with plain sweeps where more of them with corrections have left as much."""
         last = self.levels[-2]
         more = self.trials.run(with_more_sweeps(settings, left, before), last.steps)
         if is_balanced(left) and (more.x is None or self._distance(last, more) <= 0.25 * self.error):
@@ -794,7 +794,7 @@ class _Search:
         self.climbed = p.spent
         # with as many steps as the refinement takes for an error as wanted
         level, near = self._level_near(reference)
-        # a quarter says what a candidate's error is over that of the refinement, which must be an error then, no rounding
+        # a quarter says what a candidate's error is over that of the refinement, which then must be no rounding
         compares = self.smooth and level > ROUNDING * self.error
         predict = self._by_quarter(level, near) if compares else self._by_whole
         if self.smooth and not compares:
