@@ -14,7 +14,7 @@ import torch
 
 import diffvbd as dv
 from diffvbd import cli_mesh, cli_scene, cli_view
-from diffvbd.mesh.series import EXTENSIONS, check_extension
+from diffvbd.mesh.motions import EXTENSIONS, check_extension
 from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.said import PAGES
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, float_array
-from diffvbd.mesh.shapes import positive
+from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, positive
 from diffvbd.mesh.tet_mesh import TET_FACES, TetMesh, oriented
 
 ImplicitFunction = Callable[[FloatArray], FloatArray]

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..mesh.frames import read_frames
 from ..mesh.io import load
+from ..mesh.motions import read_frames
 from ..mesh.tet_mesh import TetMesh
 from .motion import Motion, load_motions, motions_of
 
