@@ -52,7 +52,7 @@ ROOMS = (
     "_version", "safeguards", "mask", "checks", "distributed", "tuples", "said", "lasting", "scopes", "reference",
     "energies", "mesh", "ops", "contact",
     "model", "adjoint", "step", "rollout", "inspect", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
-    "cli_mesh", "cli_scene", "cli_view", "cli", "__main__",
+    "cli", "__main__",
 )  # fmt: skip
 OPTIONAL = {
     "matplotlib",

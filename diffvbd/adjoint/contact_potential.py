@@ -24,7 +24,7 @@ from ..contact.pair_forces import (
     near_pairs,
 )
 from ..model.model import Model
-from ..reference.friction import smoothed
+from ..reference.energies import smoothed
 from .potential import IncrementalPotential
 
 

@@ -115,3 +115,17 @@ def positive(name: str, value: Any) -> float:
     if number <= 0:
         raise ValueError(f"{name}: expected a positive length, got {number:.6g}")
     return number
+
+
+def connected(cells: IntArray, count: int) -> IntArray:
+    """The lowest vertex of the connected cells [C, N] that each of `count` vertices is in, shape [count]."""
+    label = np.arange(count)
+    while True:  # each vertex takes the lowest label of its cells, and that label's own: paths halve each time
+        lowest = label[cells].min(axis=1)
+        new = label.copy()
+        for corner in cells.T:
+            np.minimum.at(new, corner, lowest)
+        new = new[new]
+        if np.array_equal(new, label):
+            return label
+        label = new

@@ -11,7 +11,7 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, float_array, listed, positive, warn
+from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, connected, float_array, listed, positive, warn
 from diffvbd.mesh.read import SURFACES, Tets, kind_of, listed_kinds, read_cells, tets_of, triangles_of
 from diffvbd.mesh.tet_mesh import TetMesh, oriented, signed_volume
 
@@ -264,20 +264,6 @@ def _labels(content: meshio.Mesh, name: str, rows: list[tuple[int, IntArray]]) -
     with np.errstate(invalid="ignore"):
         whole = labels.astype(np.int64)
     return whole if np.array_equal(whole, labels) else None
-
-
-def connected(cells: IntArray, count: int) -> IntArray:
-    """The lowest vertex of the connected cells [C, N] that each of `count` vertices is in, shape [count]."""
-    label = np.arange(count)
-    while True:  # each vertex takes the lowest label of its cells, and that label's own: paths halve each time
-        lowest = label[cells].min(axis=1)
-        new = label.copy()
-        for corner in cells.T:
-            np.minimum.at(new, corner, lowest)
-        new = new[new]
-        if np.array_equal(new, label):
-            return label
-        label = new
 
 
 def together(points: FloatArray, distance: float) -> IntArray:

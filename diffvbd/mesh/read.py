@@ -69,7 +69,9 @@ def _cells_of_object(mesh: Any) -> tuple[meshio.Mesh, list[str]]:
         raise TypeError(f"source: expected a path, or a mesh of trimesh, pyvista or meshio, got {got}")
     kinds, blocks = np.asarray(mesh.celltypes), mesh.cells_dict
     known = [kind for kind in blocks if kind in _VTK]
-    cell_data = {name: [np.asarray(rows)[kinds == kind] for kind in known] for name, rows in mesh.cell_data.items()}
+    cell_data: dict[str, Any] = {
+        name: [np.asarray(rows)[kinds == kind] for kind in known] for name, rows in mesh.cell_data.items()
+    }
     left_out = int((~np.isin(kinds, known)).sum())
     content = meshio.Mesh(np.asarray(mesh.points), [(_VTK[kind], blocks[kind]) for kind in known],
                           dict(mesh.point_data.items()), cell_data)  # fmt: skip

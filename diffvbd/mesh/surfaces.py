@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, count, float_array, int_array, positive, warn
-from diffvbd.mesh.io import Source, connected, read_triangles
+from diffvbd.mesh.arrays import FloatArray, IntArray, connected, count, float_array, int_array, positive, warn
+from diffvbd.mesh.io import Source, read_triangles
 from diffvbd.mesh.tet_mesh import TetMesh
 
 # Rows: what becomes x, y, z. All are rotations, and each brings the axis of its name to y.

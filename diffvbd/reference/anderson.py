@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .layout import dot, put, take
 from .rigid import admits, connected_bodies
-from .scene import Scene
+from .scene import Scene, dot, put, take
 
 REGULARIZATION = 1e-6  # of the diagonal
 ROUNDING = 8  # ulps of the potential's terms by which it may rise all the same

@@ -15,8 +15,7 @@ from ..model.model import Model
 from ..model.rest import rest_metric
 from ..safeguards import SATURATION_EPS
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
-from .particles import check_finite
-from .sums import FixedSum, placed
+from .particles import FixedSum, check_finite, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
 _OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], device="cpu")

@@ -31,8 +31,7 @@ from torch import Tensor, nn
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 SIZE = (0.08, 0.4, 0.08)  # [m]
 DENSITY = 1000.0  # [kg/m^3]
@@ -64,29 +63,14 @@ def problem(settings: Settings) -> Problem:
         stages=[Stage(loss=training.loss, iterations=iterations, learning_rate=0.05, capturable=True)],
         estimates=lambda: judged(training.missed),
         units={"distance": "m"},
-        protocol={
-            "scenes": scenes,
-            "vertices": arm.model.num_vertices,
-            "steps": STEPS,
-            "held": STAY,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "density": DENSITY,
-            "mu": MU,
-            "lam": LAM,
-            "size": SIZE,
-            "height": HEIGHT,
-            "distance": DISTANCE,
-            "swing": SWING,
-            "acceleration": ACCELERATION,
-            "hidden": HIDDEN,
-            "near": NEAR,
-            "spread": SPREAD,
-        },
+        protocol={"scenes": scenes, "vertices": arm.model.num_vertices, "steps": STEPS, "held": STAY,
+                  "time_step": TIME_STEP, "sweeps": SWEEPS, "density": DENSITY, "mu": MU, "lam": LAM, "size": SIZE,
+                  "height": HEIGHT, "distance": DISTANCE, "swing": SWING, "acceleration": ACCELERATION,
+                  "hidden": HIDDEN, "near": NEAR, "spread": SPREAD},
         findings=training.findings,
         picture=training.picture,
         animation=training.animation,
-    )
+    )  # fmt: skip
 
 
 class Arm:
@@ -128,20 +112,11 @@ class Arm:
         """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
         targets, swings = given
         shape = (*lead, len(targets), self.model.num_vertices, 3)
-        return dv.rollout(
-            self.model,
-            self.model.rest_points.expand(shape),
-            (self.bend * (swings @ self.ground)[:, None]).expand(shape),
-            steps=STEPS,
-            mu=MU,
-            lam=LAM,
-            time_step=TIME_STEP,
-            sweeps=SWEEPS,
-            prescribed=self.driven(policy, targets),
-            observe=lambda x, v, step: mean(x, self.tip) - (targets @ self.ground + self.standing),
-            save=save,
-            checkpoint_every=None,
-        )
+        return dv.rollout(self.model, self.model.rest_points.expand(shape),
+                          (self.bend * (swings @ self.ground)[:, None]).expand(shape), steps=STEPS, mu=MU, lam=LAM,
+                          time_step=TIME_STEP, sweeps=SWEEPS, prescribed=self.driven(policy, targets),
+                          observe=lambda x, v, step: mean(x, self.tip) - (targets @ self.ground + self.standing),
+                          save=save, checkpoint_every=None)  # fmt: skip
 
     def misses(self, policy: Policy, given: Scenes, lead: tuple[int, ...] = ()) -> Tensor:
         """Mean squared distance from tip to target while it must be there [m^2], shape [*lead, scenes]."""
@@ -199,14 +174,11 @@ class Training:
         return {
             "seconds": seconds,
             "gradient_was_there_after": next((row["seconds"] for row in history if row["loss"] <= lowest), None),
-            "cma_es": {
-                "version": importlib.metadata.version("cma"),
-                "networks": networks,
-                "train": {"distance": lowest**0.5},
-                "test": judged(self.arm.misses(policies(network, best.to(**like)), self.test)),
-                "course": self.course,
-            },
-        }
+            "cma_es": {"version": importlib.metadata.version("cma"), "networks": networks,
+                       "train": {"distance": lowest**0.5},
+                       "test": judged(self.arm.misses(policies(network, best.to(**like)), self.test)),
+                       "course": self.course},
+        }  # fmt: skip
 
     @torch.no_grad()
     def shown(self, policy: Policy) -> Tensor:
@@ -223,14 +195,9 @@ class Training:
         motions = {"untrained": self.shown(policies(self.network, self.first)), "trained": self.shown(self.network)}
         at = [0, STEPS // 4, STEPS // 2, STEPS]
         curves = {"gradient": [(row["seconds"], row["loss"]) for row in history], "CMA-ES": self.course}
-        viz.learning(
-            path,
-            self.surface,
-            {name: motion[at] for name, motion in motions.items()},
-            [k * TIME_STEP for k in at],
-            {name: curve for name, curve in curves.items() if curve},
-            self.goals(),
-        )
+        viz.learning(path, self.surface, {name: motion[at] for name, motion in motions.items()},
+                     [k * TIME_STEP for k in at], {name: curve for name, curve in curves.items() if curve},
+                     self.goals())  # fmt: skip
 
     def animation(self, path: Path) -> None:
         viz.animation(path, self.surface, {"trained": self.shown(self.network)}, TIME_STEP, self.goals())

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from diffvbd import Refinement
-from diffvbd.tasks.progress import Row
 
+Row = dict[str, float]
 OWN_KEYS = ("iteration", "stage", "loss", "gradient_norm", "seconds")  # of a row; the others are estimates
 
 

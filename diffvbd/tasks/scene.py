@@ -11,7 +11,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.mesh.write import replace
-from diffvbd.tasks import archive
+from diffvbd.tasks.folder import read_archive
 
 MOST_STEPS = 10**7  # beyond, a typing error is likelier than patience
 
@@ -75,19 +75,8 @@ class Scene:
     ) -> dv.Trajectory:
         """Roll out from (x0, v0); mu and lam in [Pa]; options as in `diffvbd.rollout`."""
         x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (self.x0, self.v0))
-        return dv.rollout(
-            model,
-            x,
-            v,
-            steps=steps,
-            mu=mu,
-            lam=lam,
-            time_step=self.time_step,
-            sweeps=self.sweeps,
-            gravity=self.gravity,
-            integrator=INTEGRATORS[self.integrator](),
-            **options,
-        )
+        return dv.rollout(model, x, v, steps=steps, mu=mu, lam=lam, time_step=self.time_step, sweeps=self.sweeps,
+                          gravity=self.gravity, integrator=INTEGRATORS[self.integrator](), **options)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -152,7 +141,7 @@ class Observation:
             ValueError: not an .npz file, unknown or missing keys, wrong shapes; positions that are not in metres, by
                 their size; a time_step that does not meet the times of the observations.
         """
-        values = archive.read(path, "an .npz file with the key x")
+        values = read_archive(path, "an .npz file with the key x")
         given = {key: value for key, value in overrides.items() if value is not None}
         recorded = None if {"time_step", "steps"} <= set(given) else values.get("time_step")
         values |= given
@@ -187,13 +176,10 @@ class Observation:
             if fields["integrator"] not in INTEGRATORS:
                 raise ValueError(f"{path}: integrator: expected one of {[*INTEGRATORS]}, got {fields['integrator']!r}")
         _check_size(path, x[0], mesh)
-        scene = Scene(
-            mesh=mesh,
-            x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
-            v0=_checked(path, "v0", values.get("v0", np.zeros(shape)), shape),
-            pinned=_mask(path, values.get("pinned", np.zeros(shape[0], bool)), shape[0]),
-            **fields,
-        )
+        scene = Scene(mesh=mesh, x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
+                      v0=_checked(path, "v0", values.get("v0", np.zeros(shape)), shape),
+                      pinned=_mask(path, values.get("pinned", np.zeros(shape[0], bool)), shape[0]),
+                      **fields)  # fmt: skip
         truth = {key: _number(path, key, values[key]) for key in ("mu", "lam") if key in values}
         return cls(scene, x, steps, truth)
 

@@ -15,12 +15,9 @@ import torch
 from ..checks import check_bool, check_count, fail
 from ..model.model import Model
 from .drawing import Scenery
-from .motion import Mesh, Motion, mesh_of, motions_of
-from .opened import opened
-from .panel import Slider
-from .scenery import scenery_of
+from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of
 from .values import Values
-from .viewer import Viewer
+from .viewer import Slider, Viewer
 
 
 def live(
