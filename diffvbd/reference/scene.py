@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import input_name
+
 
 @dataclass(frozen=True)
 class Color:
@@ -119,9 +121,9 @@ class Scene:
     mass: Tensor  # [..., V]
     parameters: dict[str, Any]
 
-    def parameter(self, kind: str, energy: Any, name: str) -> Tensor:
+    def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
-        return self.tensor(self.parameters.get(f"{kind}.{name}", getattr(energy, name)))
+        return self.tensor(self.parameters.get(input_name(energy, key), getattr(energy, key)))
 
     def tensor(self, value: Any) -> Tensor:
         return torch.as_tensor(value, dtype=self.like.dtype, device=self.like.device)
