@@ -1,7 +1,6 @@
 """The command line: what it writes, what it recovers, and how it refuses."""
 
 import io
-import json
 import subprocess
 import sys
 import warnings
@@ -42,14 +41,6 @@ def test_help_shows_examples_and_every_command(capsys: pytest.CaptureFixture) ->
     text = capsys.readouterr().out
     for word in ("run", "list", "simulate", "identify", "info", "examples:", "--save-target"):
         assert word in text
-
-
-def test_list_and_info(capsys: pytest.CaptureFixture) -> None:
-    assert run("list") == 0
-    assert "beam-mu-lam" in capsys.readouterr().out
-    assert run("info") == 0
-    text = capsys.readouterr().out
-    assert "torch" in text and "_C" in text
 
 
 def test_run_quick_prints_a_table_and_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -106,35 +97,10 @@ def test_identify_recovers_the_material_of_a_motion(mesh_file: Path, tmp_path: P
     assert all(float(error) < 0.01 for error in errors)  # [%]
 
 
-def test_another_time_step_keeps_the_times_of_the_observations(mesh_file: Path, tmp_path: Path) -> None:
-    target = tmp_path / "target.npz"
-    options = [*SCENE, "--stride", 4, "--save-target", target]
-    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *options) == 0
-    mesh = dv.mesh.load(mesh_file)
-    for time_step, steps in ((0.01, [0, 4, 8, 12]), (0.04, [0, 1, 2, 3]), (0.0025, [0, 16, 32, 48])):
-        found = Observation.load(target, mesh, time_step=time_step)
-        assert found.scene.time_step == time_step
-        assert found.steps.tolist() == steps
-    both = Observation.load(target, mesh, time_step=0.02, steps=[0, 1, 2, 3])  # said by who calls
-    assert both.steps.tolist() == [0, 1, 2, 3]
-
-
 def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 2
     told = capsys.readouterr().out
     assert "identify  recover mu and lam" in told and "examples:" in told
-
-
-def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
-    target = tmp_path / "target.npz"
-    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, "--mu", 4e4, "--save-target", target) == 0
-    content = dict(np.load(target))
-    np.savez(tmp_path / "shape.npz", x=content["x"][-1])
-    options = ["--start", 1e4, 1e5, "--fixed-lam", "--out", tmp_path / "run"]
-    assert run("identify", mesh_file, tmp_path / "shape.npz", *SCENE, *options) == 0
-    log = (tmp_path / "run" / "log.json").read_text()
-    mu = float(log.split('"estimates": {')[1].split('"mu": ')[1].split(",")[0])
-    assert mu == pytest.approx(4e4, rel=tolerance("identified"))
 
 
 @pytest.mark.parametrize(
@@ -249,38 +215,6 @@ def test_simulate_makes_folders_and_asks_before_it_overwrites(
     assert run(*arguments, "--force") == 0 and len(asked) == 3
 
 
-def test_friction_and_relaxation_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
-    low = dv.mesh.load(mesh_file).points[:, 1].min()
-    ends = {}
-    options = ["--floor", low - 0.002, "--dhat", 0.005, "--velocity", 1, 0, 0, "--steps", 12, "--time-step", 0.01]
-    for name, more in {"smooth": [], "rough": ["--friction", 0.8], "relaxed": ["--relaxation", 1.5]}.items():
-        target = tmp_path / f"{name}.npz"
-        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target]
-        assert run("simulate", mesh_file, *out, *options, *more) == 0
-        content = np.load(target)
-        ends[name] = content["x"][-1]
-        assert ("friction" in content, "relaxation" in content) == (name == "rough", name == "relaxed")
-        scene = Observation.load(target, dv.mesh.load(mesh_file)).scene
-        assert (scene.friction, scene.relaxation) == (0.8 if name == "rough" else None, 1.5 if name == "relaxed" else 1)
-    assert ends["rough"][:, 0].mean() < ends["smooth"][:, 0].mean() - 0.01
-    assert not np.array_equal(ends["relaxed"], ends["smooth"])
-
-
-def test_the_integrator_is_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
-    """Of free fall, which second order has exactly."""
-    falls = {}
-    for name in ("implicit-euler", "sdirk2", "bdf2"):
-        target = tmp_path / f"{name}.npz"
-        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target]
-        assert run("simulate", mesh_file, *out, "--steps", 5, "--time-step", 0.02, "--integrator", name) == 0
-        found = Observation.load(target, dv.mesh.load(mesh_file))
-        assert found.scene.integrator == name
-        falls[name] = float((found.x[-1] - found.x[0])[:, 1].mean())
-    exact = -0.5 * 9.81 * 0.1**2
-    assert abs(falls["implicit-euler"] - exact) > 0.1 * abs(exact)
-    assert all(abs(falls[name] - exact) < tolerance("closed_form") * abs(exact) for name in ("sdirk2", "bdf2"))
-
-
 def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
     """With two sweeps they change where a stiff body ends, and its file says that they were there."""
     ends = {}
@@ -299,17 +233,6 @@ def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Pat
     assert run("identify", mesh_file, tmp_path / "plain.npz", "--coarse", *out) in (0, 1)
     for given in (True, np.bool_(True), 1, 1.0):
         assert Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), coarse=given).scene.coarse
-
-
-def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
-    target = tmp_path / "target.npz"
-    material = ["--young", 1e5, "--poisson", 0.3]
-    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, *material, "--save-target", target) == 0
-    start = ["--start-young", 2.6e4, "--start-poisson", 0.3, "--iterations", 60, "--out", tmp_path / "run"]
-    assert run("identify", mesh_file, target, *start) == 0
-    log = json.loads((tmp_path / "run" / "log.json").read_text())
-    assert [log["history"][0][name] for name in ("mu", "lam")] == pytest.approx([1e4, 1.5e4])
-    assert "Young's modulus 1" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

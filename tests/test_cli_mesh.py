@@ -8,7 +8,6 @@ import meshio
 import numpy as np
 import pytest
 
-from diffvbd import cli_mesh
 from diffvbd import mesh as dm
 from diffvbd.cli import main
 from diffvbd.testing import tolerance
@@ -48,16 +47,6 @@ def test_a_scan_becomes_tets(scan: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert "would be overwritten; give --force, or another name" in capsys.readouterr().err
 
 
-def test_what_is_left_out_of_a_large_scan_is_said(
-    scan: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("trimesh", reason="needs the extra [mesh]")
-    monkeypatch.setattr(dm, "tetrahedralize", lambda surface, edge, epsilon, most: dm.cube(3))
-    assert run("mesh", scan, "--scale", 0.01, "--max-triangles", 20, "-o", scan.with_name("part.vtu")) == 0
-    told = capsys.readouterr()
-    assert "decimated to 20 triangles; --max-triangles keeps more" in told.out and not told.err
-
-
 def test_a_scan_without_its_unit_is_warned_of(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("trimesh", reason="needs the extra [mesh]")
     monkeypatch.setattr(dm, "tetrahedralize", lambda *given: dm.cube(3))
@@ -65,11 +54,6 @@ def test_a_scan_without_its_unit_is_warned_of(scan: Path, monkeypatch: pytest.Mo
         UserWarning, match=r"largest extent is 20 m.* scale=0\.001 \(--scale 0\.001\), or size= \(--size\)"
     ):
         assert run("mesh", scan, "-o", scan.with_name("part.vtu")) == 0
-
-
-def test_quality_is_shown() -> None:
-    text = cli_mesh.report(dm.cube(3), 2 * dm.cube(3).volume.sum(), 1.0)
-    assert "27 vertices" in text and "(-50.00% of the surface's)" in text and "0 tets below 0.1" in text
 
 
 @pytest.mark.parametrize(

@@ -29,11 +29,6 @@ def test_the_version_stands_in_one_place() -> None:
         assert not re.search(rf"(?<![\d.]){re.escape(version)}(?![\d.])", text(name)), name
 
 
-def test_the_changelog_begins_with_the_version() -> None:
-    headings = re.findall(r"^## (\S+)", text("CHANGELOG.md"), re.MULTILINE)
-    assert headings[0] == diffvbd.__version__
-
-
 def test_the_citation_agrees_with_the_project() -> None:
     project = dict(re.findall(r'^(name|license|description) = "(.*)"$', text("pyproject.toml"), re.MULTILINE))
     citation = text("CITATION.cff")

@@ -134,18 +134,6 @@ def test_slides_above_the_angle_of_friction(device: str, support: str) -> None:
 
 
 @pytest.mark.parametrize("support", TWO)
-def test_sliding_distance_converges(support: str) -> None:
-    coefficient, duration = 0.3, 0.4
-    block = block_on(support, dv.Friction(coefficient, CREEP))
-    settle(block, ANGLE, coefficient)
-    expected = GRAVITY * (math.sin(ANGLE) - coefficient * math.cos(ANGLE)) * duration**2 / 2
-    errors = [float(distance(block, ANGLE, h, duration)) / expected - 1 for h in (0.02, 0.01, 0.005)]
-    assert order_of(errors) == pytest.approx(1.0, abs=tolerance("order"))
-    finest = 0.005 / duration
-    assert errors[-1] == pytest.approx(finest, rel=tolerance("sliding") / finest)
-
-
-@pytest.mark.parametrize("support", TWO)
 def test_a_sliding_block_stops(support: str) -> None:
     """After v0^2 / (2 mu_f g), and it stays there."""
     coefficient, duration = 0.4, 0.16
@@ -190,18 +178,6 @@ def test_gradient_of_the_sliding_distance(support: str) -> None:
                 there = [float(run(coefficient + k * eps)) for k in range(3)]
                 difference = (-3 * there[0] + 4 * there[1] - there[2]) / (2 * eps)
         assert float(gradient) == pytest.approx(difference, rel=tolerance("finite_difference"))
-
-
-@pytest.mark.parametrize("support", SUPPORTS)
-def test_without_friction(device: str, support: str) -> None:
-    """A coefficient of zero is no friction: to the bit where both take the way through contact."""
-    none, zero = block_on(support, device=device), block_on(support, dv.Friction(0.0, CREEP), device=device)
-    settle(none, ANGLE, 0.0)
-    zero.x = none.x
-    for a, b in zip(slide(none, ANGLE, 0.01, 0.1, 0.3), slide(zero, ANGLE, 0.01, 0.1, 0.3), strict=True):
-        if support != "floor":
-            assert torch.equal(a, b)
-        assert relative_error(a, b) <= tolerance("forward")
 
 
 @pytest.mark.parametrize("support", SUPPORTS)

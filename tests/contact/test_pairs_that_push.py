@@ -33,25 +33,6 @@ def test_a_step_and_its_gradients_are_those_without_it(monkeypatch: pytest.Monke
         assert filtered.abs().max() > 0 and torch.equal(filtered, whole)
 
 
-def test_a_scene_alone_has_the_bits_that_it_has_in_a_batch() -> None:
-    cube, places = dv.mesh.cube(2, size=0.1), [(0.003 * (k % 2), 0.1005 * k, 0.002 * (k % 3)) for k in range(4)]
-    mesh = dv.mesh.join([cube.translate(place) for place in places])
-    low = float(mesh.points[:, 1].min()) - 5e-4
-    energies = (dv.StableNeoHookean(), dv.FloorBarrier(low, kappa=1e4, dhat=1e-3),
-                dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5))  # fmt: skip
-    model = dv.Model(mesh, energies=energies)
-
-    def end(scenes: int) -> Tensor:
-        x = model.rest_points.expand(scenes, -1, -1).contiguous()
-        motion = dv.rollout(model, x, torch.zeros_like(x), steps=4, mu=1e5, lam=1e5, time_step=0.01, sweeps=1,
-                            check_contact=False)  # fmt: skip
-        return motion.x[-1]
-
-    alone, batch = end(1), end(8)
-    assert not torch.equal(alone[0], model.rest_points)
-    assert torch.equal(batch, alone.expand_as(batch))
-
-
 @pytest.mark.usefixtures("one_regime")
 @pytest.mark.parametrize("bodies", [2, 5])  # of up to three bodies a scene is one group
 def test_a_scene_without_pairs_has_the_same_bits_beside_one_with_pairs(bodies: int, device: str) -> None:

@@ -65,49 +65,12 @@ def test_friction_that_has_not_converged_is_named() -> None:
     assert float(good.friction_residuals.max()) <= tolerance("minimum")
 
 
-def test_a_body_is_not_hidden_by_the_forces_of_others() -> None:
-    model, options, x, v = grip()
-    few, _ = dv.step(model, x, v, sweeps=4, **options)
-    told = dv.diagnose(model, few, previous=(x, v), warn=False, **options)
-    assert told.residuals.argmax() == 0 and told.unbalanced <= float(told.residuals.max()) * (1 + tolerance("formula"))
-
-
-def test_float32_has_the_residual_of_float64(device: str) -> None:
-    double = two_boxes(device)
-    x = double.rest_points
-    v = torch.zeros_like(x)
-    v[8:, 1] = -0.2
-    end, _ = dv.step(double, x, v, sweeps=5, **SOFT)
-    expected = dv.diagnose(double, end, previous=(x, v), warn=False, **SOFT)
-    single = double.to(dtype=torch.float32)
-    narrow, _ = dv.step(single, x.float(), v.float(), sweeps=5, **SOFT)
-    found = dv.diagnose(single, narrow, previous=(x.float(), v.float()), warn=False, **SOFT)
-    for a, b in ((found.residuals, expected.residuals), (found.friction_residuals, expected.friction_residuals)):
-        assert float((a - b).abs().max()) <= tolerance("reported_residual") and float(b.max()) > 0
-
-
 def test_bodies_without_contact_have_residuals_too() -> None:
     model = dv.Model(join([box(2, 0.2), box(2, 0.2).translate((1.0, 0, 0))]), pinned=[0, 1, 8, 9])
     x = model.rest_points
     end, _ = dv.step(model, x, 0 * x, sweeps=2, **SOFT)
     told = dv.diagnose(model, end, previous=(x, 0 * x), warn=False, **SOFT)
     assert told.residuals.shape == (2,) and (told.residuals > 0).all() and told.friction_residuals is None
-
-
-def test_states_that_are_lost_are_still_diagnosed() -> None:
-    model = two_boxes()
-    x = model.rest_points
-    lost = x.clone()
-    lost[3] = torch.nan
-    told = dv.diagnose(model, lost, previous=(x, 0 * x), warn=False, **SOFT)
-    assert told.nonfinite.sum() == 1 and bool(told.residuals.isnan().all()) and "NaN" in told.messages[0]
-
-
-def test_no_scenes() -> None:
-    model = two_boxes()
-    none = model.rest_points[None][:0]
-    told = dv.diagnose(model, none, previous=(none, none), warn=False, **SOFT)
-    assert told.residuals.shape == (0, 2) and told.unbalanced == 0
 
 
 @pytest.mark.parametrize("name", ["force", "gravity"])

@@ -79,15 +79,6 @@ def test_moduli_of_a_file_drive_a_step(tmp_path: Path) -> None:
     assert mu.grad is not None and mu.grad.shape == (mesh.num_tets,) and (mu.grad != 0).all()
 
 
-def test_labels_that_are_no_bodies_stay_values(tmp_path: Path) -> None:
-    cells = [("tetra", [[0, 1, 2, 3], [1, 2, 3, 5]])]
-    meshio.Mesh(POINTS, cells, cell_data={"body": [np.array([4, 5])]}).write(tmp_path / "glued.vtu")
-    found = dm.load_fields(tmp_path / "glued.vtu")
-    assert found.mesh.num_bodies == 1 and found.cell_data["body"].tolist() == [4, 5]
-    dm.save(tmp_path / "again.vtu", *found)
-    assert dm.load_fields(tmp_path / "again.vtu").cell_data["body"].tolist() == [4, 5]
-
-
 def test_series_has_values_of_tets(tmp_path: Path) -> None:
     mesh = dm.cube()
     frames = np.stack([mesh.points] * 2)
@@ -139,10 +130,3 @@ def test_names_with_signs_of_xml_come_back(tmp_path: Path, name: str) -> None:
     for file in ("a.vtu", "b_0000.vtu"):
         found = dm.load_fields(tmp_path / file)
         assert list(found.point_data) == list(found.cell_data) == [name]
-
-
-def test_values_are_real_numbers(tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=r"cell_data\['c'\]: expected real numbers, got dtype complex128"):
-        dm.save(tmp_path / "a.vtu", MESH, cell_data={"c": np.zeros(T, dtype=complex)})
-    with pytest.raises(TypeError, match="point_data: expected values by name, as in a dict, got list"):
-        dm.save(tmp_path / "a.vtu", MESH, [1.0])  # pyright: ignore[reportArgumentType]

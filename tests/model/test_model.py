@@ -1,7 +1,5 @@
 """Model: coloring, masses, pins, copies, presets, and the number of colors against DSATUR."""
 
-import heapq
-import itertools
 import warnings
 from typing import Any
 
@@ -27,42 +25,6 @@ MESHES = [
     *(("delaunay", size) for size in ("small", "medium", "large")),
     *(("random", size) for size in ("small", "medium", "large")),
 ]
-
-
-def neighbors(tets: np.ndarray, count: int) -> list[set[int]]:
-    out: list[set[int]] = [set() for _ in range(count)]
-    for tet in tets.tolist():
-        for a, b in itertools.permutations(tet, 2):
-            out[a].add(b)
-    return out
-
-
-def dsatur(tets: np.ndarray, count: int) -> int:
-    """Colors of DSATUR (Brelaz 1979): the vertex with the most colors around it comes next, ties by degree."""
-    near = neighbors(tets, count)
-    color = [-1] * count
-    around: list[set[int]] = [set() for _ in range(count)]
-    queue = [(0, -len(near[v]), v) for v in range(count)]
-    heapq.heapify(queue)
-    while queue:
-        saturation, _, v = heapq.heappop(queue)
-        if color[v] >= 0 or -saturation != len(around[v]):
-            continue
-        color[v] = next(c for c in itertools.count() if c not in around[v])
-        for u in near[v]:
-            if color[u] < 0 and color[v] not in around[u]:
-                around[u].add(color[v])
-                heapq.heappush(queue, (-len(around[u]), -len(near[u]), u))
-    return 1 + max(color, default=-1)
-
-
-@pytest.mark.parametrize(("kind", "size"), MESHES)
-def test_number_of_colors_is_within_one_of_dsatur(kind: str, size: Any, record_property: Any) -> None:
-    mesh = mesh_of(kind, size)
-    ours, theirs = dv.Model(mesh).num_colors, dsatur(mesh.tets, mesh.num_vertices)
-    record_property("colors", f"{kind} {size}: {ours}, DSATUR {theirs}")
-    print(f"{kind} {size}: {ours} colors, DSATUR {theirs}")
-    assert 4 <= ours <= theirs + 1
 
 
 @pytest.mark.parametrize(("kind", "size"), MESHES)
@@ -118,15 +80,6 @@ def test_pins_by_mask_or_indices(pinned: Any) -> None:
     assert still.nonzero().reshape(-1).tolist() == [0, 3]
 
 
-def test_a_models_mask_is_its_own() -> None:
-    mask = torch.zeros(8, dtype=torch.bool)
-    density = torch.full((6,), 500.0, dtype=torch.float64)
-    model = dv.Model(dv.mesh.cube(split="kuhn"), density=density, pinned=mask)
-    mask[:] = True
-    density[:] = 1.0
-    assert not model.pinned.any() and (model.density == 500.0).all()
-
-
 # --- what a Model shows -----------------------------------------------------------------------------------------------
 
 
@@ -142,29 +95,6 @@ def test_repr_says_what_it_is() -> None:
     assert "\n" not in text and len(text) < 700
     plain = repr(dv.Model(dv.mesh.cube(split="kuhn"), dtype=torch.float32))
     assert "float32" in plain and "saturation" not in plain and "relaxation" not in plain
-
-
-def test_repr_shows_no_tensors() -> None:
-    stiffness, points = torch.rand(45), torch.rand(45, 3)
-    anchor = dv.Anchor(stiffness, points, vertices=[1, 4, 7])
-    text = repr(dv.Model(dv.mesh.beam(5, 3, 3, split="kuhn"), energies=(dv.StableNeoHookean(), anchor)))
-    for shown in (text, repr(anchor)):
-        assert "stiffness=[45]" in shown and "points=[45, 3]" in shown
-        assert "tensor" not in shown and "\n" not in shown and len(shown) < 700
-    assert "vertices=3 of 45" in text and "vertices=[3]" in repr(anchor)
-    assert repr(dv.Anchor(2.5)) == "Anchor(stiffness=2.5, points=None, vertices=None)"
-
-
-def test_surface_and_geometry_are_the_meshes() -> None:
-    mesh = dv.mesh.box((4, 3, 2), split="kuhn")
-    model = dv.Model(mesh)
-    assert torch.equal(model.surface, torch.from_numpy(mesh.surface.copy()))
-    assert torch.equal(model.rest_points, torch.from_numpy(mesh.points.copy()))
-    assert torch.equal(model.tets, torch.from_numpy(mesh.tets.copy()))
-    assert (model.num_vertices, model.num_tets) == (mesh.num_vertices, mesh.num_tets)
-    # outward: the divergence theorem gives the volume
-    a, b, c = model.rest_points[model.surface].unbind(1)
-    assert abs(float((a * torch.linalg.cross(b, c)).sum() / 6) - 1.0) <= tolerance("formula")
 
 
 def test_paper_preset() -> None:
@@ -250,17 +180,6 @@ def test_a_batch_without_scenes_is_legal() -> None:
     model = dv.Model(dv.mesh.cube(split="kuhn"))
     new, by_x, _ = gradients(model, torch.zeros(0, 8, 3, dtype=torch.float64))
     assert new.shape == (0, 8, 3) and by_x.shape == (0, 8, 3)
-
-
-def test_all_vertices_pinned_is_legal() -> None:
-    mesh = dv.mesh.cube(split="kuhn")
-    model = dv.Model(mesh, pinned=range(8))
-    assert model.num_colors == 0 and model.num_active == 0
-    new, by_x, by_v = gradients(model, model.rest_points)
-    assert torch.equal(new, model.rest_points)
-    assert torch.equal(by_x, torch.ones_like(by_x)) and torch.equal(by_v, torch.zeros_like(by_v))
-    target = model.rest_points + 0.1
-    assert torch.equal(gradients(model, model.rest_points, prescribed=target)[0], target)
 
 
 def test_vertices_without_tets_are_legal_when_pinned() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.exactness import BATCHED, check, check_shapes
-from helpers.regimes import ANY_SIZE, REGIMES, forced, large_inputs
+from helpers.regimes import REGIMES, forced, large_inputs
 from helpers.results import TAPES, assert_same_bits, evaluated
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
@@ -193,12 +193,6 @@ def test_any_number_of_threads_per_vertex(
     assert_equal_to_the_cpu(model, inputs, 6, "color")
 
 
-def test_the_fans_have_the_degree_they_promise() -> None:
-    for name, degree in (("fan for a thread", 30), ("fan of 98", 98), ("fan of 602", 602)):
-        tets = ODD[name][0]().tets
-        assert len(set(tets[(tets == 0).any(1)].ravel())) - 1 == degree
-
-
 @pytest.mark.parametrize("regime", (None, *REGIMES))
 def test_no_scenes(regime: str | None) -> None:
     model = dv.Model(dv.mesh.cube(), device="cuda")
@@ -289,26 +283,6 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
 # --- the choice -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("cells", "lead", "able"),
-    [(1, (20_000,), REGIMES), (4, (256,), REGIMES[1:]), (10, (), REGIMES[1:]), (31, (), ANY_SIZE), (1, (), REGIMES)],
-)  # fmt: skip
-def test_the_automatic_choice_is_one_of_the_regimes(cells: int, lead: tuple[int, ...], able: tuple[str, ...]) -> None:
-    """Many small bodies, many medium meshes, one medium mesh, one large mesh, one small one."""
-    model, inputs = large_inputs(cells, *lead)
-    inputs.pop("rest_points")
-    chosen = evaluated(model, inputs, 3)
-    matches = []
-    for regime in able:
-        with forced(regime):
-            result = evaluated(model, inputs, 3)
-        # regimes differ by rounding only
-        limit = tolerance("property_factor") * tolerance("adjoint")
-        assert all(relative_error(result[k], chosen[k]) <= limit for k in chosen if k != "v")
-        matches.append(all(torch.equal(result[k], chosen[k]) for k in chosen))
-    assert any(matches)
-
-
 def launches(model: dv.Model, inputs: dict[str, Any], tape: str) -> tuple[int, int]:
     """Of sweeps and of reverse sweeps in one step: of each color where that is the regime."""
     with profile(activities=[ProfilerActivity.CUDA]) as seen:
@@ -362,22 +336,3 @@ def test_a_regime_that_cannot_run_a_scene_raises() -> None:
 def test_an_unknown_regime_raises(name: Any) -> None:
     with pytest.raises((ValueError, TypeError), match="regime"), dv.regime(name):
         pass
-
-
-def test_regimes_nest_and_end_with_an_exception() -> None:
-    model, inputs = large_inputs(10)
-    with dv.regime("grid"):
-        with pytest.raises(ValueError, match="regime"), dv.regime("thread"):
-            dv.step(model, sweeps=1, **inputs)
-        inner = dv.step(model, sweeps=3, **inputs)
-    with dv.regime("grid"):
-        assert torch.equal(dv.step(model, sweeps=3, **inputs)[0], inner[0])
-
-
-def test_a_regime_means_nothing_on_the_cpu() -> None:
-    model, inputs = odd_scene("bodies", (2,))
-    expected = evaluated(model, inputs, 3)
-    for regime in REGIMES:
-        with forced(regime):
-            result = evaluated(model, inputs, 3)
-        assert all(torch.equal(result[name], expected[name]) for name in expected)

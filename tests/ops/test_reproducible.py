@@ -3,11 +3,7 @@
 Of CUDA see also test_cuda_regimes.py.
 """
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -119,71 +115,3 @@ def test_numbering_of_vertices_is_the_users(device: str, kind: str) -> None:
         per_vertex = name == "end" or inputs[name].shape[:1] == (len(rank),)
         other = ends[1][name][rank] if per_vertex else ends[1][name]
         assert value.any() and relative_error(other, value) <= tolerance("closed_form"), name
-
-
-@pytest.mark.parametrize("case", ("plain", "paper", "saturated", "inverted", "floor_damped", "anchored"))
-def test_dot_product(device: str, case: str) -> None:
-    """<J v, w> = <v, J^T w>, J v by central differences of the whole step in all arguments at once."""
-    scene = build_scene(case, "delaunay", "small")
-    model, inputs = scene.model(device), scene.inputs(device=device)
-    time_step, parameters = inputs.pop("time_step"), inputs.pop("parameters", {})
-    flat = inputs | parameters
-    rng = generator("dot", case)
-    # relative directions for material and parameters, absolute ones for positions: each moves the result
-    directions = {
-        name: torch.as_tensor(rng.standard_normal(tuple(a.shape)), device=device) * (1.0 if a.dim() == 2 else a.abs())
-        for name, a in flat.items()
-    }
-    w = [torch.as_tensor(rng.standard_normal(tuple(flat["x"].shape)), device=device) for _ in range(2)]
-
-    def run(values: dict[str, Tensor]) -> Tensor:
-        given = {k: values[k] for k in inputs}
-        named = {k: values[k] for k in parameters} or None
-        x, v = dv.step(model, sweeps=4, time_step=time_step, parameters=named, **given)
-        return (w[0] * x).sum() + time_step * (w[1] * v).sum()
-
-    leaves = {k: a.clone().requires_grad_() for k, a in flat.items()}
-    gradients = torch.autograd.grad(run(leaves), list(leaves.values()))
-    best = float("inf")
-    for name, gradient in zip(leaves, gradients, strict=True):
-        adjoint = float((gradient * directions[name]).sum())
-        errors = []
-        for eps in (1e-4, 1e-5, 1e-6):
-            ahead, behind = (run(flat | {name: flat[name] + s * eps * directions[name]}) for s in (1, -1))
-            errors.append(abs(float(ahead - behind) / (2 * eps) - adjoint) / abs(adjoint) if adjoint else float("inf"))
-        if not gradient.any():
-            assert name == "prescribed" and not scene.pinned.any()
-            continue
-        assert min(errors) <= tolerance("finite_difference"), (name, errors)
-        best = min(best, *errors)
-    assert best < tolerance("best_difference")
-
-
-OF_SHEETS = """
-import torch
-import diffvbd as dv
-from diffvbd import testing
-sheet = dv.mesh.sheet(13, 10, size=(0.32, 0.24), thickness=0.005)
-mesh = dv.mesh.join([sheet, sheet.translate((0.011, 0.015, 0.007))])
-barrier = dv.PairBarrier(kappa=1e4, dhat=0.012, self_contact=False, detections=1)
-floor = dv.FloorBarrier(height=-0.01, kappa=1e3, dhat=0.02)
-model = dv.Model(mesh, energies=(dv.StableNeoHookean(), barrier, floor), coarse="auto")
-x, size = model.rest_points, torch.full((), 1e5, dtype=torch.float64)
-inputs = {"x": x, "v": -0.3 * torch.cos(7 * x), "mu": size, "lam": 2 * size, "time_step": 0.01}
-inputs["parameters"] = {"pair_barrier.kappa": 0.1 * size, "floor_barrier.kappa": 0.01 * size}
-found = testing.evaluate(lambda **given: dv.step(model, sweeps=4, **given), inputs)
-"""
-
-
-def test_sheets_that_touch_with_coarse_corrections(threads: None, tmp_path: Path) -> None:
-    """By torch's setting and by that of the process: dense algebra may take its order of sums from either."""
-    file = tmp_path / "found.pt"
-    code = f"{OF_SHEETS}\ntorch.save(found, {str(file)!r})"
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"OMP_NUM_THREADS": "2"})
-    other = torch.load(file)
-    assert all(value.any() for value in other.values())
-    for count in (1, 2):
-        torch.set_num_threads(count)
-        here: dict[str, Any] = {}
-        exec(OF_SHEETS, here)
-        assert_same_bits(here["found"], other)

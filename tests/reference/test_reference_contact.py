@@ -157,23 +157,6 @@ def test_damping_opposes_approach_alone() -> None:
     assert (least[:, 0] >= -tolerance("formula") * least[:, 2]).all() and (least[:, 2] > 0).any()
 
 
-def test_forces_between_bodies_are_equal_and_opposite() -> None:
-    model, x_prev, _ = setup()
-    x = x_prev + 1e-3 * torch.as_tensor(generator("move").standard_normal((8, 3)))
-    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
-    own = (part.pairs[:, :4] < 8).all(1)
-    pairs = Pairs(scene_of(model, x), part._replace(pairs=part.pairs[own], constants=part.constants[own]), None)
-    start = torch.cat((x_prev, COLLIDERS))[None]
-    barrier = PairBarrier(scene_of(model, x), pairs, COLLIDERS[None])
-    lagged = LaggedPairForces(scene_of(model, x), pairs, start, COLLIDERS[None])
-    for energy in (barrier, lagged):
-        gradient, _ = blocks(model, energy, x, x_prev)
-        size = gradient.abs().sum()
-        assert size > 0 and gradient.sum(0).abs().max() <= tolerance("momentum") * size
-    gradient, _ = blocks(model, barrier, x, x_prev)
-    assert torch.linalg.cross(x, gradient).sum(0).abs().max() <= tolerance("momentum") * gradient.abs().sum()
-
-
 @pytest.mark.parametrize("travel", (1e-4, 1e-2))
 def test_floor_friction_is_the_gradient_of_its_potential(travel: float) -> None:
     """Of two planes, against the force of the barrier at the start of the step."""

@@ -9,7 +9,6 @@ from helpers.two_boxes import two_boxes
 
 import diffvbd as dv
 from diffvbd.mesh import box
-from diffvbd.rollout import contact_check
 from diffvbd.step.contact_cycles import CUT
 from diffvbd.step.held_up import SEVERAL, cut_share
 
@@ -48,23 +47,6 @@ def test_motion_that_pairs_held_up_is_warned_of() -> None:
     assert cut_share(model) > CUT
 
 
-def test_motion_that_pairs_held_up_in_any_step_is_warned_of() -> None:
-    """An impact is over in a step or two, and the momentum that it lost is lost."""
-    large, small = dv.mesh.cube(4, size=0.2), dv.mesh.cube(4, size=0.12).translate((0.21, 0.03, 0.05))
-    barrier = dv.PairBarrier(kappa=1e3, detections=1)
-    model = dv.Model(dv.mesh.join([large, small]), energies=(dv.StableNeoHookean(), barrier))
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    v[64:, 0] = -5.0
-    options: dict[str, Any] = {"mu": 8e3, "lam": 1e4, "time_step": 1 / 60, "sweeps": 10, "gravity": (0.0, 0.0, 0.0)}
-    shares, end = [], (x, v)
-    for _ in range(10):
-        end = dv.step(model, *end, **options)
-        shares.append(float(cut_share(model)))
-    assert max(shares) > CUT > shares[-1]
-    (text,) = messages(lambda: dv.rollout(model, x, v, steps=10, **options))
-    assert f"in step {shares.index(max(shares))}, which lost velocity and momentum" in text
-
-
 def test_friction_that_has_not_converged_is_warned_of() -> None:
     model, x, v = sliding(coefficient=0.5, velocity=1e-4)
     stiff: dict[str, Any] = {"mu": 1e5, "lam": 2e5, "time_step": 0.01}
@@ -91,15 +73,6 @@ def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
             assert sum("pairs held up" in text for text in messages(run)) == int(check)
     for end, slope in ends[1:]:
         assert torch.equal(end, ends[0][0]) and torch.equal(slope, ends[0][1]) and slope.any()
-
-
-@pytest.mark.parametrize(("asked", "steps", "looks"), [(None, 9, False), (None, 10, True), (True, 1, True),
-                                                       (True, 0, False), (False, 50, False)])  # fmt: skip
-def test_when_it_is_looked_at(asked: bool | None, steps: int, looks: bool) -> None:
-    model, x, _ = thrown()
-    assert contact_check.checks_contact(asked, model, x, steps) == looks
-    assert not contact_check.checks_contact(asked, dv.Model(box(2, 0.2)), x[:8], steps)
-    assert not contact_check.checks_contact(asked, model, x[None][:0], steps)
 
 
 def test_bad_input() -> None:

@@ -2,7 +2,6 @@
 is at fault; so does one whose sweeps leave its motion wrong, and one that bends tets too thin for it."""
 
 import warnings
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,12 +9,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.rollout import end_check
-from diffvbd.step.arguments import prepare
-from diffvbd.step.integrators import Solve
 from diffvbd.step.lost import FAR
-from diffvbd.step.unsolved import unsolved
-from diffvbd.testing import tolerance
 
 MEASURES_GROWTH = True  # see conftest.py
 
@@ -59,21 +53,6 @@ def test_an_end_that_is_no_number_is_warned_of() -> None:
     assert messages(lambda: dv.rollout(model, 1e-20 * x, v, steps=1, **SOFT)) == []
 
 
-def test_the_next_rollout_says_it_where_the_device_was_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on CUDA: a copy that is not there yet is asked for again later, whatever ends meanwhile."""
-    model, x, v = bent()
-    monkeypatch.setattr(end_check, "may_copy", lambda x: True)
-    ready = SimpleNamespace(query=lambda: there)
-    model._derived[end_check.ENDED] = [(torch.tensor([good, True]), ready) for good in (True, False, True)]
-    there = False
-    assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
-    there = True
-    with pytest.warns(UserWarning, match="a rollout of this Model before this one ended") as found:
-        dv.rollout(model, x, v, steps=1, **SOFT)
-    assert found[0].filename == __file__
-    assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
-
-
 @pytest.mark.cuda
 def test_the_next_rollout_says_it_on_cuda() -> None:
     model, x, v = lost()
@@ -112,20 +91,6 @@ def test_sweeps_and_time_steps_are_blamed() -> None:
     said = messages(lambda: dv.rollout(model, x, v, steps=16, mu=1e8, lam=4e8, time_step=0.01, sweeps=2,
                                        integrator=dv.SDIRK2(), gravity=(0.0, 0.0, 0.0)))  # fmt: skip
     assert any("more than 1000 body sizes" in text and "sweeps: so few let vibrations grow" in text for text in said)
-
-
-def test_a_loop_of_steps_says_it_too() -> None:
-    model, x, v = bent()
-    said: list[int] = []
-    state = x, 0 * v
-    for k in range(20):
-        after: list[tuple[Tensor, Tensor]] = []
-        texts = messages(lambda s=state: after.append(dv.step(model, *s, force=-50.0 * s[1], **SOFT)))  # noqa: B023
-        assert all("x: this step ended with positions that are spread over" in t and "force:" in t for t in texts)
-        said += [k] * bool(texts)
-        state = after[0]
-    assert len(said) > 2 and said == list(range(said[0], 20))
-    assert messages(lambda: dv.step(model, x + 1e6, v, **SOFT)) == []  # far from the origin
 
 
 def test_a_flight_is_not_lost() -> None:
@@ -167,31 +132,3 @@ def test_what_rests_or_has_no_sweeps_to_judge_is_not_doubted(dtype: torch.dtype)
     end = dv.rollout(model, x, v, steps=60, save="last", check_energy=False, **many)
     for frames in (10, 40):
         assert messages(lambda n=frames: dv.rollout(model, end.x[-1], end.v[-1], steps=n, **SOFT)) == []
-
-
-def test_the_error_is_that_of_newtons_method_among_polynomials() -> None:
-    """Of a body that is moved as a whole from where the step converges, all of it is found."""
-    mesh = dv.mesh.box(3, 0.2)
-    model = dv.Model(mesh)
-    x = model.rest_points
-    converged = dv.solve(model, x, 0 * x, mu=1e4, lam=1e4, time_step=0.01, tolerance=1e-10).x
-    given = {"force": None, "gravity": (0.0, -9.81, 0.0), "prescribed": None, "colliders": None,
-             "colliders_before": None}  # fmt: skip
-    prepared = prepare(model, (), mu=1e4, lam=1e4, time_step=0.01, sweeps=1, rest_points=None, density=None,
-                       parameters=None)  # fmt: skip
-    away = torch.tensor([3e-4, 0.0, -4e-4], dtype=x.dtype)
-    found = unsolved(model, Solve(x, 0 * x, prepared, given), converged + away, {})
-    assert found is not None and abs(found.error / 5e-4 - 1) <= tolerance("closed_form")
-
-
-def test_bending_of_thin_tets_is_said_where_it_shows() -> None:
-    mesh = dv.mesh.sheet(10, 10, (0.3, 0.3), 2e-3)
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse="auto", relaxation=1.5)
-    x = model.rest_points
-    pull = torch.zeros(2, 3, dtype=x.dtype)
-    thin = int((x.amax(0) - x.amin(0)).argmin())
-    pull[0, thin], pull[1, 0] = -9.81, 9.81  # across the sheet, along it
-    for gravity, bends in zip(pull, (True, False), strict=True):
-        said = messages(lambda g=gravity: dv.rollout(model, x, 0 * x, steps=10, young=1e8, poisson=0.3, gravity=g,
-                                                     time_step=0.01, sweeps=10))  # fmt: skip
-        assert any("tets 24 times as wide as thick bend here" in text for text in said) == bends

@@ -1,6 +1,5 @@
 """Claim: a rollout that gains energy from nowhere says so, each time."""
 
-import re
 import warnings
 from typing import Any
 
@@ -63,26 +62,6 @@ def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
     assert {w.filename for w in found} == {__file__}
     for asked in (None, True):
         assert len(messages(lambda asked=asked: dv.rollout(model, x, v, steps=10, check_energy=asked, **STIFF))) == 1
-
-
-def test_the_scene_that_gains_most_is_named() -> None:
-    model, x, v = bent()
-    both = torch.stack([0 * v, v])
-    (said,) = messages(lambda: dv.rollout(model, x.expand_as(both), both, steps=10, check_energy=True, **STIFF))
-    gained = re.search(r"after step \d+ scene 1 has gained (\S+) % of", said)
-    assert gained is not None and float(gained[1]) > 5 and "e+" not in gained[1]
-
-
-def test_a_gain_out_of_next_to_nothing_is_said_in_joules() -> None:
-    # two bodies closer than dhat, without gravity: all energy comes from the barrier
-    lower = dv.mesh.cube(2, size=0.1)
-    model = dv.Model(dv.mesh.join([lower, lower.translate((0.01, 0.104, 0.01))]),
-                     energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=0.02)))  # fmt: skip
-    x = model.rest_points
-    (said,) = messages(lambda: dv.rollout(model, x, torch.zeros_like(x), steps=10, check_energy=True, gravity=(0, 0, 0),
-                                          **SOFT | {"mu": 1e5, "lam": 1e5}))  # fmt: skip
-    assert re.search(r"has gained \S+ J, where it had and gravity gave it \S+ J: ", said)
-    assert "take a smaller dhat" in said
 
 
 def test_what_helps_helps() -> None:

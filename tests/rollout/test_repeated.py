@@ -59,46 +59,6 @@ def test_state_of_its_own(kind: str, schedule: Any, device: str) -> None:
     assert_refused(end(model, force, schedule), p)
 
 
-def turned(k: int, like: Tensor) -> Tensor:
-    """Gravity along one axis after another: numbers that change places."""
-    return torch.eye(3, dtype=like.dtype, device=like.device)[k % 3]
-
-
-# of the number of the call, the positions and a weight
-VALUES: dict[str, tuple[str, Callable[[int, Tensor, Tensor], Any]]] = {
-    "a force on one vertex": ("force", lambda n, x, p: p * torch.nn.functional.one_hot(
-        x.new_tensor(3 + n % 5).long(), len(x)).to(x)[:, None].expand_as(x)),
-    "axes in turn": ("gravity", lambda n, x, p: p * turned(n, x)),
-    "numbers": ("gravity", lambda n, x, p: [0.0, -9.0 - n, 0.0]),
-    "an array": ("gravity", lambda n, x, p: np.array([0.0, -9.0 - n, 0.0])),
-    "a number of numpy": ("density", lambda n, x, p: np.float64(900.0 + n)),
-    "of two solves": ("prescribed", lambda n, x, p: tuple(
-        torch.where(x[:, :1] == 0, x + share * 1e-3 * p * n, torch.nan) for share in (1, 2))),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", VALUES)
-def test_values_of_any_kind(kind: str, device: str) -> None:
-    model = beam(device)
-    x, (name, value) = model.rest_points, VALUES[kind]
-    p, calls = x.new_tensor(1.0).requires_grad_(), 0
-
-    def function(k: int, now: Tensor, v: Tensor) -> Any:
-        nonlocal calls
-        calls += 1
-        return value(calls, x, p)
-
-    integrator = dv.SDIRK2() if name == "prescribed" else None
-    motion = dv.rollout(model, x, torch.zeros_like(x), steps=7, mu=1e5 * p, lam=1e5, time_step=0.01, sweeps=3,
-                        checkpoint_every=3, integrator=integrator, save="last", **{name: function})  # fmt: skip
-    loss = motion.x[-1, :, 1].sum()
-    if device == "cpu" or "number" in kind or kind == "an array":
-        with pytest.raises(RuntimeError, match=f"{name}: expected the same value for step"):
-            torch.autograd.grad(loss, p)
-    else:
-        assert torch.autograd.grad(loss, p)[0].isnan()
-
-
 @pytest.mark.parametrize("schedule", SCHEDULES, ids=str)
 def test_what_repeats_itself_passes(schedule: Any, device: str) -> None:
     """Dropout, whose random numbers torch keeps; None; infinite values are named as ever."""

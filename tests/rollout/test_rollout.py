@@ -260,31 +260,6 @@ def test_zero_steps_return_the_initial_state(device: str) -> None:
             assert torch.equal(slope, torch.ones_like(slope))
 
 
-def test_progress_goes_to_stderr_and_counts_each_step_once(capsys: pytest.CaptureFixture[str]) -> None:
-    scene = build_scene("plain")
-    call, leaves = leaves_of(scene.inputs())
-    trajectory = dv.rollout(
-        scene.model(), **call, steps=3, sweeps=1, progress=True, checkpoint_every=dv.BinomialCheckpoints(1)
-    )
-    torch.autograd.grad(trajectory.x.sum(), leaves, allow_unused=True)
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert [line for line in shown.err.replace("\n", "\r").split("\r") if line] == ["step 1/3", "step 2/3", "step 3/3"]
-    dv.rollout(scene.model(), **scene.inputs(), steps=3, sweeps=1)
-    assert capsys.readouterr().err == ""
-
-
-def test_inputs_are_untouched(device: str) -> None:
-    scene = build_scene("anchored")
-    model, inputs = scene.model(device), scene.inputs(device=device)
-    before = {k: t.clone() for k, t in inputs.items() if isinstance(t, Tensor)}
-    for _ in range(2):
-        trajectory = dv.rollout(model, **inputs, steps=3, sweeps=2)
-    assert torch.equal(trajectory.x[0], inputs["x"])
-    trajectory.x.zero_()
-    assert all(torch.equal(inputs[k].nan_to_num(), before[k].nan_to_num()) for k in before)  # NaN: not read
-
-
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [("steps", -1, ValueError), ("steps", 2.5, TypeError), ("steps", True, TypeError), ("save", "every", ValueError),
@@ -297,12 +272,6 @@ def test_bad_options_raise(name: str, value: Any, error: type[Exception]) -> Non
     options = scene.inputs() | {"steps": 2, "sweeps": 1, name: value}
     with pytest.raises(error, match=f"{name}: expected .*got"):
         dv.rollout(scene.model(), **options)
-
-
-@pytest.mark.parametrize(("value", "error"), [(0, ValueError), (-2, ValueError), (1.0, TypeError), (True, TypeError)])
-def test_binomial_wants_a_positive_count(value: Any, error: type[Exception]) -> None:
-    with pytest.raises(error, match="snapshots: expected .*got"):
-        dv.BinomialCheckpoints(value)
 
 
 # --- cost of a schedule -----------------------------------------------------------------------------------------------
@@ -345,33 +314,3 @@ def test_changing_an_argument_before_a_checkpointed_backward_raises(device: str,
         changed.mul_(2)
     with pytest.raises(RuntimeError, match="changed in place|modified by an inplace operation"):
         end.sum().backward()
-
-
-def test_a_force_on_a_pinned_vertex_reaches_nothing(device: str) -> None:
-    mesh = dv.mesh.cube(2)
-    model = dv.Model(mesh, pinned=[0], device=device)
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    force = torch.zeros_like(x)
-    force[0] = float("nan")
-    density = torch.tensor(1e3, dtype=x.dtype, device=device, requires_grad=True)
-    rest = model.rest_points.clone().requires_grad_()
-    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2, "density": density, "rest_points": rest}
-    end = dv.step(model, x, v, force=force, **options)[0]
-    grads = torch.autograd.grad(end.square().sum(), (density, rest))
-    clean = dv.step(model, x, v, force=torch.zeros_like(x), **options)[0]
-    for grad, expected in zip(grads, torch.autograd.grad(clean.square().sum(), (density, rest)), strict=True):
-        assert torch.equal(grad, expected) and bool(expected.any())
-
-
-def test_what_is_not_differentiated_raises() -> None:
-    model = dv.Model(dv.mesh.cube(2))
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    with pytest.raises(TypeError, match="time_step: .*not differentiable"):
-        dv.step(model, x, v, mu=1.0, lam=1.0, time_step=torch.tensor(0.01, requires_grad=True), sweeps=1)
-
-
-def test_the_old_name_of_binomial_checkpoints_works() -> None:
-    with pytest.warns(DeprecationWarning, match="BinomialCheckpoints"):
-        assert dv.Binomial is dv.BinomialCheckpoints  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(AttributeError, match="Trinomial"):
-        _ = dv.Trinomial  # pyright: ignore[reportAttributeAccessIssue]

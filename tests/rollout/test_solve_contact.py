@@ -7,8 +7,7 @@ import torch
 from helpers.two_boxes import ball, two_boxes
 
 import diffvbd as dv
-from diffvbd.mesh import box
-from diffvbd.testing import contact_scenes, relative_error, tolerance
+from diffvbd.testing import contact_scenes, tolerance
 
 SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.005}
 
@@ -61,34 +60,6 @@ def test_its_derivative_is_that_of_the_executed_sweeps(device: str) -> None:
     stepped = gradients(lambda **options: dv.step(model, sweeps=found.sweeps, **options)[0])
     for name, a, b in zip(leaves, solved, stepped, strict=True):
         assert torch.equal(a, b) and a.any(), name
-
-
-def test_friction_on_a_floor_without_pairs(device: str) -> None:
-    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.01, kappa=2e3, damping=3.0), dv.Friction(0.3, 0.05))
-    model = dv.Model(box(2, 0.2), energies=energies, device=device)
-    x = model.rest_points
-    v = torch.full_like(x, 0.1)
-    goal = tolerance("conjugate_gradients")
-    done = dv.solve(model, x, v, tolerance=goal, **SOFT)
-    told = dv.diagnose(model, done.x, previous=(x, v), warn=False, **SOFT)
-    assert told.residuals is not None and told.residuals.shape == (1,) and float(told.residuals) <= goal
-    assert told.friction_residuals is not None and float(told.friction_residuals) <= tolerance("closed_form")
-    assert dv.contact.forces(model, done.x, previous=(x, v), time_step=0.005).floors.tangential[0, 0, 0] < -0.1
-
-
-def test_float32_converges_to_its_rounding() -> None:
-    model, given = pushed(dtype=torch.float32)
-    done = dv.solve(model, tolerance=1e-7, **given, **SOFT)
-    assert done.converged
-    double, wide = pushed()
-    expected = dv.solve(double, tolerance=1e-11, **wide, **SOFT)
-    assert relative_error(done.x.double(), expected.x) <= tolerance("float32_forward")
-
-
-def test_no_scenes() -> None:
-    model, given = pushed()
-    none = {k: given[k][:0] for k in ("x", "v")}
-    assert dv.solve(model, **none, **SOFT).converged
 
 
 def test_a_step_that_bounds_cut_short_does_not_converge_and_says_so() -> None:

@@ -43,15 +43,6 @@ def test_advice_looks_between_the_steps() -> None:
     assert float((end(settings.steps(DURATION)) - exact).norm()) < 0.2 * float(exact.norm())
 
 
-def test_a_budget_says_so() -> None:
-    model, x, force = beam()
-    given = {"mu": 1e5, "lam": 1e5, "duration": DURATION, "sweeps": 5}
-    for steps, told in ((4, True), (32, False)):
-        budget = dv.error_budget(model, x, 0 * x, time_step=DURATION / steps, force=force, **given)
-        (share,) = (s for s in budget.shares if s.cause == "time step")
-        assert ("whose steps do not see how force swings" in share.note) == told
-
-
 @pytest.mark.parametrize(
     ("function", "steps", "moves", "is_seen"),
     [
@@ -106,27 +97,6 @@ def test_an_integral_does_the_same_for_an_edge_of_no_length() -> None:
 
     for share in released(impulses):
         assert float(share) == pytest.approx(1.0, rel=tolerance("contact_motion"))
-
-
-def test_who_chooses_steps_takes_the_mean_over_them() -> None:
-    """In dv.refine, error_budget and advise the mean is that over the steps they take."""
-    model, x, _ = beam()
-    asked: set[float] = set()
-
-    def push(t: float) -> Tensor:
-        asked.add(round(t, 9))
-        return torch.full_like(x, 0.01)
-
-    force = dv.step_average(push, samples=2)
-    given: dict[str, Any] = {"mu": 1e5, "lam": 1e5}
-    loss = lambda: dv.rollout(model, x, 0 * x, steps=2, time_step=0.04, sweeps=9, force=force, **given).x[-1].sum()  # noqa: E731
-    constant = dv.rollout(model, x, 0 * x, steps=2, time_step=0.04, sweeps=9, force=push(0.01), **given).x[-1].sum()
-    assert float(loss()) == pytest.approx(float(constant), rel=tolerance("sum"))
-    assert asked == {0.01, 0.03, 0.05, 0.07}
-    dv.refine(loss)
-    assert asked == {0.01, 0.03, 0.05, 0.07, 0.005, 0.015, 0.025, 0.035, 0.045, 0.055, 0.065, 0.075}
-    budget = dv.error_budget(model, x, 0 * x, duration=0.08, time_step=0.02, sweeps=5, force=force, **given)
-    assert 0.00125 in asked and 0 < budget.total < 1  # a quarter of a step of its finest run
 
 
 @pytest.mark.parametrize(

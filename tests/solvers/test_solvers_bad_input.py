@@ -5,7 +5,6 @@ Values are looked at on the CPU."""
 import re
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -104,22 +103,8 @@ def test_what_is_not_used_may_be_anything() -> None:
     assert all(torch.equal(*pair) and pair[0].any() for pair in zip(found, expected, strict=True))
 
 
-def test_a_number_of_points_of_numpy() -> None:
-    for solver in (XPBD(np.int64(8), [[0, 1]], 2.0), ProjectiveDynamics(np.int64(8), 2.0)):
-        assert solver.num_points == 8 and type(solver.num_points) is int and solver.rest_points is None
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_cuda_where_there_is_none() -> None:
     for kind in (XPBD, ProjectiveDynamics):
         with pytest.raises(RuntimeError, match="^diffvbd: .*CUDA"):
             kind.from_mesh(MESH, device="cuda")
-
-
-@pytest.mark.parametrize("kind", [XPBD, ProjectiveDynamics])
-def test_constants_have_no_gradient(kind: Any) -> None:
-    for name in ("points", "mass"):
-        given = {"points": X, "mass": torch.full((8,), 2.0, dtype=torch.float64), "edges": [[0, 1]]}
-        given[name] = given[name].clone().requires_grad_()
-        with pytest.raises(TypeError, match=f"^{name}: expected a number, got a tensor that requires grad"):
-            kind(**given)

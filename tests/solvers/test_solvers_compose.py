@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd import solvers
 from diffvbd.solvers import BlockUpdate, Update, compose
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -116,18 +115,6 @@ def test_a_wrong_vjp_is_seen() -> None:
     assert relative_error(found["a"], expected["a"]) > 1e-2
 
 
-def test_scenes_share_parameters_or_have_their_own() -> None:
-    shared = system(batch=(2, 3))
-    found, expected = (gradients(run, shared) for run in (gauss_seidel(3), unrolled(3)))
-    assert_equal(found, expected)
-    assert found["a"].shape == (7, 7) and found["b"].shape == (7,)
-    own = shared | {"b": rand(2, 3, 7, key="own")}
-    assert gradients(gauss_seidel(3), own)["b"].shape == (2, 3, 7)
-    kept = shared | {"b": rand(2, 1, 7, key="kept")}
-    each = gradients(gauss_seidel(3), kept | {"b": kept["b"].expand(2, 3, 7)})
-    assert_equal(gradients(gauss_seidel(3), kept), each | {"b": each["b"].sum(1, keepdim=True)})
-
-
 # --- sequences of the user's own --------------------------------------------------------------------------------------
 
 
@@ -183,63 +170,6 @@ def test_finite_differences() -> None:
     )  # fmt: skip
 
 
-def test_function_with_its_own_vjp_and_one_tensor() -> None:
-    def scaled(state: tuple, parameters: tuple) -> Tensor:
-        return parameters[0] * state[0][..., :2, :]
-
-    def scaled_vjp(state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
-        bar = torch.zeros_like(state[0])
-        bar[..., :2, :] = parameters[0] * rows_bar[0]
-        return (bar,), ((state[0][..., :2, :] * rows_bar[0]).sum(),)
-
-    x, p = rand(4, 3), torch.tensor(0.7, dtype=torch.float64)
-    results = []
-    for vjp in (None, scaled_vjp):
-        solver = compose([Update(scaled, slice(0, 2), vjp=vjp)])
-        results.append(gradients(lambda x, p, s=solver: s(x, p, sweeps=3), {"x": x, "p": p}))
-    assert_equal(results[1], results[0])
-
-
-@pytest.mark.parametrize("vjp", [None, "by hand"])
-def test_rows_that_are_views_of_the_state(vjp: Any) -> None:
-    """What an update returns is what the state was before it, however the rows are written."""
-
-    def exchange(state: tuple, parameters: tuple) -> tuple:
-        return state[1][..., :2, :], state[0][..., :2, :]
-
-    def exchange_vjp(state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
-        bars = [torch.zeros_like(t) for t in state]
-        bars[0][..., :2, :], bars[1][..., :2, :] = rows_bar[1], rows_bar[0]
-        return tuple(bars), ()
-
-    def exchanged(x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.cat((z[:2], x[2:])), torch.cat((x[:2], z[2:]))
-
-    update = Update(exchange, (slice(2), slice(2)), vjp=exchange_vjp if vjp else None)
-    inputs = {"x": rand(3, 3), "z": rand(3, 3, key="z")}
-    found = gradients(lambda x, z: compose([update])((x, z), sweeps=1), inputs)
-    assert_equal(found, gradients(exchanged, inputs), bar=0.0)
-    twice = gradients(lambda x, z: compose([update])((x, z), sweeps=2), inputs)
-    assert_equal(twice, gradients(lambda x, z: (x + 0, z + 0), inputs), bar=0.0)
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x: x[..., 1:4, :],  # overlaps the rows that it is written to
-        lambda x: x[..., :3, :].flip(-2),
-        lambda x: x[..., :1, :].expand(3, 3),  # overlaps itself
-        lambda x: x[..., :3, :].mT,
-    ],
-    ids=["shifted", "flipped", "expanded", "transposed"],
-)
-def test_rows_that_overlap_what_they_replace(function: Any) -> None:
-    inputs = {"x": rand(4, 3)}
-    solver = compose([Update(lambda state, parameters: function(state[0]), slice(3))])
-    found = gradients(lambda x: solver(x, sweeps=1), inputs)
-    assert_equal(found, gradients(lambda x: torch.cat((function(x), x[3:])), inputs), bar=tolerance("composed"))
-
-
 # --- tape, copies, refusals -------------------------------------------------------------------------------------------
 
 
@@ -261,28 +191,6 @@ def test_the_tape_holds_rows_only() -> None:
     assert len(saved) == 1 + 2 * sweeps
     out.sum().backward()
     assert x.grad is not None and torch.equal(x.grad, torch.ones_like(x))
-
-
-def test_inputs_stay_and_backwards_repeat() -> None:
-    updates, _ = chain()
-    inputs = chain_inputs()
-    before = {name: t.clone() for name, t in inputs.items()}
-    leaves = {name: t.requires_grad_() for name, t in inputs.items()}
-    x, z = compose(updates)((leaves["x"], leaves["z"]), (leaves["p"], leaves["q"]), sweeps=3)
-    end = x.detach().clone()
-    loss = (x**2).sum() + z.sum()
-    once, twice = (torch.autograd.grad(loss, list(leaves.values()), retain_graph=True) for _ in range(2))
-    assert all(torch.equal(a, b) and a.any() for a, b in zip(once, twice, strict=True))
-    assert all(torch.equal(leaves[name], before[name]) for name in leaves) and torch.equal(x, end)
-
-
-def test_only_what_is_asked_for_gets_a_gradient() -> None:
-    given = system()
-    wanted = given["b"].requires_grad_()
-    out = gauss_seidel(2)(given["x"], given["a"], wanted)
-    out.sum().backward()
-    assert wanted.grad is not None and wanted.grad.any() and given["a"].grad is None and given["x"].grad is None
-    assert not gauss_seidel(2)(given["x"], given["a"], given["b"].detach()).requires_grad
 
 
 def test_float32() -> None:
@@ -354,7 +262,3 @@ def test_a_vjp_of_the_wrong_shape_is_named(bars: Any, message: str) -> None:
     out = compose([Update(same, slice(1), vjp=lambda *_: bars)])(x, sweeps=1)
     with pytest.raises((ValueError, TypeError), match=message):
         out.sum().backward()
-
-
-def test_names_are_exported() -> None:
-    assert all(getattr(solvers, name).__doc__ for name in solvers.__all__)

@@ -94,39 +94,3 @@ def test_views_of_what_has_changed_are_refused_too() -> None:
     solver.mass.mul_(2)  # None stands for it
     with pytest.raises(ValueError, match="mass: expected the values that were factored"):
         solver.step(**state(), factor=factor, sweeps=1)
-
-
-def test_a_factor_of_inference_tensors() -> None:
-    """They have no versions, by which a change is told elsewhere."""
-    solver = body()
-    given = constants(solver)
-    with torch.inference_mode():
-        own = {name: 1 * value for name, value in given.items()}
-        factor = solver.factor(time_step=H, **own)
-        found = solver.step(**state(), factor=factor, sweeps=2)
-        own["stiffness"].mul_(2)
-        with pytest.raises(ValueError, match="stiffness: expected the values that were factored"):
-            solver.step(**state(), factor=factor, sweeps=2)
-    expected = solver.step(**state(), time_step=H, **given, sweeps=2)
-    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
-
-
-def test_changes_that_go_unnoticed_mix_nothing(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on CUDA, where a look at values would wait: forward and gradient are those of the old values."""
-    solver = body(device)
-    given = constants(solver)
-    leaf = given["stiffness"].clone().requires_grad_()
-    factor = solver.factor(time_step=H, **(given | {"stiffness": leaf}))
-    monkeypatch.setattr(type(factor.given[0]), "moved", lambda self: False)
-    results = []
-    for _ in range(2):
-        end, _ = solver.step(**state(device), factor=factor, sweeps=3)
-        results.append((end.detach(), *torch.autograd.grad((end**2).sum(), leaf, retain_graph=True)))
-        leaf.data.mul_(5)
-    assert all(torch.equal(*pair) and pair[0].any() for pair in zip(*results, strict=True))
-
-
-def test_a_factor_of_another_network_is_refused() -> None:
-    factor = body().factor(time_step=H, stiffness=1e3, tet_stiffness=1e4)
-    with pytest.raises(ValueError, match="factor: expected one that this solver has made, got one of another solver"):
-        body().step(**state(), factor=factor, sweeps=1)

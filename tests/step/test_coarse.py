@@ -148,25 +148,6 @@ def test_transforms_are_refused() -> None:
         torch.func.vmap(lambda y: dv.step(model, y, torch.zeros_like(y), sweeps=2, **given)[0])(torch.stack([x, x]))
 
 
-def test_corrections_of_a_step() -> None:
-    """One sweep, a correction, three sweeps, a correction, ..."""
-    space = dv.CoarseSpace()
-    assert [space.corrections(n) for n in (0, 1, 2, 4, 5, 7, 8)] == [1, 1, 1, 1, 2, 2, 3]
-    model, given = cantilever(coarse=space)
-    with dv.coarse.record() as lengths:
-        end(model, given, 8, steps=2)
-    assert [t.shape for t in lengths] == [(1, 3, 1)] * 2 and all((t == 1).all() for t in lengths)
-
-
-def test_autocast_leaves_the_precision_alone() -> None:
-    """It would take float32 products in half of it; moduli of each tet go through such products."""
-    model, given = cantilever(coarse="auto", relaxation=1.5, dtype=torch.float32)
-    moduli = {name: torch.linspace(1, 2, model.num_tets) * given[name] for name in ("mu", "lam")}
-    usual = end(model, given | moduli, 4, steps=2)
-    with torch.autocast("cpu"):
-        assert torch.equal(end(model, given | moduli, 4, steps=2), usual)
-
-
 def test_no_more_functions_than_asked_for() -> None:
     thin, thick = dv.mesh.box((6, 6, 2), (1.0, 1.0, 0.01)), dv.mesh.box((5, 5, 5), (1.0, 1.0, 1.0))
     for mesh in (thin, thick):
@@ -191,12 +172,3 @@ def test_a_refused_correction_leaves_no_trace() -> None:
     assert (lengths[0][..., 0] == 0).any() and (lengths[0][..., 1] > 0).all(), lengths
     bars = torch.autograd.grad(x_end.sum() + v_end.square().sum(), (x, mu))
     assert all(torch.isfinite(t).all() for t in (x_end, v_end, *bars)) and bars[0].abs().max() > 0
-
-
-def test_no_scenes_at_all() -> None:
-    model, given = cantilever(coarse="auto")
-    x = torch.zeros((0, model.num_vertices, 3), dtype=torch.float64)
-    mu = torch.tensor(1e6, dtype=torch.float64, requires_grad=True)
-    end, _ = dv.step(model, x, x, sweeps=4, rest_points=model.rest_points, density=1e3, **given | {"mu": mu})
-    (bar,) = torch.autograd.grad(end.sum(), mu)
-    assert end.shape == x.shape and bar == 0

@@ -10,7 +10,6 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import colliders
-from diffvbd.testing import relative_error, tolerance
 
 SECOND = (dv.SDIRK2(), dv.BDF2())
 EVERY = (dv.ImplicitEuler(), *SECOND)
@@ -52,18 +51,6 @@ def test_a_history_is_checked_like_a_state(way: str, name: str, change: Any, got
     x1, v1, history = dv.step(model, x, v, integrator=dv.BDF2(), **STEP)
     wrong = history._replace(**change(history))
     raises(lambda: taken(model, x1, v1, way, integrator=dv.BDF2(), history=wrong), name, got)
-
-
-def test_a_history_goes_on_with_a_time_step_that_rounding_has_changed() -> None:
-    """Durations of 0.7 s and 0.1 s in steps of 0.1 s differ in the last digit of a step."""
-    model, x, v = held()
-    settings = dv.Settings(0.1, 3, dv.BDF2())
-    begun = dv.rollout(model, x, v, duration=0.7, settings=settings, mu=1e4, lam=1e4)
-    assert begun.history is not None and begun.history.time_step != 0.1
-    on = dv.rollout(model, begun.x[-1], begun.v[-1], duration=0.1, settings=settings, history=begun.history, mu=1e4,
-                    lam=1e4)  # fmt: skip
-    whole = dv.rollout(model, x, v, duration=0.8, settings=settings, mu=1e4, lam=1e4)
-    assert relative_error(on.x[-1], whole.x[-1]) <= tolerance("cancelling")
 
 
 def test_the_time_step_of_a_history_is_a_number() -> None:

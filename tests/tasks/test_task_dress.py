@@ -1,6 +1,5 @@
 """Claim: the drape and the first frames of a dress give its Lame parameters, from vertices and from its outline."""
 
-import warnings
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,6 @@ import torch
 from helpers.marks import slow
 from helpers.task_checks import check_fall, check_gradient
 
-from diffvbd.tasks import TASKS, Settings, dress, dress_mu_lam
 from diffvbd.tasks.dress_silhouette import SOFTNESS, profile
 from diffvbd.testing import tolerance
 
@@ -30,23 +28,6 @@ def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
 def test_gradient_matches_central_differences(name: str, stage: int, tmp_path: Path) -> None:
     # limits and closest points have kinks; differences step over some
     check_gradient(name, tmp_path, step=1e-6, rel=tolerance("kinked_difference"), stage=stage)
-
-
-def test_stages_alternate_and_each_objective_moves_one_parameter(tmp_path: Path) -> None:
-    problem = dress_mu_lam.problem(Settings(tmp_path, quick=True))
-    first, *rest = problem.stages
-    assert first.moves is None
-    assert [stage.moves for stage in rest] == [("log_mu",), ("log_lam",)] * (len(rest) // 2)
-    alone = dress.problem("dress-mu-lam", Settings(tmp_path, quick=True), lambda frames: frames, alone=True)
-    assert [stage.name for stage in alone.stages] == [stage.name for stage in rest]
-
-
-@pytest.mark.parametrize("name", ["dress-mu-lam", "dress-size"])
-def test_few_sweeps_of_a_coarse_dress_are_no_news(name: str, tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        problem = TASKS[name].build(Settings(tmp_path, quick=True))
-        problem.stages[0].loss()
 
 
 def around(radius: torch.Tensor, heights: torch.Tensor, turn: float = 0.0) -> torch.Tensor:

@@ -10,10 +10,8 @@ import torch
 from helpers.task_checks import check_fall, check_gradient
 
 import diffvbd as dv
-from diffvbd import viz
-from diffvbd.mesh.tet_mesh import boundary_faces
 from diffvbd.tasks import Settings, fit_real_mesh
-from diffvbd.tasks.fit_real_mesh import HEIGHT, HELD, TRACTION, neighbors, pulls, scaled
+from diffvbd.tasks.fit_real_mesh import HEIGHT, scaled
 from diffvbd.testing import tolerance
 
 BODY = scaled(dv.mesh.bunny(8), HEIGHT)
@@ -63,28 +61,6 @@ def test_weight_falls_until_the_misfit_is_that_of_the_noise(tmp_path: Path) -> N
     assert lowered.tolist() == [0, 0, 1, 0, 0]
 
 
-def test_neighbors_are_all_inner_faces() -> None:
-    first, second, _ = neighbors(BODY)
-    assert 2 * len(first) + len(BODY.surface) == 4 * BODY.num_tets
-    assert all(len(np.intersect1d(*BODY.tets[[i, j]])) == 3 for i, j in zip(first, second, strict=True))
-    # six tets about the diagonal of a cube: a face has an edge, the diagonal of a side and that of the cube
-    _, _, area = neighbors(dv.mesh.cube(2, size=0.5, split="kuhn"))
-    assert area == pytest.approx(6 * [0.5 * 0.5 * 0.5 * math.sqrt(2)])
-
-
-def test_pulls_spread_and_spare_what_is_held() -> None:
-    force = pulls(BODY, 5)
-    assert force.shape == (5, BODY.num_vertices, 3)
-    assert not force[:, BODY.points[:, 1] <= HELD * HEIGHT].any()
-    pulled = np.linalg.norm(force, axis=2) > 0
-    assert pulled.any(1).all() and (np.unique(pulled, axis=0).shape[0] == 5)
-    assert pulled[0, BODY.points[:, 1].argmax()]
-    # what is pulled with the traction can be no more than the surface
-    a, b, c = BODY.points[BODY.surface].transpose(1, 0, 2)
-    total = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-    assert (np.linalg.norm(force.sum(1), axis=1) < 0.3 * TRACTION * total).all()
-
-
 def test_mesh_of_a_file(tmp_path: Path) -> None:
     file = tmp_path / "big.mesh"
     dv.mesh.save(file, BODY.transform(7.0 * np.eye(3)).translate([1.0, 2.0, 3.0]))
@@ -104,19 +80,3 @@ def test_mesh_of_a_file(tmp_path: Path) -> None:
     if importlib.util.find_spec("pytetwild") is None:
         with pytest.raises(ImportError, match="pytetwild"):
             fit_real_mesh.problem(Settings(tmp_path), mesh=surface)
-
-
-def test_map_of_a_field(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    triangles, owner = boundary_faces(BODY.tets, BODY.num_vertices)
-    assert (triangles == BODY.surface).all()
-    assert all(np.isin(t, BODY.tets[k]).all() for t, k in zip(triangles, owner, strict=True))
-    mu = np.geomspace(1.0, 2.0, BODY.num_tets)
-    picture = tmp_path / "map.png"
-    viz.field(picture, BODY.points, BODY.tets, {"mu": mu}, "mu [Pa]", ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    assert picture.stat().st_size > 10_000
-    for wrong in (mu[1:], -mu, mu * np.nan):
-        with pytest.raises(ValueError, match=r"values: expected 794 positive numbers in 'mu'"):
-            viz.field(picture, BODY.points, BODY.tets, {"mu": wrong})
-    with pytest.raises(ValueError, match="cut: expected tets behind the plane"):
-        viz.field(picture, BODY.points, BODY.tets, {"mu": mu}, cut=((0.0, -1.0, 0.0), (0.0, 1.0, 0.0)))

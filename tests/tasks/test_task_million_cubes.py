@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from helpers.task_checks import check_fall, check_gradient, quick, timeless
 
 from diffvbd.tasks import Settings, million_cubes, solve
-from diffvbd.tasks.million_cubes import RADIUS, RING_SPACING, is_near, launch_pad, matched, ring
+from diffvbd.tasks.million_cubes import RADIUS, is_near
 from diffvbd.testing import tolerance
 
 NAME = "million-cubes"
@@ -25,31 +24,6 @@ def test_quick_run_brings_bodies_to_their_places(tmp_path: Path) -> None:
 def test_gradient_matches_central_differences(stage: int, tmp_path: Path) -> None:
     # the gradient of the material is tiny beside that of the velocity: differences of it have few digits
     check_gradient(NAME, tmp_path, step=1e-4, rel=tolerance("coarse_difference"), stage=stage)
-
-
-def test_bodies_that_overlap_change_the_gradient_of_each_other(tmp_path: Path) -> None:
-    problem, _ = quick(NAME, tmp_path)
-    velocity = problem.parameters["velocity"]
-    with torch.no_grad():
-        velocity.copy_(-5.0 * torch.from_numpy(launch_pad(64)))  # all towards the axis
-    gradients = []
-    for stage in problem.stages:
-        assert stage.before is not None
-        stage.before(0)
-        (gradient,) = torch.autograd.grad(stage.loss(), velocity)
-        gradients.append(gradient)
-    assert (gradients[0] - gradients[1]).abs().max().item() > 0.01 * gradients[0].abs().max().item()
-
-
-def test_steps_after_the_target_change_nothing(tmp_path: Path) -> None:
-    found = []
-    for steps in (120, 130):
-        problem = million_cubes.problem(Settings(tmp_path), bodies=8, steps=steps)
-        problem.stages[0].loss().backward()
-        velocity = problem.parameters["velocity"]
-        assert velocity.grad is not None and velocity.grad.abs().min(0).values[1].item() > 0.0
-        found.append((problem.estimates(), velocity.grad))
-    assert found[0][0] == found[1][0] and torch.equal(found[0][1], found[1][1])
 
 
 def test_an_interrupted_run_continues_in_the_second_stage(tmp_path: Path) -> None:
@@ -71,17 +45,6 @@ def test_an_interrupted_run_continues_in_the_second_stage(tmp_path: Path) -> Non
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "parts", 2)
     assert run(tmp_path / "parts", None) == whole
-
-
-@pytest.mark.parametrize("bodies", [1, 17, 1000])
-def test_places_are_distinct_and_do_not_overlap(bodies: int) -> None:
-    for places in (launch_pad(bodies), ring(bodies, 1.77)):
-        assert places.shape == (bodies, 3)
-        assert len(np.unique(places.round(9), axis=0)) == bodies
-    assert RING_SPACING > RADIUS
-    mixed = matched(ring(bodies, 1.77), np.random.default_rng(0))
-    assert sorted(map(tuple, mixed)) == sorted(map(tuple, ring(bodies, 1.77)))
-    assert bodies < 1000 or abs(ring(bodies, 1.77).mean(0) - [0.0, 1.77, 0.0]).max() < 0.2 * RING_SPACING
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

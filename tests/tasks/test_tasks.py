@@ -93,32 +93,6 @@ def test_a_loss_that_is_not_finite_is_reported(tmp_path: Path) -> None:
         solve(problem, settings)
 
 
-def test_twist_turns_the_free_end_and_keeps_the_clamped_one() -> None:
-    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 2.0], [4.0, 0.0, 0.0], [4.0, 2.0, 2.0]], dtype=torch.float64)
-    turned = beam_mu.twisted(points, torch.pi)
-    expected = points[[0, 1, 3, 2]].clone()
-    expected[2:, 0] = 4.0
-    torch.testing.assert_close(turned, expected, rtol=0, atol=tolerance("formula"))
-
-
-def test_huber_is_quadratic_then_linear_with_a_finite_gradient() -> None:
-    x = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.0, 0.4], [3.0, 4.0, 0.0]], dtype=torch.float64, requires_grad=True)
-    loss = losses.huber(x, torch.zeros(3, dtype=torch.float64), delta=1.0)
-    assert loss.item() == pytest.approx((0.0 + 0.125 + 4.5) / 3)
-    loss.backward()
-    expected = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.0, 0.4], [0.6, 0.8, 0.0]], dtype=torch.float64) / 3
-    torch.testing.assert_close(x.grad, expected)
-    with pytest.raises(ValueError, match="delta: expected a finite number > 0 m, got 0"):
-        losses.huber(x, x, 0.0)
-
-
-def test_center_of_mass_weighs_by_mass() -> None:
-    x = torch.tensor([[[0.0, 0.0, 0.0], [4.0, 0.0, 8.0]]], dtype=torch.float64)
-    center = losses.center_of_mass(x, torch.tensor([3.0, 1.0], dtype=torch.float64))
-    assert center.tolist() == [[1.0, 0.0, 2.0]]
-    assert losses.vertex_distance(center, torch.zeros(3)).item() == 5.0
-
-
 @pytest.mark.parametrize(
     ("loss", "kind", "says"),
     [
@@ -135,19 +109,6 @@ def test_center_of_mass_weighs_by_mass() -> None:
 def test_losses_name_what_does_not_fit(loss: Callable[[torch.Tensor], object], kind: type, says: str) -> None:
     with pytest.raises(kind, match=says):
         loss(torch.zeros(4, 3))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(TASKS))
-def test_two_runs_have_the_same_numbers(name: str, tmp_path: Path) -> None:
-    histories = []
-    for k in range(2):
-        problem, settings = quick(name, tmp_path / str(k))
-        for stage in problem.stages:
-            stage.iterations = min(stage.iterations, 5)
-        histories.append(timeless(solve(problem, settings).history))
-    assert histories[0] == histories[1]
-    assert histories[0][0]["loss"] != histories[0][-1]["loss"] != 0.0
 
 
 @pytest.mark.cuda
