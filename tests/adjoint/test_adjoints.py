@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.marks import slow
 from helpers.spreads import beyond
 from torch import Tensor
 
@@ -38,7 +39,7 @@ def scene_on(device: str, case: str, kind: str = "structured") -> tuple[dv.Model
     return scene.model(device), scene.inputs(device=device)
 
 
-@pytest.mark.parametrize("sweeps", (0, 1, 5))
+@pytest.mark.parametrize("sweeps", (0, 1, slow(5)))
 @pytest.mark.parametrize(("case", "kind"), SCENES)
 def test_unrolled_is_the_reverse_sweep(device: str, case: str, kind: str, sweeps: int) -> None:
     model, inputs = scene_on(device, case, kind)
@@ -106,8 +107,9 @@ def test_what_a_step_keeps_does_not_grow_with_the_sweeps(device: str) -> None:
     assert kept[0] == kept[1] > 0
 
 
-@pytest.mark.parametrize("schedule", (None, 2, dv.BinomialCheckpoints(1)), ids=str)
-@pytest.mark.parametrize("adjoint", [dv.Unrolled(), *GLOBAL], ids=("unrolled", "assembled", "matrix-free"))
+@pytest.mark.parametrize(
+    ("adjoint", "schedule"), [(dv.Unrolled(), 2), (GLOBAL[0], dv.BinomialCheckpoints(1)), (GLOBAL[1], None)]
+)
 def test_a_rollout_is_its_steps_under_every_schedule(device: str, adjoint: Any, schedule: Any) -> None:
     model, inputs = scene_on(device, "batch")
 
@@ -255,6 +257,7 @@ def test_scenes_without_anything_to_solve(device: str, adjoint: Any) -> None:
     assert end.shape == x.shape and torch.autograd.grad(end.sum(), x)[0].shape == x.shape
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [dv.Unrolled(), dv.GlobalAdjoint(tolerance=1e-6)], ids=("unrolled", "global"))
 def test_float32(device: str, adjoint: Any) -> None:
     scene = build_scene("anchored", "delaunay")

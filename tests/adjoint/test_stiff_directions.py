@@ -29,7 +29,7 @@ def check(device: str, scene: limits.Scene, sweeps: int) -> None:
             assert error <= allowed, f"{tape}, {name}: {error:.1e}, allowed {allowed:.1e}"
 
 
-@pytest.mark.parametrize("gap", quick_and_slow((max(limits.GAPS), min(limits.GAPS)), limits.GAPS))
+@pytest.mark.parametrize("gap", quick_and_slow((min(limits.GAPS),), limits.GAPS))
 def test_an_oblique_plane(device: str, gap: float) -> None:
     for sweeps, normal in zip((1, 3, 3, 1), limits.NORMALS, strict=True):
         check(device, limits.oblique(gap, (normal,)), sweeps)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import DEVICES
-from helpers.marks import slow
+from helpers.marks import quick_and_slow, slow
 from helpers.spreads import assert_near_contact
 from helpers.touching import pressed, rebuilt, stack
 from torch import Tensor
@@ -41,13 +41,14 @@ def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("steps", "sweeps", "window"), [(1, 7, None), slow(1, 9, 2), slow(3, 6, None)])
-@pytest.mark.parametrize("name", list(SCENES))
+@pytest.mark.parametrize("name", quick_and_slow(("obstacles", "batched", "thrown"), SCENES))
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, window: int | None,
                                                   device: str) -> None:  # fmt: skip
     lengths = check(corrected(name, window), steps, sweeps, device)
     assert (lengths == 1).any() or name in ("fast", "thrown")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_gradients_of_shortened_and_refused_corrections(device: str) -> None:
     scene = corrected("batched")

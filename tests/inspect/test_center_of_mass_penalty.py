@@ -242,6 +242,7 @@ def test_bad_input(changes: dict[str, Any], error: type[Exception], message: str
 # --- inside torch -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_compile(device: str) -> None:
     """In one graph; without a look at the number of pairs, too little room turns every force into NaN."""
     torch._dynamo.reset()

@@ -125,6 +125,7 @@ def test_bad_input(given, error, text) -> None:
         dv.advise(model, x, torch.zeros_like(x), **{"duration": 0.1, **material} | given)
 
 
+@pytest.mark.slow
 def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
     """In long steps a cube that meets another one loses its rebound, and runs of h and h/2 agree on that."""
     one = mesh.box(2, 0.1, split="kuhn")
@@ -141,6 +142,7 @@ def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
     assert a.x is not None and b.x is not None and runs.apart(a.x, b.x) <= 0.2
 
 
+@pytest.mark.slow
 def test_a_bounce_that_steps_resolve() -> None:
     """Contact converges with the second power of h once steps resolve it: 1 % can be had, and is kept."""
     body = mesh.box(2, 0.1, split="kuhn").translate((0, 4e-3, 0))

@@ -45,6 +45,7 @@ def test_converged_steps_on_a_floor_are_held_against_converged_ones(monkeypatch:
     assert "of its forces unbalanced" in shares(none)["sweeps"].note
 
 
+@pytest.mark.slow
 def test_long_steps_are_the_cause() -> None:
     model, x, v = cantilever()
     budget = dv.error_budget(model, x, v, time_step=1 / 100, sweeps=400, quantity=lambda x, v: x[-1, 1], **SCENE)

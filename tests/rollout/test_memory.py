@@ -158,7 +158,7 @@ ROLLOUTS = [
 
 
 ROLLOUTS_OF = [(*case, True) for case in ROLLOUTS] + [(*case, False) for case in ROLLOUTS if case[0] == "recompute"]
-ROLLOUTS_OF = [slow(*case) if case[1] == 40 else case for case in ROLLOUTS_OF]
+ROLLOUTS_OF = [slow(*case) if case[1] >= 24 else case for case in ROLLOUTS_OF]
 
 
 @pytest.mark.parametrize(("tape", "steps", "schedule", "save", "pinned"), ROLLOUTS_OF)
@@ -194,6 +194,7 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
         assert_near(predicted["kept"], held)
 
 
+@pytest.mark.slow
 def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
     model = beam_model()
     x = model.rest_points.clone()

@@ -277,7 +277,7 @@ def test_bad_options_raise(name: str, value: Any, error: type[Exception]) -> Non
 # --- cost of a schedule -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("steps", "snapshots"), [(10, 1), (12, 2), (20, 3), (40, 4), (35, 3)])
+@pytest.mark.parametrize(("steps", "snapshots"), [(10, 1), (12, 2), (20, 3)])
 def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -> None:
     """No step runs forward more than 1 + t times, t the least number with C(snapshots + t, t) >= steps."""
     from math import comb

@@ -25,6 +25,7 @@ def beam() -> tuple[dv.Model, Tensor, Callable[[float], Tensor]]:
     return model, model.rest_points, lambda t: push * math.sin(2 * math.pi * FREQUENCY * t)
 
 
+@pytest.mark.slow
 def test_advice_looks_between_the_steps() -> None:
     model, x, force = beam()
     given = {"mu": 1e5, "lam": 1e5, "gravity": (0.0, 0.0, 0.0), "force": force}

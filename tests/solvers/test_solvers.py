@@ -218,6 +218,7 @@ def test_xpbd_without_compliance_keeps_lengths() -> None:
     )
 
 
+@pytest.mark.slow
 def test_projective_dynamics_converges_to_the_minimum_of_its_energy() -> None:
     mesh = mesh_of("small")
     solver = ProjectiveDynamics.from_mesh(mesh, pinned=held(mesh), springs=True)

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from helpers.marks import slow
 from torch import Tensor
 from torch._dynamo import compiled_autograd
 
@@ -13,7 +12,8 @@ PAIRS = (dv.PairBarrier(dhat=0.02), dv.Friction(0.3))
 FLOOR = dv.FloorBarrier(height=-0.005)
 
 
-@pytest.mark.parametrize("energies", [(FLOOR, *PAIRS), slow(()), slow((FLOOR,)), slow(PAIRS)])
+@pytest.mark.slow
+@pytest.mark.parametrize("energies", [(), (FLOOR,), PAIRS, (FLOOR, *PAIRS)])
 def test_gradients_are_those_of_a_plain_backward(device: str, energies: tuple) -> None:
     boxes = [dv.mesh.box(2, 0.2), dv.mesh.box(2, 0.2).translate((0.01, 0.21, 0.0))]
     model = dv.Model(dv.mesh.join(boxes), energies=(dv.StableNeoHookean(), *energies), device=device)

@@ -61,7 +61,7 @@ def least_gap(density: float = DENSITY) -> float:
     return (1 - FILTER_ETA) * bearing_gap(density * 0.2**3 * GRAVITY, KAPPA, DHAT)
 
 
-CASES = [(k, omega) for k in range(6) for omega in (0.5, 1.0, 1.6) if k != 1 or omega <= 1]
+CASES = [(0, 1.0), (1, 0.5), (1, 1.0), (2, 1.6), (3, 1.0), (5, 0.5), (5, 1.6)]
 
 
 @pytest.mark.parametrize(("sweeps", "relaxation"), CASES)

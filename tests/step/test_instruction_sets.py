@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 SETS = ("newest", "baseline", "v3", "v9")
 # Other packages are loaded once, which takes seconds; the set is chosen where each child process loads the kernels.
 SCRIPT = """
@@ -42,6 +44,7 @@ def hashes() -> dict[str, list[str]]:
     return {name: lines for name, *lines in parts}
 
 
+@pytest.mark.slow
 def test_the_same_bits() -> None:
     found = hashes()
     newest = found["newest"]

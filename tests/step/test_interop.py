@@ -56,6 +56,7 @@ def test_compile_of_a_step_with_every_argument(device: str, fresh_compiler: None
     compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False)
 
 
+@pytest.mark.slow
 def test_compile_of_a_step_with_coarse_corrections(device: str, fresh_compiler: None) -> None:
     compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False, coarse=dv.CoarseSpace(functions=4, groups=1))
 

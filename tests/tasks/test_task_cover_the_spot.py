@@ -13,6 +13,7 @@ from diffvbd.testing import tolerance
 DISK = dv.mesh.disk(0.42, 0.06, 6)
 
 
+@pytest.mark.slow
 def test_quick_run_covers_more(tmp_path: Path) -> None:
     result = check_fall("cover-the-spot", tmp_path, factor=0.7, iterations=5)
     assert result.history[0]["uncovered"] > 0.2

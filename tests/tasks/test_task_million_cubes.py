@@ -13,6 +13,7 @@ from diffvbd.testing import tolerance
 NAME = "million-cubes"
 
 
+@pytest.mark.slow
 def test_quick_run_brings_bodies_to_their_places(tmp_path: Path) -> None:
     result = check_fall(NAME, tmp_path, factor=0.9)
     errors = [row["mean_error"] for row in result.history]

@@ -58,7 +58,7 @@ def interrupt(problem: Problem, at: int) -> None:
         stage.loss = failing(stage.loss)
 
 
-@pytest.mark.parametrize("at", range(1, 23))
+@pytest.mark.parametrize("at", (1, 6, 7, 11, 15, 16, 20, 22))
 def test_a_run_interrupted_anywhere_ends_as_one_in_one_go(
     at: int, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

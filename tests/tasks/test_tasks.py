@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.marks import quick_and_slow
 from helpers.task_checks import check_gradient, quick, timeless
 
 from diffvbd import losses
@@ -16,7 +17,7 @@ from diffvbd.testing import tolerance
 MATERIAL = sorted(name for name in TASKS if name.startswith("beam"))
 
 
-@pytest.mark.parametrize("name", MATERIAL)
+@pytest.mark.parametrize("name", quick_and_slow(MATERIAL[:1], MATERIAL))
 def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
     problem, settings = quick(name, tmp_path)
     result = solve(problem, settings)
@@ -33,6 +34,7 @@ def test_gradient_at_the_start_matches_central_differences(name: str, tmp_path: 
     check_gradient(name, tmp_path, step=1e-5, rel=tolerance("finite_difference"))
 
 
+@pytest.mark.slow
 def test_log_and_picture_are_written(tmp_path: Path) -> None:
     settings = Settings(tmp_path, quick=True)
     result = solve(beam_mu.problem(settings), settings)
@@ -51,6 +53,7 @@ class Interrupted(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_continues_with_the_same_numbers(tmp_path: Path) -> None:
     problem, settings = quick("beam-mu", tmp_path / "whole")
     whole = solve(problem, settings)
