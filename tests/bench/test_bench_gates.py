@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import absent, advice, floors, floors_scenes, integrators, stifftasks
+from bench import absent, advice, extremes, floors, floors_scenes, integrators, stifftasks
 from bench import extremes_features as features
 from bench.__main__ import main
 from bench.floors_newton import Body
@@ -108,3 +108,29 @@ def test_an_extreme_of_no_use_is_warned_of() -> None:
     (case,) = [c for c in QUICK if (c.feature, c.axis) == ("plain, free", "mu 1e10 Pa, K = 1")]
     row = features.check(case)
     assert row["useless"] and row["warned"] == "sweeps" and row["gain"] > 1
+
+
+# --- extreme inputs ---------------------------------------------------------------------------------------------------
+
+
+INPUTS = [case for case in extremes.CASES if case.quick]
+
+
+@pytest.mark.parametrize("case", INPUTS, ids=lambda case: f"{case.axis}: {case.name}")
+def test_case_is_finite_descends_and_keeps_its_gradient(case: extremes.Extreme) -> None:
+    row = extremes.check(case)
+    assert row["finite"]
+    if row["must_descend"]:
+        assert row["rise"] <= extremes.RISE
+    # the bar of the exactness tests, or the conditioning where that is larger
+    assert extremes.verdict(row) in ("ok", "conditioning")
+
+
+@pytest.mark.parametrize("floor", [False, True], ids=["cantilever", "drop"])
+def test_rollout_of_hundreds_of_steps(floor: bool) -> None:
+    # later on the floor the loss hardly depends on the stiffness, and differences of it are rounding
+    row = extremes.check_rollout(extremes.Rollout("short", 200 if floor else 300, floor=floor))
+    assert row["finite"] and row["gradient"] != 0.0
+    assert row["difference_error"] < tolerance("long_difference")
+    if floor:
+        assert row["lowest"] > -0.2

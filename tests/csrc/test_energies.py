@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.compiler import cxx
-from helpers.paths import CSRC
+from helpers.paths import CSRC, needs_csrc
 
 from diffvbd import energies, ops
 from diffvbd.mask import CONTACT, FIRST_VERTEX_BIT
@@ -336,3 +336,33 @@ def test_python_tape_is_the_compiled_one(headers: Any) -> None:
 def masks() -> int:
     """Bits of a mask run below this: the elastic block's, contact, the vertex energies'."""
     return 1 << (FIRST_VERTEX_BIT + len(energies.VERTEX_ENERGIES))
+
+
+# --- scalars ----------------------------------------------------------------------------------------------------------
+
+
+@needs_csrc
+def test_one_formula_of_every_scalar(tmp_path: Path) -> None:
+    program, source = tmp_path / "scalars", Path(__file__).with_name("scalars.cpp")
+    subprocess.run([*cxx(), "-std=c++17", "-w", f"-I{CSRC}", str(source), "-o", str(program)], check=True)
+    found = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    assert found.split("\n")[:2] == ["10 10 10 10 7", "8 8 8 8 1"]
+
+
+# --- distances --------------------------------------------------------------------------------------------------------
+
+
+@needs_csrc
+def test_the_derivative_of_the_closest_feature(tmp_path: Path) -> None:
+    program = tmp_path / "distance"
+    source = Path(__file__).with_name("distance.cpp")
+    flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-w", f"-I{CSRC}"]
+    subprocess.run([*cxx(), *flags, str(source), "-o", str(program)], check=True)
+    *features, different, moving = map(
+        int, subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
+    )
+    point_triangle, edge_edge, plane = features[:5], features[5:10], features[10:]
+    # inside a face, and the three edges around it; inside both edges, and the four ends; a plane has no end
+    assert min(point_triangle[:4]) > 500 and point_triangle[4] == 0 and min(edge_edge) > 500
+    assert plane == [20000, 0, 0, 0, 0]
+    assert different == 0 and moving > 40000

@@ -3,6 +3,10 @@
 Of CUDA see also test_cuda_regimes.py.
 """
 
+import functools
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -115,3 +119,113 @@ def test_numbering_of_vertices_is_the_users(device: str, kind: str) -> None:
         per_vertex = name == "end" or inputs[name].shape[:1] == (len(rank),)
         other = ends[1][name][rank] if per_vertex else ends[1][name]
         assert value.any() and relative_error(other, value) <= tolerance("closed_form"), name
+
+
+# --- instruction sets -------------------------------------------------------------------------------------------------
+
+
+SETS = ("newest", "baseline", "v3", "v9")
+# Other packages are loaded once, which takes seconds; the set is chosen where each child process loads the kernels.
+SCRIPT = """
+import os, sys, warnings, meshio, torch, torch._dynamo
+os.environ.pop("DIFFVBD_ISA", None)
+for name in sys.argv[1:]:
+    print("set", name, flush=True)
+    assert "diffvbd" not in sys.modules
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of threads, which numpy may have started and no import waits for
+        child = os.fork()
+    if child == 0:
+        if name != "newest":
+            os.environ["DIFFVBD_ISA"] = name
+        try:
+            from bench.bits import of_case
+            for dtype in (torch.float64, torch.float32):
+                for case in ("plain", "paper", "floor_corner", "free_anchored"):
+                    print(of_case(case, "cpu", dtype), flush=True)
+        except Exception as error:
+            print("refused" if "DIFFVBD_ISA: expected" in str(error) else repr(error), flush=True)
+        os._exit(0)
+    assert os.wait()[1] == 0
+"""
+
+
+@functools.cache
+def hashes() -> dict[str, list[str]]:
+    """What each set prints: hashes, "refused" where this processor or build lacks it, or what went wrong."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", SCRIPT, *SETS]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr[-2000:]
+    parts = [part.split() for part in done.stdout.split("set ")[1:]]
+    return {name: lines for name, *lines in parts}
+
+
+@pytest.mark.slow
+def test_the_same_bits() -> None:
+    found = hashes()
+    newest = found["newest"]
+    assert len(newest) == len(set(newest)) == 8
+    assert found["baseline"] == newest
+    assert found["v3"] in (newest, ["refused"])  # an older processor, or a build without it
+
+
+def test_an_unknown_set_is_refused() -> None:
+    assert hashes()["v9"] == ["refused"]
+
+
+# --- memory that nobody has written -----------------------------------------------------------------------------------
+
+
+FLOOR, FRICTION = dv.FloorBarrier(height=-0.003, kappa=1e4, dhat=2e-3), dv.Friction(0.5)
+PAIRS = dv.PairBarrier(kappa=1e4, dhat=2e-3)
+PLANE = dv.colliders.Plane((0.0, -0.003, 0.0))
+SCENES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "floor, friction": {"energies": (FLOOR, FRICTION)},
+    "Anderson": {"acceleration": dv.Anderson(2)},
+    "coarse": {"coarse": "auto"},
+    "pairs": {"energies": (PAIRS,)},
+    "pairs, coarse": {"energies": (PAIRS,), "coarse": "auto"},
+    "pairs, friction, a collider": {"energies": (PAIRS, FRICTION), "colliders": (PLANE,)},
+    "pairs, floor, float32": {"energies": (PAIRS, FLOOR), "dtype": torch.float32},
+}
+
+
+@pytest.fixture
+def filled() -> Iterator[None]:
+    """As with torch.use_deterministic_algorithms, without which memory is never filled."""
+    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    fills = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    yield
+    torch.use_deterministic_algorithms(before, warn_only=warns)
+    torch.utils.deterministic.fill_uninitialized_memory = fills
+
+
+def run(name: str, scenes: int, device: str, fill: bool) -> list[Tensor]:
+    """Three cubes that fly into one another, two steps on; and gradients."""
+    torch.utils.deterministic.fill_uninitialized_memory = fill
+    assert not fill or bool(torch.empty((1000,), device=device).isnan().all())
+    cube = dv.mesh.box(3, 0.1)
+    bodies = dv.mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
+    options: dict[str, Any] = {"energies": (), **SCENES[name]}
+    options["energies"] = (dv.StableNeoHookean(), *options["energies"])
+    model = dv.Model(bodies, device=device, **options)
+    x = model.rest_points
+    v = 3.0 * (x.mean(0) - x) / x.std() * torch.linspace(0.5, 1.0, scenes).to(x)[:, None, None]
+    leaves = [t.clone().requires_grad_() for t in (x.expand_as(v), v, x.new_full((1, model.num_tets), 1e5))]
+    now, speed, mu = leaves
+    for _ in range(2):
+        now, speed = dv.step(model, now, speed, mu=mu, lam=1e5, time_step=0.005, sweeps=3)
+    return [now.detach(), speed.detach(), *torch.autograd.grad((now - x).square().sum(), leaves)]
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have a deterministic implementation")
+@pytest.mark.parametrize("scenes", [1, 2])
+@pytest.mark.parametrize("name", SCENES)
+def test_what_memory_held_before_does_not_matter(filled: None, name: str, scenes: int, device: str) -> None:
+    first, second = (run(name, scenes, device, fill) for fill in (False, True))
+    for one, other in zip(first, second, strict=True):
+        assert bool(one.isfinite().all()) and float(one.abs().max()) > 0
+        assert torch.equal(one, other)
