@@ -256,6 +256,7 @@ def test_identify_says_where_it_did_not_converge(
     assert message in output.err and "Young's modulus" in output.out
 
 
+@pytest.mark.slow
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "run"
     code = "import sys; from pathlib import Path; from diffvbd.tasks.folder import alone_in\n"
@@ -454,6 +455,7 @@ def test_view_says_what_is_wrong(
     assert expected in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_that_is_viewed_finds_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.marks import quick_and_slow
 from helpers.paths import ROOT
 
 import diffvbd as dv
@@ -31,7 +32,15 @@ def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
-@pages
+# What a page computes may take a minute: those that everyone reads first are quick.
+LONG = [page for page in PAGES if page.parent.name == "guides" or page.name == "performance.md"]
+
+
+@pytest.mark.parametrize(
+    "page",
+    quick_and_slow([p for p in PAGES if p not in LONG], PAGES),
+    ids=lambda path: path.relative_to(ROOT).as_posix(),
+)
 def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "__docs__"}

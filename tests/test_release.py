@@ -8,6 +8,7 @@ import sys
 import tarfile
 from pathlib import Path
 
+import pytest
 from helpers.copied_sources import copy_sources
 from helpers.paths import ROOT, needs_csrc
 
@@ -49,6 +50,7 @@ def test_the_oldest_torch_and_python_are_the_same_everywhere() -> None:
     assert f'python: ["{python}", ' in workflow
 
 
+@pytest.mark.slow
 @needs_csrc
 def test_an_sdist_has_what_builds_it(tmp_path: Path) -> None:
     copy_sources(tmp_path)

@@ -131,7 +131,7 @@ CLAIMS = {
 }
 
 
-@pytest.mark.parametrize("name", quick_and_slow(("ablation", "fd", "generality"), PAPER))
+@pytest.mark.parametrize("name", quick_and_slow(("ablation", "generality"), PAPER))
 def test_quick_run_bears_out_the_claims(name: str, quick: Callable[[str], dict[str, Any]], folder: Path) -> None:
     pytest.importorskip("scipy", reason="without Delaunay meshes the scenes are others")
     content = quick(name)

@@ -390,6 +390,7 @@ def test_quick_run_brings_bodies_to_their_places(tmp_path: Path) -> None:
     assert result.findings["mean_error_with_contact"] == result.estimates["mean_error"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_continues_in_the_second_stage(tmp_path: Path) -> None:
     def run(folder: Path, fail_at: int | None) -> list[dict[str, float]]:
         problem, settings = quick(NAME, folder)
