@@ -34,13 +34,10 @@ def slug(heading: str) -> str:
 
 # What a page computes may take a minute: those that everyone reads first are quick.
 LONG = [page for page in PAGES if page.parent.name == "guides" or page.name == "performance.md"]
+QUICK = [page for page in PAGES if page not in LONG]
 
 
-@pytest.mark.parametrize(
-    "page",
-    quick_and_slow([p for p in PAGES if p not in LONG], PAGES),
-    ids=lambda path: path.relative_to(ROOT).as_posix(),
-)
+@pytest.mark.parametrize("page", quick_and_slow(QUICK, PAGES), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "__docs__"}
@@ -125,10 +122,6 @@ def test_workflows_and_ci_call_targets_that_exist() -> None:
 
 
 FOLDER = ROOT / "docs" / "tutorials"
-
-
-def read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))
 
 
 @pytest.mark.slow

@@ -170,6 +170,7 @@ def test_the_same_bits() -> None:
     assert found["v3"] in (newest, ["refused"])  # an older processor, or a build without it
 
 
+@pytest.mark.slow
 def test_an_unknown_set_is_refused() -> None:
     assert hashes()["v9"] == ["refused"]
 
