@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 import diffvbd as dv
-from diffvbd.rollout import checkpoints
+from diffvbd.rollout import memory
 from diffvbd.testing import relative_error, tolerance
 
 # --- gradcheck --------------------------------------------------------------------------------------------------------
@@ -191,10 +191,7 @@ def test_rollouts_have_no_checkpoints_inside_transforms(device: str, monkeypatch
     inputs = small_inputs(model)
 
     def one(mu: Tensor, every: Any) -> Tensor:
-        given = inputs | {"mu": mu, "checkpoint_every": every}
-        state = {name: given.pop(name) for name in ("x", "v")}
-        parameters = {name: given.pop(name) for name in list(given) if "." in name}
-        found = dv.rollout(model, **state, **given, **parameters, steps=5, **STEP)
+        found = dv.rollout(model, **inputs | {"mu": mu}, checkpoint_every=every, steps=5, **STEP)
         return scalar(found.x[-1], found.v[-1])
 
     says = r'^checkpoint_every: expected None or "auto".*inside torch\.func'
@@ -204,7 +201,7 @@ def test_rollouts_have_no_checkpoints_inside_transforms(device: str, monkeypatch
         with pytest.raises(NotImplementedError, match=says):
             torch.func.vmap(one, (0, None))(inputs["mu"][None], schedule)
     whole = torch.func.grad(one)(inputs["mu"], None)
-    monkeypatch.setattr(checkpoints, "TAPE_BUDGET", 0)
+    monkeypatch.setattr(memory, "TAPE_BUDGET", 0)
     leaf = inputs["mu"].clone().requires_grad_()
     (expected,) = torch.autograd.grad(one(leaf, "auto"), leaf)
     assert expected.abs().max() > 0
