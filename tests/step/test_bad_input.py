@@ -68,11 +68,9 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("force", [1.0, 2.0, 3.0], "list"),
     ("gravity", "off", "str|off"),
     ("gravity", -9.81, "float|9.81"),
-    ("gravity", None, "None"),
     ("prescribed", "here", "str"),
     ("rest_points", MESH, "TetMesh"),
     ("floor_kappa", "stiff", "str"),
-    ("floor_kappa", None, "None"),
     ("adjoint", "full", "str|full"),
     # numbers that no float holds
     *((name, 10**400, "1329 bits") for name in ("mu", "lam", "density", "floor_kappa")),
@@ -88,11 +86,7 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("rest_points", spoiled(INF, 5, 0), "nan|inf"),
     *((name, bad, str(bad)) for name in ("mu", "lam", "density") for bad in (NAN, INF)),
     *((f"floor_{name}", NAN, "nan") for name in ("kappa", "dhat", "damping")),
-    ("floor_height", doubles(NAN), "nan"),
-    ("floor_normal", doubles([0.0, NAN, 0.0]), "nan"),
-    ("floor_normal", doubles([0.0, 0.0, 0.0]), "nan|0"),
     ("anchor_stiffness", NAN, "nan"),
-    ("anchor_points", spoiled(NAN, 3, 1), "nan"),
     # range
     ("mu", -1.0, "-1"),
     ("mu", doubles(1.0, 1.0, 1.0, -2.5, 1.0, 1.0), "-2.5.*tet 3"),
@@ -109,7 +103,7 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("flor_kappa", 1.0, r": is 'floor_kappa' meant\?$"),
     ("friction", 1.0, "has no Friction among its"),
     ("pair_kappa", 1.0, "has no PairBarrier among its"),
-    ("moo", 1.0, r": is 'mu' meant\?$"),
+    ("muu", 1.0, r": is 'mu' meant\?$"),
     ("qqq", 1.0, r"anchor_points\)$"),
     ("floor_kappa", torch.ones(1, 1, dtype=torch.float64), r"shape \[1, 1\]$"),
     # rest shapes that are no shapes
@@ -120,8 +114,7 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
 
 SOLVERS: list[tuple[str, Any, str]] = [
     *(("time_step", value, got) for value, got in
-      ((0, "0"), (-0.1, "-0.1"), (NAN, "nan"), (INF, "inf"), (1e-310, "1e-310"), (1e-160, "1e-160"),
-       (1e160, r"1e\+160"), (10**400, "1329 bits"), (True, "bool"), ("fast", "str"), (None, "None"))),
+      ((0, "0"), (-0.1, "-0.1"), (NAN, "nan"), (INF, "inf"), (10**400, "1329 bits"), (True, "bool"), ("fast", "str"), (None, "None"))),
     *(("sweeps", value, got) for value, got in
       ((-1, "-1"), (1.5, "1.5"), (2.0, "2.0"), (10**400, "10000"), (True, "bool"), ("3", "'3'"), (None, "None"))),
 ]  # fmt: skip
@@ -131,6 +124,11 @@ SOLVERS: list[tuple[str, Any, str]] = [
 def test_bad_argument_of_a_solver(name: str, value: Any, got: str) -> None:
     given: dict[str, Any] = {"time_step": 0.01, "sweeps": 1, name: value}
     raises(lambda: dv.VBD(**given), name, got)
+
+
+@pytest.mark.parametrize("time_step", (1e-310, 1e-160, 1e160))
+def test_a_time_step_whose_square_no_float_holds(device: str, time_step: float) -> None:
+    raises(lambda: step_with(model_of(device), "solver", dv.VBD(time_step, 1)), "time_step", re.escape(str(time_step)))
 
 
 
@@ -150,6 +148,21 @@ def test_bad_argument_of_a_step(device: str, value_checks: None, name: str, valu
     if before is not None:
         assert torch.equal(value.nan_to_num(), before.nan_to_num())
     step_with(model, "mu", 1e4)  # the Model still works
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("floor_height", doubles(NAN)), ("floor_normal", doubles([0.0, NAN, 0.0])),
+                        ("floor_normal", doubles([0.0, 0.0, 0.0])), ("anchor_points", spoiled(NAN, 3, 1))],
+)  # fmt: skip
+def test_parameters_of_energies_are_finite(device: str, value_checks: None, name: str, value: Tensor) -> None:
+    raises(lambda: step_with(model_of(device), name, value), "parameters", "nan")
+
+
+def test_none_is_a_default(device: str) -> None:
+    model = model_of(device)
+    expected = step_with(model, "mu", 1e4)[0]
+    for name in ("gravity", "floor_kappa", "prescribed", "rest_points"):
+        assert torch.equal(step_with(model, name, None)[0], expected)
 
 
 def test_negative_lam_is_legal_where_its_block_allows_it(device: str, value_checks: None) -> None:
