@@ -539,5 +539,5 @@ def test_a_tape_has_no_gradient_of_what_is_not_differentiable(name: str) -> None
         wrt=(name,),
         history=history,
         **(STEP | {"solver": dataclasses.replace(STEP["solver"], integrator=dv.BDF2())}),
-    )  # noqa: E731
+    )
     raises(run, "wrt", f"history.moved, history.v.*got '{name}'")
