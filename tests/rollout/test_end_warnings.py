@@ -207,7 +207,6 @@ def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
 
 def test_what_helps_helps() -> None:
     model, x, v = bent_bar(coarse="auto", relaxation=1.5)
-    # TODO62: the solver of this call
     assert (
         said_of_energy(
             lambda: dv.rollout(
@@ -215,7 +214,7 @@ def test_what_helps_helps() -> None:
                 x,
                 v,
                 steps=10,
-                **STIFF | {"solver": dataclasses.replace(STIFF["solver"], sweeps=100)},
+                **STIFF | {"solver": dataclasses.replace(STIFF["solver"], solver=scene.solver(100))},
                 checks=dv.Checks(energy=True),
             )
         )
@@ -239,7 +238,7 @@ def test_rest_and_fall_are_no_gain_in_single_precision_or_far_away() -> None:
         # TODO62: the solver of this call
         end = lambda m=model, x=x + distance, v=0 * v, g=given: dv.rollout(
             m, x, v, steps=10, **g, checks=dv.Checks(energy=True)
-        )  # noqa: E731
+        )
         assert said_of_energy(end) == []
 
 

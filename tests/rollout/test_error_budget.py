@@ -42,9 +42,8 @@ def test_converged_steps_on_a_floor_are_held_against_converged_ones(monkeypatch:
     budget = dv.error_budget(*tilted_box(), **scene)
     assert shares(budget)["sweeps"].motion < tolerance("closed_form") and budget.reached
     monkeypatch.setattr(budgets, "MOST_SWEEPS", 1)
-    # TODO62: the solver of this call
     none = dv.error_budget(
-        *tilted_box(), **scene | {"young": 1e9, "solver": dataclasses.replace(scene["solver"], sweeps=0)}
+        *tilted_box(), **scene | {"young": 1e9, "solver": dataclasses.replace(scene["solver"], solver=scene.solver(0))}
     )
     assert not none.reached and "no reference could be reached: " in str(none)
     assert "of its forces unbalanced" in shares(none)["sweeps"].note

@@ -44,8 +44,7 @@ def test_it_is_a_step_of_as_many_sweeps(device: str, case: str) -> None:
     model, inputs = scene_on(device, case)
     # TODO62: the solver of this call
     done = dv.solve(model, tolerance=1e-6, **inputs)
-    # TODO62: the solver of this call
-    x, v = dv.step(model, **inputs, sweeps=done.sweeps)
+    x, v = dv.step(model, **inputs, solver=scene.solver(done.sweeps))
     assert relative_error(done.x, x) <= tolerance("forward")
     assert relative_error(done.v * inputs["time_step"], v * inputs["time_step"]) <= tolerance("travel")
     assert device != "cpu" or (torch.equal(done.x, x) and torch.equal(done.v, v))
@@ -174,8 +173,7 @@ def test_it_is_a_step_of_as_many_sweeps_with_contact(device: str) -> None:
     model, given = pushed(device)
     # TODO62: the solver of this call
     done = dv.solve(model, tolerance=1e-6, **given, **SOFT)
-    # TODO62: the solver of this call
-    x, v = dv.step(model, **given, **SOFT, sweeps=done.sweeps)
+    x, v = dv.step(model, **given, **SOFT, solver=scene.solver(done.sweeps))
     assert torch.equal(done.x, x) and torch.equal(done.v, v)
     # TODO62: the solver of this call
     sooner = dv.solve(model, tolerance=1e-2, check_every=3, **given, **SOFT)
@@ -196,8 +194,7 @@ def test_its_derivative_is_that_of_the_executed_sweeps(device: str) -> None:
     found = dv.solve(model, tolerance=1e-6, **given, **SOFT)
     # TODO62: the solver of this call
     solved = gradients(lambda **options: dv.solve(model, tolerance=1e-6, **options).x)
-    # TODO62: the solver of this call
-    stepped = gradients(lambda **options: dv.step(model, **options, sweeps=found.sweeps)[0])
+    stepped = gradients(lambda **options: dv.step(model, **options, solver=scene.solver(found.sweeps))[0])
     for name, a, b in zip(leaves, solved, stepped, strict=True):
         assert torch.equal(a, b) and a.any(), name
 
