@@ -29,9 +29,9 @@ def test_the_residual_meets_the_tolerance(device: str, case: str, goal: float) -
     x, v, h = inputs["x"], inputs["v"], solver.time_step
     mass = torch.where(model.mass > 0, model.mass, 1.0)[:, None]
     y = x + h * v + h * h * (inputs["gravity"] + inputs["force"] / mass)
+    parameters = {k: t for k, t in inputs.items() if k.startswith(("floor", "anchor"))}
     left = reference.residual(model, done.x, y, inputs["mu"], inputs["lam"], h, x, density=inputs["density"],
-                              rest_points=inputs["rest_points"],
-                              parameters={k: t for k, t in inputs.items() if k.startswith(("floor", "anchor"))})  # fmt: skip
+                              rest_points=inputs["rest_points"], parameters=parameters)  # fmt: skip
     left, inertia = (torch.where(model.pinned[:, None], 0.0, a) for a in (left, mass * (done.x - y)))
     scale = inertia.flatten(-2).norm(dim=-1) + (left - inertia).flatten(-2).norm(dim=-1)
     residual = float((left.flatten(-2).norm(dim=-1) / scale).max())
