@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import inspect
 import re
 import sys
 import time
@@ -16,14 +17,13 @@ import torch
 
 import diffvbd as dv
 from diffvbd.mesh.motions import EXTENSIONS, check_extension
-from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.said import PAGES
 from diffvbd.scopes import record_to
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.folder import joined
 from diffvbd.tasks.problem import Result, Row, check_device
 from diffvbd.tasks.report import versions
-from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, Observation, Scene, side
+from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
 from diffvbd.viz.server import require_viser
 from diffvbd.viz.values import QUANTITIES
 
@@ -42,13 +42,13 @@ EXAMPLES = """examples:
   diffvbd identify part.msh target.npz --start 1e4 1e4
                                                    recover (mu, lam) from the observed motion
   diffvbd advise part.msh --pin x- --duration 0.5 --error 0.01
-                                                   time step, sweeps and the like that keep an error of 1 %
+                                                   solver (time step, sweeps, ...) that stays within an error of 1 %
 
 `diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. `identify` ends with status 1
-where it stalled, and warns wherever it did not converge; `advise` where the error cannot be had. An interrupted `run`
-or `identify` continues where it stopped when the same command is given again.
+where it stalled, and warns wherever it did not converge; `advise` where the error cannot be reached. An interrupted
+`run` or `identify` continues where it stopped when the same command is given again.
 """
-ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "coarse")  # what advise chooses
+ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "subspace")  # what advise chooses
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
   x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
   steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...; where the file has a time_step,
@@ -56,7 +56,7 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
   x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
   pinned     vertices that are held, bool, shape [V]; default none
   time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation,
-             integrator, coarse (0 or 1)
+             integrator, subspace
   mu, lam    the true material [Pa], if known: only used to report the error
 `diffvbd simulate --save-target TARGET.npz` writes such a file.
 """
@@ -125,12 +125,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene(simulate)
     simulate.set_defaults(command=_simulate)
 
-    advice = commands.add_parser("advise", help="find time step, sweeps and the like that keep a wanted error")
+    advice = commands.add_parser("advise", help="find a solver that stays within a wanted error")
     advice.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     advice.add_argument("--duration", type=float, required=True, help="of the motion [s]")
-    advice.add_argument("--error", type=float, default=ERROR, help=f"share of the motion, below 1 (default {ERROR:g})")
-    advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
-    advice.add_argument("--patience", type=float, default=PATIENCE, help=f"pilots may run so long [s] ({PATIENCE:g})")
+    error, budget = (inspect.signature(dv.advise).parameters[name].default for name in ("error", "time_budget"))
+    advice.add_argument(
+        "--error", type=float, default=error, help=f"fraction of the motion, below 1 (default {error:g})"
+    )
+    advice.add_argument("--gradient", action="store_true", help="of gradients, too")
+    advice.add_argument("--time-budget", type=float, default=budget, help=f"of trial runs [s] (default {budget:g})")
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
     _add_material(advice)
     _add_scene(advice, ADVISED)
@@ -206,9 +209,8 @@ def _simulate(options: argparse.Namespace) -> None:
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
-        said_below = False if options.stride == 1 else None
-        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress,
-                                check_contact=said_below)  # fmt: skip
+        checks = dv.Checks(contact=False if options.stride == 1 else None)  # which diagnose looks at below
+        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress, checks=checks)
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
     count = int(scene.pinned.sum())
@@ -219,8 +221,8 @@ def _simulate(options: argparse.Namespace) -> None:
         )
     if len(steps) > 1 and options.stride == 1:
         previous = (motion.x[-2], motion.v[-2]) if scene.integrator == Scene.integrator else None
-        found = dv.diagnose(model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous,
-                            gravity=scene.gravity, warn=False)  # fmt: skip
+        found = dv.diagnose(model, motion.x[-1], scene.solver, previous=previous, warn=False, mu=mu, lam=lam,
+                            gravity=scene.gravity)  # fmt: skip
         for message in found.messages:
             print(f"warning: {message}", file=sys.stderr)
     if options.save_target:
@@ -238,19 +240,22 @@ def _advise(options: argparse.Namespace) -> int:
     scene = _scene(options, mesh)
     model = scene.model(options.device)
     x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (scene.x0, scene.v0))
-    settings = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
-                         patience=options.patience, mu=mu, lam=lam, gravity=scene.gravity)  # fmt: skip
-    print(settings)
-    print(f"\nin Python: settings=dv.Settings({_in_python(settings)})")
-    return 0 if settings.predicted is not None and settings.predicted.reached else 1
+    solver = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
+                       time_budget=options.time_budget, mu=mu, lam=lam, gravity=scene.gravity)  # fmt: skip
+    print(solver)
+    print(f"\nin Python: dv.VBD({_in_python(solver)})")
+    return 0 if solver.prediction is not None and solver.prediction.reached else 1
 
 
-def _in_python(settings: dv.Settings) -> str:
-    """The arguments of dv.Settings that are not left at their defaults."""
-    given = [f"{settings.time_step!r}, {settings.sweeps}, dv.{settings.integrator!r}"]
-    given += [f"relaxation={settings.relaxation!r}"] if settings.relaxation != 1 else []
-    given += [f"coarse={settings.coarse!r}"] if settings.coarse is not None else []
-    return ", ".join(given)
+def _in_python(solver: dv.VBD) -> str:
+    """Arguments of a dv.VBD that are not left at their defaults."""
+    plain = dv.VBD(solver.time_step, solver.sweeps)
+    names = ("relaxation", "integrator", "subspace")
+    changed = {name: getattr(solver, name) for name in names if getattr(solver, name) != getattr(plain, name)}
+    words = {name: f"dv.{value!r}" if name == "integrator" else repr(value) for name, value in changed.items()}
+    if solver.coarse == dv.CoarseSpace():
+        words["subspace"] = '"coarse"'
+    return ", ".join([f"{solver.time_step!r}, {solver.sweeps}", *(f"{name}={word}" for name, word in words.items())])
 
 
 def _make_place(options: argparse.Namespace) -> None:
@@ -365,8 +370,8 @@ def _add_scene(parser: argparse.ArgumentParser, chosen: tuple[str, ...] = ()) ->
     scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
     text = "1.5 to 1.7 needs fewer sweeps (default 1; not with friction)"
     scene.add_argument("--relaxation", type=float, help=shown("relaxation", text))
-    scene.add_argument("--coarse", action="store_const", const=True, help=shown(
-        "coarse", "coarse corrections between the sweeps, for what is stiff, long, thin or finely meshed"))  # fmt: skip
+    text = f"corrections between the sweeps (default {Scene.subspace}); coarse suits what is stiff, long or fine"
+    scene.add_argument("--subspace", choices=[*SUBSPACES], help=shown("subspace", text))
     scene.add_argument("--integrator", choices=[*INTEGRATORS],
                        help=shown("integrator", f"of time (default {Scene.integrator})"))  # fmt: skip
     scene.add_argument(
@@ -405,7 +410,7 @@ def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
 def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
     """What was given of a Scene, the others have defaults; `pinned` [V] of --pin."""
     names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
-             "integrator", "coarse")  # fmt: skip
+             "integrator", "subspace")  # fmt: skip
     values = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     for name, value in values.items():
         if not isinstance(value, (str, int)) and not np.isfinite(value).all():

@@ -51,17 +51,14 @@ def beam_mu(settings: Settings) -> Problem:
     vertices, steps, iterations = ((6, 3, 3), 15, 60) if settings.quick else ((21, 7, 7), 100, 76)
     mesh = dv.mesh.beam(*vertices, size=SIZE, split="kuhn")
     clamped = mesh.points[:, 0] < mesh.points[:, 0].min() + 1e-9
-    model = dv.Model(mesh, density=DENSITY, pinned=clamped, relaxation=RELAXATION, coarse="auto")
-    model = model.to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=clamped).to(settings.device)
+    solver = dv.VBD(TIME_STEP, SWEEPS, relaxation=RELAXATION, subspace="coarse")
 
     x = twisted(model.rest_points, TWIST)
     v = torch.zeros_like(x)
 
     def simulate(mu: torch.Tensor) -> torch.Tensor:
-        motion = dv.rollout(
-            model, x, v, steps=steps, mu=mu, lam=LAM, time_step=TIME_STEP, sweeps=SWEEPS, gravity=(0.0, 0.0, 0.0)
-        )
-        return motion.x
+        return dv.rollout(model, x, v, solver, steps=steps, mu=mu, lam=LAM, gravity=(0.0, 0.0, 0.0)).x
 
     start = torch.tensor(START_MU, dtype=x.dtype, device=x.device)
     with torch.no_grad():
@@ -83,7 +80,7 @@ def beam_mu(settings: Settings) -> Problem:
         truth={"mu": TRUE_MU},
         units={"mu": "Pa"},
         protocol={"vertices": vertices, "steps": steps, "time_step": TIME_STEP, "sweeps": SWEEPS,
-                  "relaxation": RELAXATION, "coarse": "auto", "density": DENSITY, "lam": LAM, "start_mu": START_MU},
+                  "relaxation": RELAXATION, "subspace": "coarse", "density": DENSITY, "lam": LAM, "start_mu": START_MU},
         **pictures(mesh.surface, motions, TIME_STEP, [steps // 20, steps // 5, steps], {"mu": TRUE_MU}),
     )  # fmt: skip
 
@@ -103,17 +100,15 @@ def beam_mu_lam(settings: Settings) -> Problem:
     vertices, steps, iterations = ((6, 3, 3), 30, 60) if settings.quick else ((21, 7, 7), 100, 76)
     mesh = dv.mesh.beam(*vertices, size=SIZE, split="kuhn")
     clamped = mesh.points[:, 0] < mesh.points[:, 0].min() + 1e-9
-    model = dv.Model(mesh, density=DENSITY, pinned=clamped, start="predictor").to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=clamped).to(settings.device)
+    solver = dv.VBD(TIME_STEP, KICKED_SWEEPS, start="predictor")
 
     x = model.rest_points
     v = kicked(x, KICK / (100 * TIME_STEP))
     v[model.pinned] = 0.0
 
     def simulate(mu: torch.Tensor, lam: torch.Tensor) -> torch.Tensor:
-        motion = dv.rollout(
-            model, x, v, steps=steps, mu=mu, lam=lam, time_step=TIME_STEP, sweeps=KICKED_SWEEPS, gravity=(0.0, 0.0, 0.0)
-        )
-        return motion.x
+        return dv.rollout(model, x, v, solver, steps=steps, mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0)).x
 
     start = torch.tensor(START, dtype=x.dtype, device=x.device)
     with torch.no_grad():

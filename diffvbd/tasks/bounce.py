@@ -90,8 +90,8 @@ class Bounce:
         """
         x = self.model.rest_points + offset.unsqueeze(-2)
         v = velocity.unsqueeze(-2).expand_as(x)
-        return dv.rollout(self.model, x, v, steps=self.steps, mu=self.mu, lam=self.lam, time_step=self.time_step,
-                          sweeps=self.sweeps).x  # fmt: skip
+        solver = dv.VBD(self.time_step, self.sweeps)
+        return dv.rollout(self.model, x, v, solver, steps=self.steps, mu=self.mu, lam=self.lam).x
 
     def squared_distances(self, motion: Tensor) -> Tensor:
         """From center of mass to target [m^2] in every frame, shape [steps + 1, ...]; infinite before first contact.

@@ -39,15 +39,14 @@ VIEW = (10.0, 60.0)  # of the pictures: nearly edge on [degrees]
 def problem(settings: Settings) -> Problem:
     vertices, steps, sweeps, iterations = ((5, 6), 15, 5, 50) if settings.quick else ((18, 24), 30, 8, 120)
     mesh, top = hanging(*vertices, WIDTH, LENGTH, THICKNESS)
-    model = dv.Model(mesh, density=DENSITY, pinned=top, relaxation=RELAXATION, coarse="auto").to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=top).to(settings.device)
+    solver = dv.VBD(TIME_STEP, sweeps, relaxation=RELAXATION, subspace="coarse")
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     gravity, true = (torch.tensor(a, dtype=x.dtype, device=x.device) for a in (GRAVITY, TRUE_WIND))
 
     def simulate(wind: Tensor) -> Tensor:
         """Positions [m] after each step, shape [steps + 1, V, 3]."""
-        motion = dv.rollout(model, x, v, steps=steps, mu=MU, lam=LAM, time_step=TIME_STEP, sweeps=sweeps,
-                            gravity=gravity + wind)  # fmt: skip
-        return motion.x
+        return dv.rollout(model, x, v, solver, steps=steps, mu=MU, lam=LAM, gravity=gravity + wind).x
 
     with torch.no_grad():
         target = simulate(true)[-1]
@@ -75,6 +74,6 @@ def problem(settings: Settings) -> Problem:
         units=dict.fromkeys(("wind_x", "wind_y", "wind_z"), "m/s^2"),
         protocol={"true_wind": TRUE_WIND, "gravity": GRAVITY, "vertices": vertices,
                   "size": (WIDTH, LENGTH, THICKNESS), "density": DENSITY, "mu": MU, "lam": LAM, "steps": steps,
-                  "time_step": TIME_STEP, "sweeps": sweeps, "relaxation": RELAXATION, "coarse": "auto"},
+                  "time_step": TIME_STEP, "sweeps": sweeps, "relaxation": RELAXATION, "subspace": "coarse"},
         **pictures(mesh.surface, motions, TIME_STEP, [steps // 4, steps // 2, steps], truth, view=VIEW),
     )  # fmt: skip

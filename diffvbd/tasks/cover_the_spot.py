@@ -124,9 +124,9 @@ class Fall:
             each[:, None].expand(-1, self.disk.num_vertices, -1).flatten(0, 1)
             for each in (OFFSET * self.offset.tanh(), self.velocity)
         )
-        motion = dv.rollout(self.model, self.model.rest_points + moved, v, steps=shorter * self.version.steps, mu=MU,
-                            lam=LAM, time_step=TIME_STEP / shorter, sweeps=shorter * self.version.sweeps,
-                            save=save)  # fmt: skip
+        solver = dv.VBD(TIME_STEP / shorter, shorter * self.version.sweeps)
+        motion = dv.rollout(self.model, self.model.rest_points + moved, v, solver, steps=shorter * self.version.steps,
+                            save=save, mu=MU, lam=LAM)  # fmt: skip
         return motion.x.unflatten(1, (3, -1))
 
     def loss(self) -> Tensor:

@@ -123,8 +123,8 @@ class Drape:
     def fall(self, mu: Tensor, lam: Tensor, steps: int | None = None) -> Tensor:
         """Positions [m] of all frames, shape [steps + 1, V, 3]."""
         steps = self.version.steps if steps is None else steps
-        return dv.rollout(self.model, self.model.rest_points, self.still, steps=steps, mu=mu, lam=lam,
-                          time_step=TIME_STEP, sweeps=SWEEPS).x  # fmt: skip
+        solver = dv.VBD(TIME_STEP, SWEEPS, start="predictor")
+        return dv.rollout(self.model, self.model.rest_points, self.still, solver, steps=steps, mu=mu, lam=lam).x
 
     def recovered(self, steps: int | None = None) -> Tensor:
         return self.fall(self.log_mu.exp(), self.log_lam.exp(), steps)
@@ -179,7 +179,6 @@ def model_of(mesh: dv.TetMesh, neck: np.ndarray) -> dv.Model:
             dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
         ),
         colliders=[dv.colliders.Capsule(FOOT, HEAD, RADIUS)],
-        start="predictor",
     )
 
 

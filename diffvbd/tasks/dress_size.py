@@ -45,8 +45,8 @@ def problem(settings: Settings) -> Problem:
         (around, rings), steps, sweeps, iterations = ((8, 6), 15, 15, 40)
     mesh = dv.mesh.dress(around, rings, THICKNESS, neck_height=NECK)
     ring = ring_of_vertices(mesh, around, rings)
-    model = dv.Model(mesh, density=DENSITY, pinned=ring == 0, relaxation=RELAXATION, start="predictor")
-    model = model.to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=ring == 0).to(settings.device)
+    solver = dv.VBD(TIME_STEP, sweeps, relaxation=RELAXATION, start="predictor")
     v = torch.zeros_like(model.rest_points)
     hem = mean_weights(ring == rings - 1, v)
     neck = torch.tensor((0.0, NECK, 0.0), dtype=v.dtype, device=v.device)
@@ -55,9 +55,7 @@ def problem(settings: Settings) -> Problem:
     def simulate(size: Tensor) -> Tensor:
         """Positions [m] after each step, shape [steps + 1, V, 3]."""
         shape = cut(model.rest_points, size, neck)
-        motion = dv.rollout(model, shape, v, steps=steps, mu=MU, lam=LAM, time_step=TIME_STEP, sweeps=sweeps,
-                            rest_points=shape)  # fmt: skip
-        return motion.x
+        return dv.rollout(model, shape, v, solver, steps=steps, mu=MU, lam=LAM, rest_points=shape).x
 
     def height(size: Tensor) -> Tensor:
         return hem @ simulate(size)[-1, :, 1]

@@ -118,8 +118,9 @@ class Pulled:
     def __init__(self, body: dv.TetMesh, settings: Settings, version: Version) -> None:
         self.body, self.version = body, version
         pinned = body.points[:, 1] <= HELD * HEIGHT
-        model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION, start="predictor")
+        model = dv.Model(body, density=DENSITY, pinned=pinned)
         self.model = model.to(settings.device)
+        self.solver = dv.VBD(TIME_STEP, SWEEPS, relaxation=RELAXATION, start="predictor")
         self.like = {"dtype": self.model.dtype, "device": self.model.device}
         self.force = torch.as_tensor(pulls(body, version.grips), **self.like)
         self.x = self.model.rest_points.expand(version.grips, -1, -1)
@@ -140,10 +141,9 @@ class Pulled:
     def simulate(self, mu: Tensor, save: int | None = None) -> Tensor:
         """Positions [m] of saved frames, shape [frames, grips, V, 3]."""
         lam = 2 * POISSON / (1 - 2 * POISSON) * mu
-        motion = dv.rollout(self.model, self.x, self.v, steps=self.version.steps, mu=mu, lam=lam, time_step=TIME_STEP,
-                            sweeps=SWEEPS, force=self.force, gravity=(0.0, 0.0, 0.0),
-                            save=self.version.every if save is None else save)  # fmt: skip
-        return motion.x
+        save = self.version.every if save is None else save
+        return dv.rollout(self.model, self.x, self.v, self.solver, steps=self.version.steps, save=save, mu=mu, lam=lam,
+                          force=self.force, gravity=(0.0, 0.0, 0.0)).x  # fmt: skip
 
     def misfit(self, mu: Tensor) -> Tensor:
         """Mean squared residual over the variance of the noise."""

@@ -48,7 +48,8 @@ VISIBLE = 0.1  # of the largest singular value
 def problem(settings: Settings) -> Problem:
     vertices, steps, iterations = ((5, 4), 48, 40) if settings.quick else ((17, 13), 120, 199)
     mesh, top = hanging(*vertices, WIDTH, LENGTH, THICKNESS)
-    model = dv.Model(mesh, density=DENSITY, pinned=top, relaxation=RELAXATION, start="predictor").to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=top).to(settings.device)
+    solver = dv.VBD(TIME_STEP, SWEEPS, relaxation=RELAXATION, start="predictor")
     gravity = torch.tensor(GRAVITY, dtype=model.dtype, device=model.device)
     true = reference_wind().to(model.device, model.dtype)
 
@@ -56,9 +57,8 @@ def problem(settings: Settings) -> Problem:
         """Positions [m] after each step for winds [8, ..., 3] [m/s^2], shape [steps + 1, ..., V, 3]."""
         x = model.rest_points.expand(*wind.shape[1:-1], -1, -1).contiguous()
         each_step = wind[:, None].expand(-1, steps // WINDOWS, *wind.shape[1:]).flatten(0, 1)
-        motion = dv.rollout(model, x, torch.zeros_like(x), steps=steps, mu=MU, lam=LAM, time_step=TIME_STEP,
-                            sweeps=SWEEPS, gravity=dv.per_step((gravity + each_step)[..., None, :]))  # fmt: skip
-        return motion.x
+        winds = dv.per_step((gravity + each_step)[..., None, :])
+        return dv.rollout(model, x, torch.zeros_like(x), solver, steps=steps, mu=MU, lam=LAM, gravity=winds).x
 
     with torch.no_grad():
         target = simulate(true)

@@ -79,7 +79,7 @@ class Arm:
     def __init__(self, device: str) -> None:
         self.mesh = dv.mesh.box((2, 7, 2), SIZE, split="kuhn").translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
         height = self.mesh.points[:, 1]
-        self.model = dv.Model(self.mesh, density=DENSITY, pinned=height == 0.0, start="predictor").to(device)
+        self.model = dv.Model(self.mesh, density=DENSITY, pinned=height == 0.0).to(device)
         self.like = {"dtype": self.model.dtype, "device": self.model.device}
         self.foot, self.tip = (
             torch.as_tensor(np.flatnonzero(height == y), device=self.model.device) for y in (0.0, SIZE[1])
@@ -108,15 +108,14 @@ class Arm:
 
     def simulate(
         self, policy: Policy, given: Scenes, lead: tuple[int, ...] = (), save: Literal["all", "last"] = "last"
-    ) -> dv.Trajectory:
+    ) -> dv.results.Trajectory:
         """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
         targets, swings = given
         shape = (*lead, len(targets), self.model.num_vertices, 3)
-        return dv.rollout(self.model, self.model.rest_points.expand(shape),
-                          (self.bend * (swings @ self.ground)[:, None]).expand(shape), steps=STEPS, mu=MU, lam=LAM,
-                          time_step=TIME_STEP, sweeps=SWEEPS, prescribed=self.driven(policy, targets),
-                          observe=lambda x, v, step: mean(x, self.tip) - (targets @ self.ground + self.standing),
-                          save=save, checkpoint_every=None)  # fmt: skip
+        x, v = self.model.rest_points.expand(shape), (self.bend * (swings @ self.ground)[:, None]).expand(shape)
+        return dv.rollout(self.model, x, v, dv.VBD(TIME_STEP, SWEEPS, start="predictor"), steps=STEPS, save=save,
+                          observe=lambda step, x, v: mean(x, self.tip) - (targets @ self.ground + self.standing),
+                          checkpoint_every=None, mu=MU, lam=LAM, prescribed=self.driven(policy, targets))  # fmt: skip
 
     def misses(self, policy: Policy, given: Scenes, lead: tuple[int, ...] = ()) -> Tensor:
         """Mean squared distance from tip to target while it must be there [m^2], shape [*lead, scenes]."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.results import Refinement
 from diffvbd.tasks.problem import Problem, Result, Row, Settings, estimates_of
 
 
@@ -117,7 +118,7 @@ def summary(row: Row) -> str:
     return "  ".join(f"{short.get(k, k)} {v:.4g}" for k, v in row.items() if k not in ("iteration", "seconds"))
 
 
-def survival(problem: Problem, settings: Settings, first: float) -> dv.Refinement | str:
+def survival(problem: Problem, settings: Settings, first: float) -> Refinement | str:
     """Whether the result survives more sweeps and smaller steps, or why that is not known."""
     stage = problem.stages[-1]
     if settings.quick:

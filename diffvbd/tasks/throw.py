@@ -112,7 +112,7 @@ class Throw:
     def model_of(self, *others: Any, **more: Any) -> dv.Model:
         """Sheet and ball, with other energies and arguments of the Model beside their own."""
         energies = (dv.StableNeoHookean(), *others, self.barrier)
-        model = dv.Model(self.mesh, energies=energies, density=DENSITY, pinned=self.pinned, start="predictor", **more)
+        model = dv.Model(self.mesh, energies=energies, density=DENSITY, pinned=self.pinned, **more)
         return model.to(self.device)
 
     def heights(self, raw: Tensor) -> Tensor:
@@ -121,11 +121,11 @@ class Throw:
 
     def simulate(
         self, raw: Tensor, model: dv.Model, steps: int, save: Literal["all", "last"] = "last"
-    ) -> dv.Trajectory:
+    ) -> dv.results.Trajectory:
         bars = self.x + (self.heights(raw)[:steps] @ self.lifts.flatten(1)).unflatten(-1, (-1, 3))
-        return dv.rollout(model, self.x, torch.zeros_like(self.x), steps=steps, mu=self.mu, lam=self.mu,
-                          time_step=self.time_step, sweeps=SWEEPS, prescribed=dv.per_step(bars), save=save,
-                          checkpoint_every=None)  # fmt: skip
+        solver = dv.VBD(self.time_step, SWEEPS, start="predictor")
+        return dv.rollout(model, self.x, torch.zeros_like(self.x), solver, steps=steps, save=save,
+                          checkpoint_every=None, mu=self.mu, lam=self.mu, prescribed=dv.per_step(bars))  # fmt: skip
 
     def loss(self) -> Tensor:
         ball = self.simulate(self.raw, self.model, self.steps).x[-1, self.part]
