@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ..checks import check_broadcast, check_kind, check_tensor, check_time_step, fail, name_value
 from ..energies import StableNeoHookean
+from ..model.material import rest_metric
 from ..model.model import Model
-from ..model.rest import rest_metric
 from ..model.solver import VBD
 from ..safeguards import SATURATION_EPS
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors

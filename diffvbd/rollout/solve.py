@@ -13,9 +13,8 @@ from torch import Tensor
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, check_adjoint
 from ..checks import check_bool, check_count, check_positive, fail, is_word
-from ..model.integrators import BDF2
 from ..model.model import Model
-from ..model.solver import VBD
+from ..model.solver import BDF2, VBD
 from ..model.system import System
 from ..ops import SweepSettings
 from ..said import warn
@@ -32,10 +31,10 @@ from ..step.arguments import (
     refuse_non_finite,
     system_for,
 )
-from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
 from ..step.integrators import check_staged, take
 from ..step.met import outcomes
 from ..step.predict import Begun, begin
+from ..step.residual import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
 from ..tuples import replaced
 
 LOGGER = logging.getLogger("diffvbd")
