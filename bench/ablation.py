@@ -12,6 +12,11 @@ shape, turning about its vertical axis by 4 rad/s per metre of height (zero at m
 on every velocity component. Noise of one size is a strain that grows as edges get shorter: that is what refinement does
 to any motion whose wavelength the mesh barely resolves. The loss is a fixed random linear function of the end state.
 Other draws of the noise are measured too, because one flat tet decides whether a gate fires on the coarse mesh.
+
+The paper gives neither motion nor material of its ablation, so only the pattern can be compared: the full adjoint at
+rounding level, each omission visible at K = 1 and larger on a finer mesh, the gate exact where no tet comes near
+inversion. What an omission costs follows the length of the updates (saturation: their ratio to 0.1 m) and the strain
+that they make (Hessian tangent).
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import paper
-from bench.common import markdown_table
+from bench.tables import Table
 from diffvbd import testing
 from diffvbd.solvers import VertexBlock, vertex_block_descent
 
@@ -166,37 +171,10 @@ def package_step(model: dv.Model, inputs: dict[str, Any], sweeps: int) -> dict[s
     return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device)), "cpu")
 
 
-def markdown(results: dict[str, Any]) -> str:
-    rows, meshes = results["rows"], results["meshes"]
-    sizes = [m["vertices"] for m in meshes]
-    error = {(r["variant"], r["vertices"], r["sweeps"]): r["error"] for r in rows}
-    names = list(dict.fromkeys(r["variant"] for r in rows))
-    depths = sorted({r["sweeps"] for r in rows})
-
-    def cells(name: str, sweeps: int) -> list[Any]:
-        theirs = paper.ABLATION[name] if sweeps == 1 else {}
-        return [f"{error[name, n, sweeps]:.1e}" + (f" (paper {theirs[n]:.1e})" if n in theirs else "") for n in sizes]
-
-    header = [f"{n} vertices" for n in sizes]
-    parts = ["## Gradient error at K = 1: the larger of x0 and v0, against autograd through the executed sweep\n",
-             markdown_table(["adjoint", *header], [[name, *cells(name, 1)] for name in names])]  # fmt: skip
-    if len(depths) > 1:
-        parts += ["## More sweeps hide what is missing\n",
-                  markdown_table(["adjoint", "K", *header],
-                                 [[name, k, *cells(name, k)] for name in names for k in depths])]  # fmt: skip
-    if results["draws"]:
-        by = {(r["variant"], r["vertices"]): r for r in results["draws"]}
-        spans = [[name, *("{median:.1e} ({least:.1e} to {largest:.1e})".format(**by[name, n]) for n in sizes)]
-                 for name in VARIANTS]  # fmt: skip
-        parts += [f"## Median, least and largest error at K = 1 over {DRAWS} draws of the noise\n",
-                  markdown_table(["adjoint", *header], spans)]  # fmt: skip
-    parts += ["## What the first sweep meets\n",
-              markdown_table([k.replace("_", " ") for k in meshes[0]], [m.values() for m in meshes])]  # fmt: skip
-    parts.append(
-        "The paper gives neither motion nor material of its ablation, so the scene is ours and only the pattern can be "
-        "compared: the full adjoint at rounding level, each omission visible at K = 1 and larger on a finer mesh, the "
-        "gate exact where no tet comes near inversion. What an omission costs follows the length of the updates "
-        "(saturation: their ratio to 0.1 m) and the strain that they make (Hessian tangent). In some draws the noise "
-        "flattens a tet of the coarse mesh, and then the gate is wrong there, too.\n"
-    )
-    return "\n".join(parts)
+TABLES = (
+    Table("Gradient error, the larger of x0 and v0, against autograd through the executed sweeps", "rows",
+          {"adjoint": "variant", "vertices": "vertices", "K": "sweeps", "error": "error",
+           "paper": lambda row: paper.ABLATION[row["variant"]].get(row["vertices"]) if row["sweeps"] == 1 else None}),
+    Table(f"Median, least and largest error at K = 1 over {DRAWS} draws of the noise", "draws"),
+    Table("What the first sweep meets", "meshes"),
+)  # fmt: skip

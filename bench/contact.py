@@ -1,15 +1,23 @@
-"""Contact under stress, and what contact costs: crossings, gaps, cut motion and energy; step times.
+"""Contact under stress, what contact costs, and a search for crossings by violent scenes that a seed draws.
 
 Crossings are counted by `dv.contact.intersections`, which knows nothing of distances and planes: signs of volumes, for
 every edge of the surfaces and the triangles whose boxes it meets, at the start and after every n-th step ("check
 every"). Energy is kinetic, elastic and of gravity (relative to the start), without barriers. A vertex is cut in a step
 when pairs have held it up.
+
+Cost: one step of h = 1/60 s of boxes in pairs, one above the other, of which some touch; on the CPU processor time of
+one thread. What is kept for the backward is counted on the CPU.
+
+Violent scenes: bodies of a mesh start at random turns, thrown at each other at up to 60 m/s, with vertices that move on
+their own, on a floor, among colliders that move, with one to eight sweeps; every fifth batch in single precision, every
+fourth with coarse corrections, every seventh with SDIRK2 and another with BDF2. Every step of every scene is looked at.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -21,9 +29,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffvbd as dv
-from bench import contact_cost
-from bench.common import markdown_table
-from bench.gpu_measure import Card
+from bench.measure import Card, kept_bytes, least
+from bench.tables import Table, times
 from diffvbd import mesh, reference
 
 Array = NDArray[np.float64]
@@ -85,16 +92,6 @@ def ground(height: float = 0.0) -> tuple[tuple[Array, float], ...]:
     return ((np.array([0.0, 1.0, 0.0]), height),)
 
 
-def torus(radius: float, tube: float, spacing: float) -> dv.TetMesh:
-    """Ring about the y axis."""
-
-    def inside(p: Array) -> Array:
-        return np.hypot(np.hypot(p[:, 0], p[:, 2]) - radius, p[:, 1]) - tube
-
-    corner = np.array([radius + tube, tube, radius + tube])
-    return mesh.fill(inside, -corner, corner, spacing)
-
-
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
@@ -106,26 +103,6 @@ def boxes_collide() -> Start:
 def blobs_collide() -> Start:
     blobs = [mesh.blob(5, seed, 0.12) for seed in (1, 2)]
     return moving([(blobs[0], (50, 0, 0)), (blobs[1].translate([0.4, 0.04, 0.02]), (0, 0, 0))])
-
-
-def edge_hits_edge() -> Start:
-    """Two bars that cross, and meet with edges alone."""
-    bar, rng = mesh.box((7, 2, 2), (0.6, 0.04, 0.04), split="kuhn"), np.random.default_rng(1)
-    other = dv.TetMesh(turned(bar, rng).points, bar.tets)
-    low, high = other.points.min(0)[1], bar.points.max(0)[1]
-    return moving([(bar.translate([-0.3, 0, -0.02]), (0, 25, 0)),
-                   (other.translate([0, high - low + 0.05, 0]), (0, -25, 0))])  # fmt: skip
-
-
-def box_hits_ground() -> Start:
-    box = turned(mesh.box(4, 0.2, split="kuhn"), np.random.default_rng(3))
-    return moving([(box.translate([0, 0.3, 0]), (10, -50, 0))], walls=ground())
-
-
-def box_and_box_hit_ground() -> Start:
-    box = mesh.box(3, 0.2, split="kuhn")
-    return moving([(box.translate([0, 0.05, 0]), (0, -50, 0)), (box.translate([0.05, 0.3, 0.03]), (15, -50, 0))],
-                  walls=ground())  # fmt: skip
 
 
 def sheet_hits_capsule() -> Start:
@@ -146,55 +123,6 @@ def tower() -> Start:
     box = mesh.box(2, (0.2, height, 0.2), split="kuhn")
     return moving([(box.translate([x, 1e-3 + k * (height + 1e-3), z]), (0, 0, 0))
                    for k, (x, z) in enumerate(rng.uniform(-0.005, 0.005, (10, 2)))], walls=ground())  # fmt: skip
-
-
-def rings() -> Start:
-    """Two interlocked rings, 0.1 m in radius, pulled apart with 10 times their weight."""
-    ring = torus(0.1, 0.025, 0.025)
-    other = dv.TetMesh(ring.points[:, [0, 2, 1]] * [1, -1, 1] + [0.1, 0, 0], ring.tets)
-    pull = np.zeros((2 * ring.num_vertices, 3))
-    pull[:, 0] = np.repeat([10 * GRAVITY, -10 * GRAVITY], ring.num_vertices)
-    return replace(moving([(ring, (0, 0, 0)), (other, (0, 0, 0))]), acceleration=pull)
-
-
-def linking(start: Start, x: Array) -> float:
-    """Gauss's linking number of the rings' center lines; +-1 while they interlock, whatever their shape."""
-    count, parts, fine = start.mesh.num_vertices // 2, 24, np.arange(20)[:, None] / 20
-    angle = np.arctan2(start.mesh.points[:count, 2], start.mesh.points[:count, 0])
-    sector = np.floor((angle / math.tau + 0.5) * parts).astype(int) % parts
-    points, chords = [], []
-    for ring in (x[:count], x[count:]):
-        corner = np.stack([ring[sector == k].mean(0) for k in range(parts)])
-        chord = np.roll(corner, -1, 0) - corner
-        points.append((corner[:, None] + (fine + 0.025) * chord[:, None]).reshape(-1, 3))
-        chords.append(np.repeat(chord / len(fine), len(fine), 0))
-    r = points[0][:, None] - points[1]
-    turn = (r * np.cross(chords[0][:, None], chords[1])).sum(-1) / np.linalg.norm(r, axis=-1) ** 3
-    return float(turn.sum()) / (4 * math.pi)
-
-
-def interlocked(case: Case, start: Start, states: list[Tensor]) -> str:
-    count = start.mesh.num_vertices // 2
-    apart = [float((x[count:].mean(0) - x[:count].mean(0)).norm()) for x in states]
-    numbers = [abs(linking(start, x.numpy())) for x in states[::5]]
-    return (f"centers {apart[0]:.3g} m apart at the start, {apart[-1]:.3g} m at the end; linking number "
-            f"{min(numbers):.3f} to {max(numbers):.3f}")  # fmt: skip
-
-
-def clapping_sheet() -> Start:
-    """A sheet whose halves are swung against each other."""
-    sheet = mesh.sheet(13, 5, (0.6, 0.2), 0.01)
-    velocity = np.zeros((sheet.num_vertices, 3))
-    velocity[:, 1] = 40 * np.abs(sheet.points[:, 0] - 0.3)
-    return Start(sheet, velocity, np.zeros(3))
-
-
-def falling_sheet() -> Start:
-    """A sheet that falls on its short edge and folds up on the ground."""
-    sheet = mesh.sheet(17, 4, (0.8, 0.15), 0.01)
-    upright = sheet.points[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0.02, 0]
-    upright[:, 0] += 0.01 * np.sin(8 * upright[:, 1])
-    return moving([(dv.TetMesh(upright, sheet.tets), (0, -2, 0))], walls=ground())
 
 
 def crowd(per_side: int, layers: int) -> Start:
@@ -238,9 +166,8 @@ def drop() -> Start:
 
 
 def _cases() -> list[Case]:
-    impacts = {"two boxes": boxes_collide, "two blobs": blobs_collide, "two bars, edge on edge": edge_hits_edge,
-               "a box on the ground": box_hits_ground, "two boxes on the ground": box_and_box_hit_ground,
-               "a sheet on a capsule": sheet_hits_capsule, "a blob on a wedge": blob_hits_wedge}  # fmt: skip
+    impacts = {"two boxes": boxes_collide, "two blobs": blobs_collide, "a sheet on a capsule": sheet_hits_capsule,
+               "a blob on a wedge": blob_hits_wedge}  # fmt: skip
     quick = ("two boxes", "a sheet on a capsule")
     out = [Case("50 m/s", name, build, 30, quick=name in quick, series=name == "two boxes")
            for name, build in impacts.items()]  # fmt: skip
@@ -251,11 +178,6 @@ def _cases() -> list[Case]:
              check_every=5, series=True),
         # by so few sweeps it does not stand
         Case("tower", "10 boxes, far from converged", tower, 300, sweeps=20, modulus=2e5, damping=2.0, friction=0.5),
-        Case("rings", "pulled apart", rings, 200, time_step=1 / 240, sweeps=20, modulus=2e5, check_every=2,
-             note=interlocked, series=True),
-        Case("sheet", "halves swung together at 40 rad/s", clapping_sheet, 120, time_step=1 / 240, modulus=1e3,
-             quick=True),
-        Case("sheet", "folds up on the ground", falling_sheet, 120, modulus=2e4, friction=0.3),
         Case("crowd", "100 bodies in a box of 5 planes", lambda: crowd(5, 4), 150, friction=0.3, check_every=2),
         Case("free fall", "27 boxes 1 mm apart at 10 m/s", free_fall, 60, dhat=4e-3, capacity=40_000,
               note=deviation_from_fall, quick=True),
@@ -351,27 +273,189 @@ def check(case: Case, card: Card) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def run(quick: bool, device: str = "cpu") -> dict[str, Any]:
-    card = Card(torch.device(device), quick)
-    cases = [replace(case, steps=min(case.steps, 10)) for case in CASES if case.quick] if quick else CASES
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # most scenes are too small for two
-    try:
-        return {"rows": [check(case, card) for case in cases], "cost": contact_cost.measure(card)}
-    finally:
-        torch.set_num_threads(threads)
+COST_DHAT = 2e-3  # [m]
+CLOSE = 0.5 * COST_DHAT  # gap of bodies that touch [m]
+FAR = 0.2  # [m], of those that do not: beyond any reach
+SHORT = 2 * COST_DHAT  # [m], a reach that lists the fewest pairs
+COST_SWEEPS, DETECTIONS, COST_STEP, MODULUS = 10, 2, 1 / 60, 1e5
 
 
-def markdown(results: dict[str, Any]) -> str:
-    rows = results["rows"]
-    columns = ("group", "name", "steps", "time_step", "sweeps", "detections", "bodies", "vertices", "check_every",
-               "intersections", "nonfinite", "smallest_gap_over_dhat", "cut_max", "cut_mean", "pairs", "energy_start",
-               "energy_max", "energy_end", "ms_per_step")  # fmt: skip
-    header = ("group", "case", "steps", "h [s]", "K", "R", "bodies", "vertices", "check every", "crossings",
-              "not finite", "smallest gap / dhat", "cut, most", "cut, mean", "pairs", "energy [J], start", "most",
-              "end", "ms per step")  # fmt: skip
-    text = "## Stress\n\n" + markdown_table(header, ([row[k] for k in columns] for row in rows))
-    remarks = [f"- {r['group']}, {r['name']}: {r['note']}." for r in rows if r["note"]]
-    remarks += [f"- {r['group']}, {r['name']}: ended after {r['done']} steps, {r['error'] or 'not finite'}."
-                for r in rows if r["done"] < r["steps"] or r["nonfinite"]]  # fmt: skip
-    return text + "\n" + "\n".join(remarks) + "\n\n" + contact_cost.markdown(results["cost"])
+def piles(count: int, n: int, close: int) -> dv.TetMesh:
+    """`count` pairs of boxes of n^3 vertices and 0.1 m, one above the other; the first `close` pairs touch."""
+    box, side = mesh.box(n, 0.1, split="kuhn"), int(np.ceil(np.sqrt(count)))
+    offsets = []
+    for k in range(count):
+        place = np.array([(k % side) * (0.1 + FAR), 0.0, (k // side) * (0.1 + FAR)])
+        # a shift along the face, lest edges lie on edges
+        offsets += [place, place + [0.013, 0.1 + (CLOSE if k < close else FAR), 0.017]]
+    return mesh.replicate(box, np.array(offsets))
+
+
+def piled(tets: dv.TetMesh, card: Card, contact: bool, reach: float | None = None) -> dv.Model:
+    barrier = (dv.PairBarrier(kappa=100.0, dhat=COST_DHAT, detections=DETECTIONS, reach=reach),) if contact else ()
+    return dv.Model(tets, energies=(dv.StableNeoHookean(), *barrier), device=card.device)
+
+
+def stepping(model: dv.Model, reverse: bool) -> Callable[[], Any]:
+    """A step from rest, or one and the gradient toward its state; as gpu_measure times it."""
+    x = model.rest_points.clone().requires_grad_(reverse)
+    v = torch.zeros_like(x).requires_grad_(reverse)
+    modulus = torch.full((), MODULUS, dtype=x.dtype, device=x.device)
+    ones = torch.ones_like(x)
+
+    def work() -> tuple[Tensor, ...]:
+        end = dv.step(
+            model, x, v, mu=modulus, lam=modulus, time_step=COST_STEP, sweeps=COST_SWEEPS, gravity=(0.0, 0.0, 0.0)
+        )
+        return torch.autograd.grad(end, (x, v), (ones, ones)) if reverse else end
+
+    return work
+
+
+def milliseconds(card: Card, work: Callable[[], Any]) -> float:
+    """Median of replays of a CUDA graph; on the CPU the least of several calls, in processor time of one thread, which
+    other programs on the machine do not stretch."""
+    replayed = card.graph(work)
+    if replayed is not None:
+        return 1e3 * replayed
+
+    def span() -> float:
+        start = time.process_time()
+        work()
+        return time.process_time() - start
+
+    return 1e3 * least(span, 3 if card.quick else 7)
+
+
+def measured(card: Card, count: int, n: int, close: int, reach: float | None = None) -> dict[str, Any]:
+    """Times of piles with contact and without."""
+    tets = piles(count, n, close)
+    row: dict[str, Any] = {"bodies": 2 * count, "vertices": tets.num_vertices, "reach": reach}
+    for key, contact in (("without", False), ("with", True)):
+        model = piled(tets, card, contact, reach)
+        row[f"{key}_ms"] = milliseconds(card, stepping(model, False))
+        row[f"{key}_reverse_ms"] = milliseconds(card, stepping(model, True))
+        row[f"{key}_kept"] = kept_bytes(stepping(model.to("cpu"), True))
+        if contact:
+            stepping(model, False)()  # raises where a captured one would have returned NaN
+            row["pairs"] = dv.contact.status(model).pairs
+        card.tidy()
+    return row
+
+
+SCENES, BATCH, FUZZ_STEPS = 2000, 40, 6
+SPEEDS = (2.0, 10.0, 60.0)  # [m/s]
+FUZZ_DHAT = 2e-3  # [m]
+INTEGRATORS = {1: dv.SDIRK2(), 4: dv.BDF2()}  # by seed modulo 7
+
+
+def _bodies(rng: np.random.Generator) -> list[dv.TetMesh]:
+    kinds = (
+        lambda: mesh.box(int(rng.integers(2, 4)), 0.1, split="kuhn"),
+        lambda: mesh.sheet(5, 5, (0.14, 0.14), float(rng.uniform(0.01, 0.03))),
+        lambda: mesh.blob(4, int(rng.integers(100)), 0.06),
+    )
+    places = [np.array([i, j, 0.0]) for j in range(2) for i in range(2)]
+    chosen = [kinds[rng.integers(3)]() for _ in range(int(rng.integers(2, 5)))]
+    return [
+        turned(body, rng).translate(0.24 * place + [0, 0.15, 0]) for body, place in zip(chosen, places, strict=False)
+    ]
+
+
+def _drawn(seed: int, device: str, batch: int) -> dict[str, Any]:
+    """Scenes of one mesh."""
+    rng = np.random.default_rng(seed)
+    tets, speed = mesh.join(_bodies(rng)), SPEEDS[seed % len(SPEEDS)]
+    energies: tuple[Any, ...] = (
+        dv.StableNeoHookean(),
+        dv.PairBarrier(kappa=float(10 ** rng.uniform(2, 5)), dhat=FUZZ_DHAT, damping=float(rng.choice([0.0, 5.0])),
+                       detections=(None, 1, 2)[rng.integers(3)]),
+    )  # fmt: skip
+    energies += (dv.Friction(float(rng.uniform(0, 0.8))),) if rng.random() < 0.6 else ()
+    energies += (dv.FloorBarrier(kappa=1e4, dhat=FUZZ_DHAT),) if rng.random() < 0.6 else ()
+    ball = dv.colliders.Sphere(center=(0.1, 0.62, 0.0), radius=0.05)
+    colliders = (ball,) if rng.random() < 0.5 else ()
+    dtype, coarse = torch.float32 if seed % 5 == 2 else torch.float64, "auto" if seed % 4 == 3 else None
+    model = dv.Model(tets, energies=energies, colliders=colliders, coarse=coarse, dtype=dtype, device=device)
+    toward = rng.standard_normal((batch, tets.num_bodies, 1, 3))
+    v = speed * toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+    v = v[:, tets.body, 0] + 0.2 * speed * rng.standard_normal((batch, tets.num_vertices, 3))
+    x = model.rest_points.expand(batch, -1, -1).clone()
+    return {"model": model, "x": x, "v": torch.from_numpy(v).to(x), "sweeps": int(rng.integers(1, 9)),
+            "modulus": float(10 ** rng.uniform(3, 7)), "time_step": float(10 ** rng.uniform(-2.7, -1.3))}  # fmt: skip
+
+
+def _crossings(seed: int, device: str, batch: int) -> tuple[int, int, int, float]:
+    """Of all steps: crossings, numbers that are not finite, steps, and the mean share of cut vertices."""
+    s = _drawn(seed, device, batch)
+    model, x, v = s["model"], s["x"], s["v"]
+    crossings = lost = 0
+    cut, points = [], model.collider_points
+    integrator, history = INTEGRATORS.get(seed % 7, dv.ImplicitEuler()), None
+    for step in range(FUZZ_STEPS):
+        given: dict[str, Any] = {}
+        if len(points):  # it comes down on them
+            before, points = points, points - points.new_tensor([0.0, 0.01 * (step % 3), 0.0])
+            given = {"colliders": points, "colliders_before": before}
+        try:
+            x, v, *past = dv.step(model, x, v, mu=s["modulus"], lam=s["modulus"], time_step=s["time_step"],
+                                  sweeps=s["sweeps"], integrator=integrator, history=history, **given)  # fmt: skip
+            history = past[0] if past else None
+        except ValueError as error:  # what is prescribed leaves bodies no way: said, not done
+            if "leaves bodies a way" not in str(error):
+                raise
+            return crossings, lost, step, float(np.mean(cut or [0.0]))
+        crossings += len(dv.contact.intersections(model, x))
+        lost += int((~torch.isfinite(x)).sum() + (~torch.isfinite(v)).sum())
+        cut.append(float(np.mean(dv.contact.status(model).cut)) / model.num_vertices)
+    return crossings, lost, FUZZ_STEPS, float(np.mean(cut))
+
+
+# --- groups -----------------------------------------------------------------------------------------------------------
+
+
+def stress(card: Card) -> list[dict[str, Any]]:
+    cases = [replace(case, steps=min(case.steps, 10)) for case in CASES if case.quick] if card.quick else CASES
+    return [check(case, card) for case in cases]
+
+
+def cost(card: Card) -> list[dict[str, Any]]:
+    """Piles of which ever more touch, then a crowd that does, with the usual reach and with a short one."""
+    count, n = (8, 3) if card.quick else (64, 4)
+    rows = [measured(card, count, n, close) for close in sorted({0, count // 8, count // 4, count // 2, count})]
+    count, n = (4, 4) if card.quick else (50, 10)
+    return [*rows, *(measured(card, count, n, count, reach) for reach in (None, SHORT))]
+
+
+def fuzz(card: Card) -> list[dict[str, Any]]:
+    batch, out = 10 if card.quick else BATCH, []
+    keys = ("scenes", "crossings", "nonfinite", "scene_steps", "cut")
+    rows: dict[float, list[float]] = {speed: [0, 0, 0, 0, 0.0] for speed in SPEEDS}
+    for seed in range(3 if card.quick else SCENES // BATCH):
+        crossings, lost, steps, cut = _crossings(seed, str(card.device), batch)
+        row = rows[SPEEDS[seed % len(SPEEDS)]]
+        for k, more in enumerate((batch, crossings, lost, batch * steps, batch * cut)):
+            row[k] += more
+        print(f"{seed}: {crossings}, {lost}", file=sys.stderr, flush=True)
+    for speed, row in rows.items():
+        row[-1] /= max(row[0], 1)
+        out.append({"speed": speed, **dict(zip(keys, row, strict=True))})
+    return out
+
+
+THREADS, ANYWHERE = 1, True  # most scenes are too small for two threads
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {"stress": stress, "cost": cost, "fuzz": fuzz}
+TABLES = (
+    Table("Stress", "stress",
+          {"group": "group", "case": "name", "steps": "steps", "h [s]": "time_step", "K": "sweeps", "R": "detections",
+           "bodies": "bodies", "vertices": "vertices", "check every": "check_every", "crossings": "intersections",
+           "not finite": "nonfinite", "smallest gap / dhat": "smallest_gap_over_dhat", "cut, most": "cut_max",
+           "cut, mean": "cut_mean", "pairs": "pairs", "energy [J], start": "energy_start", "most": "energy_max",
+           "end": "energy_end", "ms per step": "ms_per_step", "note": "note", "error": "error"}),
+    Table("Cost", "cost",
+          {"bodies": "bodies", "vertices": "vertices", "reach [m]": "reach", "pairs": "pairs",
+           "step without contact [ms]": "without_ms", "with [ms]": "with_ms",
+           "forward + backward without [ms]": "without_reverse_ms", "with, both [ms]": "with_reverse_ms",
+           "kept without [MB]": times("without_kept", 1e-6), "with, kept [MB]": times("with_kept", 1e-6)}),
+    Table("Violent scenes, by speed", "fuzz"),
+)  # fmt: skip

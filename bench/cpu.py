@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
+import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,31 +17,9 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench.measure import Card, kept_bytes, least, peak_memory, reset_peak_memory
+from bench.tables import Table, times
 from diffvbd import reference
-
-
-def run(quick: bool) -> dict[str, Any]:
-    threads = torch.get_num_threads()
-    try:
-        return {
-            "throughput": throughput(5 if quick else 11, 20, quick),
-            "scaling": scaling(9 if quick else 31, threads, quick),
-            "unrolled": unrolled(quick, threads),
-            "building": building(quick),
-            "requirements": requirements(5 if quick else 11, quick),
-        }
-    finally:
-        torch.set_num_threads(threads)
-
-
-def least(function: Callable[[], float], repetitions: int) -> float:
-    """The least of what a function returns; garbage of one run does not count in the next."""
-    best = float("inf")
-    for _ in range(repetitions):
-        gc.collect()
-        best = min(best, function())
-    return best
 
 
 def clamped_cube(
@@ -159,21 +137,6 @@ def _beam_rollout(route: str, steps: int, threads: int) -> tuple[float, float]:
     return min(seconds), float(growth)
 
 
-def reset_peak_memory() -> int:
-    """Resident bytes now; from here on the kernel counts the peak anew (Linux)."""
-    Path("/proc/self/clear_refs").write_text("5")
-    return _status("VmRSS")
-
-
-def peak_memory() -> int:
-    return _status("VmHWM")
-
-
-def _status(field: str) -> int:
-    line = next(a for a in Path("/proc/self/status").read_text().splitlines() if a.startswith(field))
-    return int(line.split()[1]) * 1024
-
-
 def unrolled(quick: bool, threads: int) -> list[dict[str, Any]]:
     """Both routes on the same forward, with the same number of threads, each in a process of its own."""
     steps = 2 if quick else 10
@@ -250,36 +213,26 @@ def requirements(n: int, quick: bool) -> list[dict[str, Any]]:
                 "name": f"{label}, gradients: {' + '.join(wants) or 'none'}",
                 "forward_ms": forward * 1e3,
                 "backward_ms": None if backward is None else backward * 1e3,
-                "kept_bytes": kept_bytes(model, x, sweeps, wants),
+                "kept_bytes": kept_bytes(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)),
             })  # fmt: skip
     return rows
 
 
-def kept_bytes(model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...]) -> int:
-    """Bytes of distinct storages that one step keeps for its backward, the Model's own and the arguments left out."""
-    own = {
-        t.untyped_storage().data_ptr() for t in (*vars(model).values(), *model._topology, x) if isinstance(t, Tensor)
-    }
-    kept: dict[int, int] = {}
-
-    def pack(t: Tensor) -> Tensor:
-        if t.untyped_storage().data_ptr() not in own:
-            kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
-        return t.detach()  # an output that keeps itself would never be freed
-
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
-        time_step(model, x, sweeps, wants)
-    return sum(kept.values())
+def _threads() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def markdown(results: dict[str, Any]) -> str:
-    rows = [r for part in ("throughput", "scaling", "unrolled", "building") for r in results[part]]
-    text = markdown_table(
-        ("what", "measured", "target", "unit"), [(r["name"], r["value"], r["target"], r["unit"]) for r in rows]
-    )
-    cells = [
-        (r["name"], f"{r['forward_ms']:.2f}", "-" if r["backward_ms"] is None else f"{r['backward_ms']:.2f}",
-         f"{r['kept_bytes'] / 1e6:.2f}")
-        for r in results["requirements"]
-    ]  # fmt: skip
-    return text + "\n" + markdown_table(("one step, K = 10", "forward [ms]", "backward [ms]", "kept [MB]"), cells)
+THREADS = 1
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    "throughput": lambda card: throughput(5 if card.quick else 11, 20, card.quick),
+    "scaling": lambda card: scaling(9 if card.quick else 31, _threads(), card.quick),
+    "unrolled": lambda card: unrolled(card.quick, _threads()),
+    "building": lambda card: building(card.quick),
+    "requirements": lambda card: requirements(5 if card.quick else 11, card.quick),
+}
+COLUMNS = {"what": "name", "measured": "value", "target": "target", "unit": "unit"}
+TABLES = (
+    *(Table(name.capitalize(), name, COLUMNS) for name in ("throughput", "scaling", "unrolled", "building")),
+    Table("One step, K = 10", "requirements", {"gradients": "name", "forward [ms]": "forward_ms",
+                                               "backward [ms]": "backward_ms", "kept [MB]": times("kept_bytes", 1e-6)}),
+)  # fmt: skip

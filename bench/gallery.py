@@ -17,21 +17,19 @@ import numpy as np
 import torch
 
 import diffvbd as dv
-from bench.common import RESULTS
+from bench.common import ROOT, chosen
 from diffvbd import losses, viz
 from diffvbd.tasks import TASKS, Settings, beam_mu, dress, solve
 from diffvbd.viz.motion import load_motions
 
-FOLDER = RESULTS.parents[1] / "docs" / "images" / "gallery"
+FOLDER = ROOT / "docs" / "images" / "gallery"
 MOST_BYTES = 400_000
 SIZE = (440, 300)
 
 
 def main(only: str | None = None, out: Path | None = None) -> int:
     """Render all, or some by name; returns the exit status."""
-    names = [*SCENES] if only is None else [name.strip() for name in only.split(",")]
-    if unknown := [name for name in names if name not in SCENES]:
-        sys.exit(f"--only: expected names among {', '.join(SCENES)}, got {', '.join(unknown)}")
+    names = chosen(only, SCENES)
     folder = out or FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
@@ -139,8 +137,8 @@ def stacked_boxes(path: Path) -> None:
         dv.PairBarrier(2e3, 2 * gap, self_contact=False, damping=10.0),
         dv.Friction(0.6, velocity=0.01),
     )
-    model = dv.Model(mesh, density=500.0, energies=energies, coarse="auto", acceleration=dv.Anderson(2))
-    motion = dv.rollout(model, *still(model), steps=110, mu=2e5, lam=2e5, time_step=0.01, sweeps=12)
+    model = dv.Model(mesh, density=500.0, energies=energies, coarse="auto")
+    motion = dv.rollout(model, *still(model), steps=110, mu=2e5, lam=2e5, time_step=0.01, sweeps=24)
     viz.render(path, motion, model, time_step=0.01, size=SIZE, seconds=2.6, view=(12.0, 75.0), zoom=1.15)
 
 

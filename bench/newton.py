@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import statistics
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,68 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import diffvbd as dv
-
-SIZES = (5, 11, 31, 58)
-# [ms per step] of an earlier version on an H100, to see at once whether a run is sound
-EARLIER = {5: 0.83, 11: 0.81, 31: 2.21, 58: 14.0}
-
-
-def rows(device: str, quick: bool, sizes: tuple[int, ...] = SIZES) -> list[dict[str, Any]]:
-    """Milliseconds per step for cubes of n vertices per axis: float32, K = 20, 10 steps in one CUDA graph."""
-    try:
-        warp, newton = importlib.import_module("warp"), importlib.import_module("newton")
-        warp.init()
-        warp.get_device(device)
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        return [{"name": "Newton SolverVBD", "error": f"not available ({reason})"}]
-    out = []
-    for n in sizes[:1] if quick else sizes:
-        name = f"Newton SolverVBD, cube of {n} vertices per axis"
-        try:
-            out.append(_measure(warp, newton, device, n, quick))
-        except Exception as error:
-            out.append({"name": name, "error": f"{type(error).__name__}: {error}".splitlines()[0][:300]})
-    return out
-
-
-def _measure(warp: Any, newton: Any, device: str, n: int, quick: bool, sweeps: int = 20) -> dict[str, Any]:
-    start = time.perf_counter()
-    mesh = dv.mesh.cube(n, split="five")
-    model = build(newton, mesh, device)
-    solver = newton.solvers.SolverVBD(model, iterations=sweeps)
-    states, control = [model.state(), model.state()], model.control()
-    steps = 2 if quick else 10  # even, so that the graph ends in the state that it starts from
-
-    def work() -> None:
-        for _ in range(steps):
-            solver.step(states[0], states[1], control, None, 5e-3)
-            states.reverse()
-
-    work()  # compiles the kernels
-    warp.synchronize_device(device)
-    built = time.perf_counter() - start
-    y = states[0].particle_q.numpy()[:, 1]
-    if not np.isfinite(y).all():
-        raise RuntimeError("positions are not finite")
-    eager = statistics.median(_spans(warp, device, work, 2 if quick else 3))
-    graph = None
-    if warp.get_device(device).is_cuda:
-        with warp.ScopedCapture(device, force_module_load=False) as capture:
-            work()
-        graph = statistics.median(_spans(warp, device, lambda: warp.capture_launch(capture.graph), 20))
-    return {
-        "name": f"Newton SolverVBD {newton.__version__} (warp {warp.__version__}), {mesh.num_vertices} v / "
-        f"{mesh.num_tets} t, K = {sweeps}, float32",
-        "part": "forward",
-        "vertices": mesh.num_vertices,
-        "ms": None if graph is None else 1e3 * graph / steps,
-        "eager_ms": 1e3 * eager / steps,
-        "earlier_ms": EARLIER.get(n),
-        "colors": len(model.particle_color_groups),
-        "sank_mm": 1e3 * float((mesh.points[:, 1] - y).max()),  # > 0: the scene did run
-        "setup_s": built,
-    }
 
 
 def ladder(
@@ -144,23 +81,3 @@ def build(
     builder.tet_materials.extend([(*material, 0.0)] * len(tets))
     builder.color()
     return builder.finalize(device=device)
-
-
-def _spans(warp: Any, device: str, work: Any, count: int) -> list[float]:
-    """Seconds of each of several calls, by events on CUDA."""
-    cuda = warp.get_device(device).is_cuda
-    out = []
-    for _ in range(count):
-        warp.synchronize_device(device)
-        if cuda:
-            with warp.ScopedDevice(device):
-                first, last = warp.Event(enable_timing=True), warp.Event(enable_timing=True)
-                warp.record_event(first)
-                work()
-                warp.record_event(last)
-                out.append(warp.get_event_elapsed_time(first, last) / 1e3)
-        else:
-            start = time.perf_counter()
-            work()
-            out.append(time.perf_counter() - start)
-    return out

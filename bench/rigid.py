@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import torch
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench.measure import Card
+from bench.tables import Table, times
 
 
-def run(quick: bool, device: str = "cpu") -> list[dict[str, Any]]:
+def corrections(card: Card) -> list[dict[str, Any]]:
+    quick, device = card.quick, str(card.device)
     out = []
     sizes: list[tuple[str, Callable[[], dv.TetMesh], int, int]] = [
         ("cube of 27", lambda: dv.mesh.cube(3, size=0.2, split="kuhn"), 20, 1),
@@ -38,11 +39,11 @@ def run(quick: bool, device: str = "cpu") -> list[dict[str, Any]]:
                 energies_of = (dv.StableNeoHookean(), *floor)
                 model = dv.Model(mesh, energies=energies_of, rigid=rigid, start=start, device=device)
                 key = "with" if rigid else "without"
-                row[f"step_{key}"] = _seconds(model, scenes, sweeps, False, quick)
+                row[f"step_{key}"] = _seconds(card, model, scenes, sweeps, False)
                 if not rigid:
-                    few = _seconds(model, scenes, 1, False, quick)
+                    few = _seconds(card, model, scenes, 1, False)
                     row["sweep"] = (row["step_without"] - few) / (sweeps - 1)
-                row[f"both_{key}"] = _seconds(model, scenes, sweeps, True, quick)
+                row[f"both_{key}"] = _seconds(card, model, scenes, sweeps, True)
             row["corrections_over_sweep"] = (row["step_with"] - row["step_without"]) / row["sweep"]
             row["step_ratio"] = row["step_with"] / row["step_without"]
             row["both_ratio"] = row["both_with"] / row["both_without"]
@@ -57,49 +58,24 @@ def _cubes(count: int) -> dv.TetMesh:
     return dv.mesh.replicate(dv.mesh.cube(2, size=0.2, split="kuhn"), place.numpy())
 
 
-def _seconds(model: dv.Model, scenes: int, sweeps: int, backward: bool, quick: bool) -> float:
-    """Median time of a step, or of a step and its backward."""
+def _seconds(card: Card, model: dv.Model, scenes: int, sweeps: int, backward: bool) -> float:
+    """Median time of a step, or of a step and its backward; on CUDA of a graph, which has no share of the host."""
     x = model.rest_points
     x = (x if scenes == 1 else x.expand(scenes, -1, -1).contiguous()).requires_grad_(backward)
     v = torch.zeros_like(x)
-    cuda = model.device.type == "cuda"
 
-    def once() -> None:
+    def once() -> Any:
         x1, v1 = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=0.01, sweeps=sweeps)
-        if backward:
-            torch.autograd.grad(x1.sum() + v1.sum(), x)
+        return torch.autograd.grad(x1.sum() + v1.sum(), x) if backward else (x1, v1)
 
-    def timed(repeats: int) -> float:
-        if cuda:
-            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            start.record()
-            for _ in range(repeats):
-                run_once()
-            end.record()
-            torch.cuda.synchronize()
-            return start.elapsed_time(end) / 1e3 / repeats
-        began = time.perf_counter()
-        for _ in range(repeats):
-            run_once()
-        return (time.perf_counter() - began) / repeats
-
-    run_once: Callable[[], object] = once
-    for _ in range(2):
-        once()
-    if cuda:  # the device's own time: launches from a graph, as a rollout that is captured has them
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            once()
-        run_once = graph.replay
-    first = timed(1)
-    repeats = max(1, min(200, int((0.02 if quick else 0.1) / max(first, 1e-6))))
-    return sorted(timed(repeats) for _ in range(3 if quick else 7))[1 if quick else 3]
+    return card.graph(once) or card.eager(once, 50)
 
 
-def markdown(results: list[dict[str, Any]]) -> str:
-    header = ["scene", "energies", "K", "a sweep [us]", "both corrections over a sweep", "step with over without",
-              "step and backward, with over without"]  # fmt: skip
-    rows = [[r["scene"], r["energies"], r["sweeps"], 1e6 * r["sweep"], r["corrections_over_sweep"], r["step_ratio"],
-             r["both_ratio"]] for r in results]  # fmt: skip
-    return "## What the rigid corrections at the start and the end of a step cost\n\n" + markdown_table(header, rows)
+ANYWHERE = True
+GROUPS = {"corrections": corrections}
+TABLES = (
+    Table("What the rigid corrections at the start and the end of a step cost", "corrections",
+          {"scene": "scene", "energies": "energies", "K": "sweeps", "a sweep [us]": times("sweep", 1e6),
+           "both corrections over a sweep": "corrections_over_sweep", "step with over without": "step_ratio",
+           "step and backward, with over without": "both_ratio"}),
+)  # fmt: skip

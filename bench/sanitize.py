@@ -14,7 +14,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -23,7 +22,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench import common
+from bench.tables import Table
 from diffvbd import mesh
 
 DEVICE = "cuda"
@@ -87,7 +87,6 @@ SCENES: dict[str, Scene] = {
     "floor, thread": _free("thread", (FLOOR,)),
     "floor and friction": _free("color", (FLOOR, FRICTION)),
     "coarse": _free(None, coarse="auto", relaxation=1.5),
-    "Anderson": _free(None, acceleration=dv.Anderson(2)),
     "pairs": _touching(1),
     "pairs, friction, a collider": _touching(2, FRICTION, colliders=(PLANE,)),
     "pairs, floor, float32": _touching(2, FLOOR, dtype=torch.float32),
@@ -115,9 +114,7 @@ def step_of(scene: Scene, steps: int, sweeps: int) -> None:
 
 def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
     """``only``: tools or scenes, split by semicolons, since names of scenes have commas."""
-    began, wanted = time.perf_counter(), [name for name in only.split(";") if name]
-    if unknown := [name for name in wanted if name not in (*TOOLS, *SCENES)]:
-        raise SystemExit(f"only: expected names among {'; '.join((*TOOLS, *SCENES))}, got {'; '.join(unknown)}")
+    wanted = [] if not only else common.chosen(only, (*TOOLS, *SCENES))
     if shutil.which(SANITIZER) is None:
         raise SystemExit(f"sanitize: expected NVIDIA's {SANITIZER} on the PATH, and found none")
     tools = [tool for tool in TOOLS if tool in wanted] or list(TOOLS)
@@ -133,7 +130,7 @@ def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
                      "first": next((f["first"] for f in done if f["found"]), ""),
                      "not found again": [f"{f['scene']}: {f['once']}" for f in done if f["once"]],
                      "not done": [f["scene"] for f in own if f["found"] is None]})  # fmt: skip
-    return {"rows": rows, "scenes": names, "seconds": time.perf_counter() - began}
+    return {"rows": rows, "scenes": names}
 
 
 def _of_processes(tool: str, name: str, device: str) -> dict[str, Any]:
@@ -174,12 +171,12 @@ def _first(text: str) -> str:
     return " | ".join(line.strip() for line in lines[1:4] if "SUMMARY" not in line)
 
 
-def markdown(results: dict[str, Any]) -> str:
-    header = ("tool", "scenes", "found", "the first", "not found again", "not done in time")
-    rows = ([row["tool"], row["scenes"], row["found"], row["first"] or "-",
-             *("; ".join(row[key]) or "-" for key in ("not found again", "not done"))]
-            for row in results["rows"])  # fmt: skip
-    return "## compute-sanitizer\n\n" + markdown_table(header, rows) + "\nScenes: " + "; ".join(results["scenes"]) + "."
+TABLES = (
+    Table("compute-sanitizer", "rows",
+          {"tool": "tool", "scenes": "scenes", "found": "found", "the first": "first",
+           "not found again": lambda row: "; ".join(row["not found again"]),
+           "not done in time": lambda row: "; ".join(row["not done"])}),
+)  # fmt: skip
 
 
 def main(arguments: list[str]) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 
 import diffvbd as dv
-from bench.common import RESULTS
+from bench.common import ROOT
 
-FOLDER = RESULTS.parents[1] / "docs" / "images"
+FOLDER = ROOT / "docs" / "images"
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SETTLED = 4.0  # [s] until a browser that draws in software has drawn
 

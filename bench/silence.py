@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table, side_by_side
+from bench.measure import Card
+from bench.tables import Table, count
 
 WRONG, CONVERGED = 0.05, 0.005  # of the motion
 MOST_SWEEPS = 15_000
@@ -166,25 +168,20 @@ def measure(case: tuple[str, int]) -> dict[str, Any]:
             "integrator": type(scene.integrator).__name__, "seconds": seconds}  # fmt: skip
 
 
-def counted(rows: list[dict[str, Any]]) -> dict[str, int]:
-    known = [r for r in rows if r["error"] is not None]
-    wrong = [r for r in known if r["error"] > WRONG]
-    return {"wrong, silent": sum(not r["warned"] for r in wrong), "wrong, warned": sum(r["warned"] for r in wrong),
-            "right, warned": sum(r["warned"] for r in known) - sum(r["warned"] for r in wrong),
-            "of these off by 1 % or less": sum(r["warned"] and r["error"] <= 0.01 for r in known),
-            "right, silent": sum(not r["warned"] for r in known) - sum(not r["warned"] for r in wrong),
-            "reference not converged": len(rows) - len(known)}  # fmt: skip
+def kind(name: str) -> Callable[[Card], list[dict[str, Any]]]:
+    return lambda card: [measure((name, number)) for number in range(1 if card.quick else 20)]
 
 
-def run(quick: bool) -> dict[str, Any]:
-    cases = [(kind, number) for kind in KINDS for number in range(1 if quick else 20)]
-    found = dict(side_by_side(measure, cases, at_once=False))
-    rows = {kind: [found[kind, n] for k, n in cases if k == kind] for kind in KINDS}
-    return {"wrong_above": WRONG, "counts": {kind: counted(r) for kind, r in rows.items()}, "rows": rows}
+def wrong(row: Any) -> bool:
+    return row["error"] is not None and not (isinstance(row["error"], float) and row["error"] <= WRONG)
 
 
-def markdown(results: dict[str, Any]) -> str:
-    counts = results["counts"]
-    header = ("kind", *next(iter(counts.values())))
-    table = markdown_table(header, [(kind, *row.values()) for kind, row in counts.items()])
-    return f"## Rollouts off by more than {100 * results['wrong_above']:g} % of their motion\n\n{table}"
+GROUPS = {name: kind(name) for name in KINDS}
+THREADS = 1
+TABLES = (
+    Table(f"Rollouts off by more than {100 * WRONG:g} % of their motion: {{}}", "*",
+          {"rollouts": count(), "wrong, silent": count(lambda row: wrong(row) and not row["warned"]),
+           "wrong, warned": count(lambda row: wrong(row) and row["warned"]),
+           "right, warned": count(lambda row: row["error"] is not None and not wrong(row) and row["warned"]),
+           "reference not converged": count(lambda row: row["error"] is None)}, by="coarse"),
+)  # fmt: skip

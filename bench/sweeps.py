@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import titled_tables
+from bench.measure import Card
+from bench.tables import Table
 from diffvbd.inspect.diagnose import diagnose
 
 SWEEPS = (5, 10, 20, 50, 100, 200, 500, 1000)
@@ -19,17 +21,8 @@ MATERIAL = {"mu": 1e5, "lam": 1.5e5}
 STEP = 1 / 60
 
 
-def run(quick: bool) -> dict[str, Any]:
-    sweeps = (5, 50) if quick else SWEEPS
-    return {
-        "hanging_bar": hanging_bar(sweeps, quick),
-        "equal_work": equal_work(quick),
-        "swinging_beam": swinging_beam(sweeps, quick),
-    }
-
-
 def bar(relaxation: float = 1.0, start: Any = "predictor") -> dv.Model:
-    """A bar of 1 m, 11 layers of vertices, held at its upper end. What `start` does, `bench starts` measures."""
+    """A bar of 1 m, 11 layers of vertices, held at its upper end."""
     mesh = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2), split="kuhn")
     # x is the long axis of beam(); turned so that it hangs down
     points = np.stack([mesh.points[:, 1], -mesh.points[:, 0], mesh.points[:, 2]], -1)
@@ -106,47 +99,15 @@ def _milliseconds(model: dv.Model, h: float, sweeps: int, mu: float, lam: float)
     return 1e3 * min(times)
 
 
-def swinging_beam(sweeps: tuple[int, ...], quick: bool) -> list[dict[str, Any]]:
-    """Position error after 0.5 s of a cantilever falling from rest, against converged steps of the same h."""
-    steps = 5 if quick else 30
-    out = []
-    for stiffness in (1.0,) if quick else (1.0, 100.0):
-        material = {k: stiffness * value for k, value in MATERIAL.items()}
-        goal = swing(beam(1.6), 500 if quick else 5000, steps, material)
-        moved = float((goal - beam().rest_points).norm(dim=-1).max())
-        for relaxation in RELAXATIONS:
-            for k in sweeps:
-                model = beam(relaxation)
-                error = float((swing(model, k, steps, material) - goal).norm(dim=-1).max())
-                out.append(
-                    {
-                        "mu": material["mu"],
-                        "relaxation": relaxation,
-                        "sweeps": k,
-                        "ms_per_step": _milliseconds(model, STEP, k, **material),
-                        "error": error,
-                        "error_over_motion": error / moved,
-                    }
-                )
-    return out
+def counts(card: Card) -> tuple[int, ...]:
+    return (5, 50) if card.quick else SWEEPS
 
 
-def beam(relaxation: float = 1.0, start: Any = "predictor") -> dv.Model:
-    mesh = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2), split="kuhn")
-    return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=relaxation, start=start)
-
-
-def swing(model: dv.Model, sweeps: int, steps: int, material: dict[str, float]) -> Tensor:
-    """Positions after the last of `steps` steps."""
-    x = model.rest_points
-    options = {"steps": steps, "time_step": STEP, "sweeps": sweeps, "save": "last", **material}
-    return dv.rollout(model, x, torch.zeros_like(x), **options).x[-1]
-
-
-def markdown(results: dict[str, Any]) -> str:
-    titles = {
-        "hanging_bar": "Hanging bar of 1 m: elongation at rest against equilibrium",
-        "equal_work": "The same bar 100 times stiffer, 100 sweeps per 1/60 s",
-        "swinging_beam": "Cantilever of 1 m released from rest: position after 0.5 s against converged steps",
-    }
-    return titled_tables(results, titles)
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    "hanging_bar": lambda card: hanging_bar(counts(card), card.quick),
+    "equal_work": lambda card: equal_work(card.quick),
+}
+TABLES = (
+    Table("Hanging bar of 1 m: elongation at rest against equilibrium", "hanging_bar"),
+    Table("The same bar 100 times stiffer, 100 sweeps per 1/60 s", "equal_work"),
+)

@@ -1,16 +1,21 @@
-"""Coarse corrections between sweeps, with Anderson acceleration and without: error and time beside plain sweeps.
+"""Coarse corrections between sweeps: error and time beside plain sweeps, in stiff, thin and violent scenes.
 
 Error: the largest distance of a vertex from where converged steps of the same h end, over the largest motion, after 30
-steps. Time: a whole step, on one thread, everything included; also in plain sweeps of the same scene, and as the K of a
-plain step that takes as long. With coarse corrections relaxation is 1.5; plain sweeps have the best of three
-relaxations and two starts at each K. Anderson acceleration: of cycles with corrections, window 2; and of plain sweeps,
-window 5, relaxation 1.3.
+steps. Time: a whole step, on one thread, everything included; on CUDA that of a graph. With coarse corrections
+relaxation is 1.5; plain sweeps have the best of three relaxations and two starts at each K. A violent scene begins far
+from where it would rest; beside it stand plain sweeps that take as long, and the largest rise of the incremental
+potential in a step.
+
+One correction: its time in
+sweeps, by differences over K; `reverse` the backward to state and material alone. Targets: 2.5 sweeps, and 3 in
+reverse.
 """
 
 from __future__ import annotations
 
-import sys
+import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,39 +23,131 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
-from bench.twolevel_scenes import Scene, functions, hanging_bar, scenes, violent_scenes
+from bench.measure import Card
+from bench.sweeps import MATERIAL, bar
+from bench.tables import Table
 from diffvbd import reference
+
+RELAXATION = 1.5  # with corrections
+
+
+@dataclass(frozen=True)
+class Scene:
+    name: str
+    mesh: dv.TetMesh
+    pinned: np.ndarray
+    material: dict[str, Any]  # mu, lam [Pa]
+    time_step: float = 1 / 60
+    x: Tensor | None = None  # None: at rest
+    v: Tensor | None = None
+
+    device: str = "cpu"
+
+    def state(self) -> tuple[Tensor, Tensor]:
+        x = torch.from_numpy(self.mesh.points.copy()) if self.x is None else self.x
+        return x.to(self.device), (torch.zeros_like(x) if self.v is None else self.v).to(self.device)
+
+    def model(self, coarse: Any = "auto", relaxation: float = RELAXATION, start: Any = "auto") -> dv.Model:
+        return dv.Model(self.mesh, pinned=torch.from_numpy(self.pinned), relaxation=relaxation, start=start,
+                        coarse=coarse, device=self.device)  # fmt: skip
+
+    def rolled(self, model: dv.Model, sweeps: int, steps: int, save: Any = "all") -> dv.Trajectory:
+        options = {"steps": steps, "time_step": self.time_step, "sweeps": sweeps, "save": save, **self.material}
+        with torch.no_grad():
+            return dv.rollout(model, *self.state(), **options)
+
+    def end(self, model: dv.Model, sweeps: int, steps: int) -> Tensor:
+        return self.rolled(model, sweeps, steps, "last").x[-1]
+
+    def seconds(self, model: dv.Model, sweeps: int, card: Card) -> float:
+        """Of a step: of a CUDA graph, or over ten."""
+        x, v = self.state()
+
+        def work() -> Any:
+            with torch.no_grad():
+                return dv.step(model, x, v, time_step=self.time_step, sweeps=sweeps, **self.material)
+
+        if card.cuda:
+            return card.graph(work) or 0.0
+        begun = time.perf_counter()
+        self.rolled(model, sweeps, 10, "last")
+        return (time.perf_counter() - begun) / 10
+
+
+def scenes(card: Card) -> list[Scene]:
+    """On a GPU one large mesh."""
+    if card.quick:
+        return [cantilever((5, 3, 3)), sheet(0.25, cells=4)]
+    if card.cuda:
+        return [replace(cantilever((101, 45, 45)), device=str(card.device))]
+    sizes = ((13, 5, 5), (21, 7, 7), (41, 13, 13))
+    return [*map(cantilever, sizes), hanging_bar(), sheet(0.25), sheet(0.05)]
+
+
+def cantilever(counts: tuple[int, int, int]) -> Scene:
+    mesh = dv.mesh.beam(*counts, size=(1.0, 0.2, 0.2), split="kuhn")
+    name = f"cantilever, {mesh.num_vertices} vertices"
+    return Scene(name, mesh, mesh.points[:, 0] < 1e-9, {"mu": 1e7, "lam": 1e7})
+
+
+def hanging_bar() -> Scene:
+    model = bar()
+    return Scene("hanging bar", model.mesh, model.pinned.numpy(), dict(MATERIAL))
+
+
+def sheet(ratio: float, cells: int = 20) -> Scene:
+    """1 m square of one layer, held at one edge; ratio: thickness over the width of a cell."""
+    mesh = dv.mesh.beam(cells + 1, 2, cells + 1, size=(1.0, ratio / cells, 1.0), split="kuhn")
+    name = f"sheet, thickness 1/{round(1 / ratio)} cell"
+    return Scene(name, mesh, mesh.points[:, 0] < 1e-9, {"mu": 1e6, "lam": 1.5e6})
+
+
+def violent_scenes(quick: bool) -> list[Scene]:
+    """A bar of 0.5 m, held at x = 0, that begins far from where it would rest."""
+    mesh = dv.mesh.beam(*((5, 3, 3) if quick else (21, 7, 7)), size=(0.5, 0.2, 0.2), split="kuhn")
+    points = torch.from_numpy(mesh.points.copy())
+    pinned = mesh.points[:, 0] < 1e-9
+    cell = 0.5 / (4 if quick else 20)
+
+    def twisted(degrees: float) -> Tensor:
+        angle = np.deg2rad(degrees) * points[:, 0] / 0.5
+        middle = points[:, 1:].mean(0)
+        y, z = (points[:, 1:] - middle).unbind(1)
+        sin, cos = torch.sin(angle), torch.cos(angle)
+        return torch.stack((points[:, 0], middle[0] + cos * y - sin * z, middle[1] + sin * y + cos * z), 1)
+
+    def along(factor: float) -> Tensor:
+        return points * torch.tensor([factor, 1.0, 1.0], dtype=torch.float64)
+
+    noise = torch.from_numpy(np.random.default_rng(0).uniform(-0.5, 0.5, points.shape))
+    noise[torch.from_numpy(pinned)] = 0
+    speed = torch.zeros_like(points)
+    speed[:, 1] = 300 * points[:, 0] / 0.5
+    states = {"twist 60 degrees": twisted(60), "twist 180 degrees": twisted(180), "stretched 3x": along(3),
+              "mirrored": along(-1), "squashed to 0.05": along(0.05), "noise of half a cell": points + cell * noise,
+              "tip at 300 m/s": points}  # fmt: skip
+    if quick:
+        states = {"twist 60 degrees": twisted(60), "mirrored": along(-1)}
+    material = {"mu": 1e6, "lam": 1.5e6}
+    return [
+        Scene(name, mesh, pinned, material, 0.01, x, speed if name.startswith("tip") else None)
+        for name, x in states.items()
+    ]
+
+
+def functions(model: dv.Model) -> int:
+    return int((~model.coarse_geometry.filling).sum())
+
 
 SWEEPS = (1, 2, 4, 5, 7, 8, 10, 11, 13, 14, 16, 17, 19, 20, 22, 23, 25, 31, 40, 52, 70, 100, 150, 200, 300)
 PLAIN_SWEEPS = (5, 10, 20, 50, 100, 200, 300)
 LAST = 1000  # plain sweeps where those do not reach 1 %
 PLAIN = tuple((relaxation, start) for relaxation in (1.0, 1.6, 1.8) for start in ("auto", "inertia"))
-# methods beside plain sweeps: name, arguments of Scene.model
-METHODS: dict[str, dict[str, Any]] = {
-    "two_level": {},
-    "two_level_anderson": {"window": 2},
-    "plain_anderson": {"coarse": None, "relaxation": 1.3, "start": "inertia", "window": 5},
-}
 VIOLENT_SWEEPS = (13, 25, 49)
 ROUNDS = 7  # of times
 LEVELS = (0.01, 1e-4)
 CONVERGED = 1e-7  # of the motion, between two K
 RISE = 1e-12  # of the potential at the start of a step, below which a rise counts as none
-HANGING, VIOLENT_RATIO = 1e-3, 1.3  # targets; those of calm scenes stand in `scenes`
-
-
-def run(quick: bool, only: str = "scenes,violent") -> dict[str, Any]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    groups: dict[str, Callable[[bool], Any]] = {
-        "scenes": lambda quick: [measure(scene, quick) for scene in scenes(quick)],
-        "violent": lambda quick: [row for scene in violent_scenes(quick) for row in violent(scene, quick)],
-    }
-    try:
-        return {name: groups[name](quick) for name in only.split(",")}
-    finally:
-        torch.set_num_threads(threads)
 
 
 def converged(scene: Scene, steps: int, quick: bool, most: int = 6400) -> tuple[Tensor, dict[str, float]]:
@@ -71,49 +168,13 @@ def converged(scene: Scene, steps: int, quick: bool, most: int = 6400) -> tuple[
     return way.x[-1], found
 
 
-def measure(scene: Scene, quick: bool) -> dict[str, Any]:
-    steps = 5 if quick else 30
-    goal, found = converged(scene, steps, quick)
-
-    def error(model: dv.Model, sweeps: int) -> float:
-        return float((scene.end(model, sweeps, steps) - goal).norm(dim=-1).max()) / found["motion"]
-
-    own = {name: scene.model(**options) for name, options in METHODS.items()}
-    counts = SWEEPS[:6] if quick else SWEEPS
-    found_by = {name: [{"sweeps": k, "error": error(model, k)} for k in counts] for name, model in own.items()}
-    models = {options: scene.model(None, *options) for options in PLAIN}
-    plain = []
-    for k in PLAIN_SWEEPS[:4] if quick else PLAIN_SWEEPS:
-        best = min((error(m, k), *options) for options, m in models.items())
-        plain.append({"sweeps": k, "error": best[0], "relaxation": best[1], "start": best[2]})
-    if not quick and plain[-1]["error"] > LEVELS[0]:
-        options = (plain[-1]["relaxation"], plain[-1]["start"])
-        plain.append({**plain[-1], "sweeps": LAST, "error": error(models[options], LAST)})
-    timed = [(own[name], rows) for name, rows in found_by.items()]
-    least_times(scene, [*timed, (models[PLAIN[0]], plain)], 2 if quick else ROUNDS)
-    sweep, fixed = line(plain)
-    reached = {}
-    for name, rows in (*found_by.items(), ("plain", plain)):
-        for level in LEVELS:
-            at = first_below(rows, level)
-            reached[f"{name}_{level:g}"] = None if at is None else {"K": at["sweeps"], "ms": at["ms"],
-                "sweeps": at["ms"] / sweep, "plain_K": (at["ms"] - fixed) / sweep}  # fmt: skip
-    row = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(own["two_level"]),
-           "reference": found, "sweep_ms": sweep, "fixed_ms": fixed, "targets": scene.targets, **reached,
-           **found_by, "plain": plain}  # fmt: skip
-    if scene.name == "hanging bar":
-        row["at_rest"] = at_rest(quick)
-    _say(scene.name, {k: v for k, v in row.items() if k not in (*METHODS, "plain")})
-    return row
-
-
-def least_times(scene: Scene, models: list[tuple[dv.Model, list[dict[str, Any]]]], rounds: int) -> None:
+def least_times(scene: Scene, models: list[tuple[dv.Model, list[dict[str, Any]]]], card: Card) -> None:
     """Adds to each row the time of a step, the least of several rounds of all: the machine is not always as fast."""
-    for n in range(rounds):
+    for n in range(2 if card.quick else ROUNDS):
         for model, rows in models:
             for row in rows:
                 if row["sweeps"] <= 100 or n < 2:
-                    row["ms"] = min(row.get("ms", float("inf")), 1e3 * scene.seconds(model, row["sweeps"]))
+                    row["ms"] = min(row.get("ms", float("inf")), 1e3 * scene.seconds(model, row["sweeps"], card))
 
 
 def line(rows: list[dict[str, Any]]) -> tuple[float, float]:
@@ -133,22 +194,38 @@ def first_below(rows: list[dict[str, Any]], level: float) -> dict[str, Any] | No
     return found
 
 
-def at_rest(quick: bool) -> list[dict[str, Any]]:
-    """Error of the elongation at which steps without inertia come to rest, as `bench sweeps` measures it."""
-    scene, out, ends = hanging_bar(), [], {}
-    for k in (10,) if quick else (500, 5, 10, 20):
-        model, (x, v) = scene.model(), scene.state()
-        for _ in range(20 if quick else 2000):
-            before, (x, _) = x, dv.step(model, x, v, time_step=scene.time_step, sweeps=k, **scene.material)
-            if float((x - before).abs().max()) < 1e-12:
-                break
-        ends[k] = float(-1 - x[:, 1].min())
-        out.append({"sweeps": k, "elongation": ends[k], "error": ends[k] / ends[next(iter(ends))] - 1})
-    return out
+def measure(scene: Scene, card: Card) -> dict[str, Any]:
+    """Errors and times over K, with corrections and without, and where each error is reached."""
+    steps = 5 if card.quick else 30
+    goal, found = converged(scene, steps, card.quick)
+
+    def error(model: dv.Model, sweeps: int) -> float:
+        return float((scene.end(model, sweeps, steps) - goal).norm(dim=-1).max()) / found["motion"]
+
+    two, models = scene.model(), {options: scene.model(None, *options) for options in PLAIN}
+    rows = [{"sweeps": k, "error": error(two, k)} for k in SWEEPS[: 6 if card.quick else None]]
+    plain = []
+    for k in PLAIN_SWEEPS[: 4 if card.quick else None]:
+        best = min((error(m, k), *options) for options, m in models.items())
+        plain.append({"sweeps": k, "error": best[0], "relaxation": best[1], "start": best[2]})
+    if not card.quick and plain[-1]["error"] > LEVELS[0]:
+        options = (plain[-1]["relaxation"], plain[-1]["start"])
+        plain.append({**plain[-1], "sweeps": LAST, "error": error(models[options], LAST)})
+    least_times(scene, [(two, rows), (models[PLAIN[0]], plain)], card)
+    sweep, fixed = line(plain)
+    row: dict[str, Any] = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(two),
+                           "reference": found, "sweep_ms": sweep, "fixed_ms": fixed}  # fmt: skip
+    for name, own in (("two_level", rows), ("plain", plain)):
+        row[name] = own
+        for level in LEVELS:
+            at = first_below(own, level)
+            row[f"{name}_{level:g}"] = at and {"K": at["sweeps"], "ms": at["ms"], "sweeps": at["ms"] / sweep}
+    return row
 
 
-def violent(scene: Scene, quick: bool) -> list[dict[str, Any]]:
+def violent(scene: Scene, card: Card) -> list[dict[str, Any]]:
     """Two-level and plain sweeps of equal relaxation and time; whether steps descend from where they start."""
+    quick = card.quick
     steps = 5 if quick else 30
     goal, found = converged(scene, steps, quick, 1600)
     two, plain = scene.model(), scene.model(None)
@@ -161,7 +238,7 @@ def violent(scene: Scene, quick: bool) -> list[dict[str, Any]]:
 
     rows = [{"sweeps": k} for k in (VIOLENT_SWEEPS[:1] if quick else VIOLENT_SWEEPS)]
     beside = [{"sweeps": 10}, {"sweeps": 50}]
-    least_times(scene, [(two, rows), (plain, beside)], 2 if quick else ROUNDS)
+    least_times(scene, [(two, rows), (plain, beside)], card)
     sweep, fixed = line(beside)
     out = []
     for row in rows:
@@ -182,7 +259,6 @@ def violent(scene: Scene, quick: bool) -> list[dict[str, Any]]:
             "mean_length": float(torch.cat([s.flatten() for s in lengths]).mean()),
             "references_apart": float((goal - other).norm(dim=-1).max()) / motion, "reference": found,
         })  # fmt: skip
-        _say(scene.name, out[-1])
     return out
 
 
@@ -207,54 +283,86 @@ def rise(scene: Scene, model: dv.Model, way: dv.Trajectory) -> float:
     return worst
 
 
-def _say(name: str, row: dict[str, Any]) -> None:
-    print(name, row, file=sys.stderr, flush=True)
+FEW, MANY = 4, 13  # sweeps between whose steps a correction is measured
 
 
-# --- text -------------------------------------------------------------------------------------------------------------
+# --- one correction ---------------------------------------------------------------------------------------------------
 
 
-def markdown(results: dict[str, Any]) -> str:
-    parts = []
-    if rows := results.get("scenes"):
-        header = ("scene", "vertices", "functions", "method", "1 %: K", "ms", "sweeps", "equal K", "0.01 %: K", "ms",
-                  "sweeps", "equal K", "error left", "targets")  # fmt: skip
-        parts.append("## Time to an error, and what is left at the most sweeps\n\n" + markdown_table(
-            header, [_time_row(row, name) for row in rows for name in (*METHODS, "plain") if name in row]))  # fmt: skip
-        counts = [row["sweeps"] for row in rows[0]["two_level"]]
-        for method in METHODS:
-            table = [[row["scene"], *(r["error"] for r in row[method])] for row in rows if method in row]
-            title = f"## Error over motion by K, {method.replace('_', ' ')}\n\n"
-            parts.append(title + markdown_table(["scene", *map(str, counts)], table))
-        table = [[row["scene"], *(f"{r['error']:.3g} ({r['relaxation']:g}, {r['start']})" for r in row["plain"][:7])]
-                 for row in rows]  # fmt: skip
-        counts = [row["sweeps"] for row in rows[0]["plain"][:7]]
-        parts.append("## Plain sweeps: error over motion by K (relaxation, start)\n\n"
-                     + markdown_table(["scene", *map(str, counts)], table))  # fmt: skip
-        table = [[row["scene"], row["sweep_ms"], row["fixed_ms"], *row["reference"].values()] for row in rows]
-        header = ("scene", "ms of a plain sweep", "ms besides", *(k.replace("_", " ") for k in rows[0]["reference"]))
-        parts.append("## References: K, difference of the last two K over motion\n\n" + markdown_table(header, table))
-        for row in rows:
-            if "at_rest" in row:
-                table = markdown_table(list(row["at_rest"][0]), [list(r.values()) for r in row["at_rest"]])
-                error = next(r["error"] for r in row["two_level"] if r["sweeps"] == 10)
-                text = f"Error over motion after 30 steps of K = 10: {error:.3g}; target {HANGING:g}.\n\n"
-                parts.append("## Hanging bar: elongation where steps with corrections come to rest\n\n" + text + table)
-    if rows := results.get("violent"):
-        names = ("scene", "sweeps", "ms", "plain_sweeps", "error", "plain_error", "ratio", "ratio_near", "rise",
-                 "plain_rise", "mean_length", "references_apart")  # fmt: skip
-        risen = sum(row["rise"] > RISE for row in rows)
-        text = f"Target of the ratio: {VIOLENT_RATIO:g}. Rollouts with a step that rises: {risen} of {len(rows)}.\n\n"
-        table = markdown_table([n.replace("_", " ") for n in names], [[row[n] for n in names] for row in rows])
-        parts.append("## Violent states: beside plain sweeps of equal relaxation and time\n\n" + text + table)
-    return "\n".join(parts)
+def cost(card: Card) -> list[dict[str, Any]]:
+    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075), split="kuhn")
+    side = 2 if card.quick else 100
+    grid = np.stack(np.meshgrid(range(side), [0], range(side)), -1).reshape(-1, 3)
+    stiff = {"mu": 1e7, "lam": 1e7}
+    crowd = Scene(f"{len(grid)} bodies of {small.num_vertices} vertices", dv.mesh.replicate(small, 0.2 * grid),
+                  np.tile(small.points[:, 0] < 1e-9, len(grid)), stiff)  # fmt: skip
+    cells = 3 if card.quick else 11
+    cube = dv.mesh.beam(cells, cells, cells, size=(0.5, 0.5, 0.5), split="kuhn")
+    scenes = 2 if card.quick else 1024
+    batch = Scene(f"{scenes} scenes of {cube.num_vertices} vertices", cube, cube.points[:, 0] < 1e-9, stiff)
+    sizes = ((5, 3, 3),) if card.quick else ((21, 7, 7), (101, 45, 45)) if card.cuda else ((21, 7, 7),)
+    return [*(_cost(card, cantilever(size), 1) for size in sizes), *([_cost(card, batch, scenes)] if card.cuda else []),
+            _cost(card, crowd, 1)]  # fmt: skip
 
 
-def _time_row(row: dict[str, Any], method: str) -> list[Any]:
-    out = [row["scene"], row["vertices"], row["functions"], method.replace("_", " ")]
-    for level in LEVELS:
-        at = row[f"{method}_{level:g}"]
-        out += ["not reached", None, None, None] if at is None else list(at.values())
-    last = row[method][-1]
-    targets = " / ".join("-" if t is None else f"{t:g}" for t in row["targets"]) if method == "two_level" else None
-    return [*out, f"{last['error']:.3g} at {last['sweeps']}", targets]
+def _cost(card: Card, scene: Scene, scenes: int) -> dict[str, Any]:
+    begun, scene = time.perf_counter(), replace(scene, device=str(card.device))
+    models = {name: scene.model(name) for name in (None, "auto")}
+    built = time.perf_counter() - begun
+    took: dict[tuple, float] = {}
+    for name, model in models.items():
+        for sweeps in (FEW, MANY):
+            for backward in (False, True):
+                took[name, sweeps, backward] = 1e3 * _seconds(card, scene, model, scenes, sweeps, backward)
+        card.tidy()
+    corrections = dv.CoarseSpace().corrections(MANY) - dv.CoarseSpace().corrections(FEW)
+    row: dict[str, Any] = {"scene": scene.name, "functions": functions(models["auto"]), "build_s": built}
+    for part, minus in (("forward", False), ("reverse", True)):
+
+        def of(name: Any, sweeps: int, part: str = part, minus: bool = minus) -> float:
+            whole = took[name, sweeps, part == "reverse"]
+            return whole - took[name, sweeps, False] if minus else whole
+
+        sweep = (of(None, MANY) - of(None, FEW)) / (MANY - FEW)
+        one = (of("auto", MANY) - of("auto", FEW) - (of(None, MANY) - of(None, FEW))) / corrections
+        besides = of("auto", FEW) - of(None, FEW) - one * dv.CoarseSpace().corrections(FEW)
+        row |= {f"{part}_sweep_ms": sweep, f"{part}_correction_ms": one, f"{part}_besides_ms": besides}
+    for name, unit in (("forward", "forward"), ("reverse", "forward"), ("reverse", "reverse")):
+        row[f"{name}_correction_in_{unit}_sweeps"] = row[f"{name}_correction_ms"] / row[f"{unit}_sweep_ms"]
+    return row
+
+
+def _seconds(card: Card, scene: Scene, model: dv.Model, scenes: int, sweeps: int, backward: bool) -> float:
+    x, v = (t.to(model.device).expand(scenes, -1, -1).contiguous().requires_grad_(backward) for t in scene.state())
+    material: dict[str, Any] = {
+        k: x.new_tensor(m).expand(scenes, 1).clone().requires_grad_(backward) for k, m in scene.material.items()
+    }
+
+    def work() -> Any:
+        with torch.set_grad_enabled(backward):
+            ends, _ = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, **material)
+            return torch.autograd.grad(ends.sum(), (x, v, *material.values())) if backward else ends
+
+    return card.graph(work) or card.eager(work)
+
+
+THREADS, ANYWHERE = 1, True
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    "scenes": lambda card: [measure(scene, card) for scene in scenes(card)],
+    "violent": lambda card: [] if card.cuda else [
+        row for scene in violent_scenes(card.quick) for row in violent(scene, card)],
+    "cost": cost,
+}  # fmt: skip
+REACHED: dict[str, Any] = {
+    f"{label} to {100 * level:g} %: {what}": f"{name}_{level:g}/{key}"
+    for level in LEVELS for name, label in (("two_level", "coarse"), ("plain", "plain"))
+    for key, what in (("K", "K"), ("ms", "ms"))
+}  # fmt: skip
+TABLES = (
+    Table("Time of a step to an error", "scenes",
+          {"scene": "scene", "vertices": "vertices", "functions": "functions", **REACHED,
+           "ms of a plain sweep": "sweep_ms"}),
+    Table("Error over motion by K, with corrections: {}", "scenes/*/two_level", ("sweeps", "error", "ms")),
+    Table("Violent states: beside plain sweeps of equal relaxation and time", "violent"),
+    Table("One correction, in sweeps", "cost"),
+)  # fmt: skip
