@@ -26,7 +26,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench.measure import Card
 from bench.tables import Table
-from diffvbd import mesh, reference
+from diffvbd import mesh
 from diffvbd.colliders import Obstacle, Plane
 
 Array = NDArray[np.float64]
@@ -431,63 +431,6 @@ def struck(count: int, gap: float, speed: float, time_step: float = 1 / 100, swe
 # --- grip -------------------------------------------------------------------------------------------------------------
 
 
-def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds: float = 0.5,
-         time_step: float = 1 / 240, device: str = "cpu", barrier: Options = None,
-         faster: Options = None) -> Row:  # fmt: skip
-    """Vertical force that a cube of 5 cm and 0.103 kg, held by friction alone, puts on its two clamps.
-
-    The clamps are plates whose outer faces are pinned and move inward in 0.1 s, by squeeze beyond the start of the
-    barrier. Gravity pulls the cube alone, so that the elastic force on the pinned faces is its weight, once at rest:
-    its mean over the last 0.1 s. faster: arguments of the Model.
-    """
-    size, thick, dhat = 0.05, 0.02, 2e-3
-    cube, plate = mesh.box(3, size, split="kuhn"), mesh.box((2, 3, 3), (thick, 0.06, 0.06), split="kuhn")
-    left = plate.translate((-thick - dhat, -0.0052, -0.0047))
-    right = plate.translate((size + dhat, -0.0049, -0.0051))
-    body = mesh.join([cube, left, right])
-    n, m = cube.num_vertices, plate.num_vertices
-    across = torch.tensor(body.points[:, 0])
-    outer = torch.zeros(len(across), dtype=torch.bool)
-    outer[n:] = (across[n:] < -thick - 0.5 * dhat) | (across[n:] > size + thick + 0.5 * dhat)
-    density = torch.full((body.num_tets,), 1000.0)
-    density[: cube.num_tets] = 0.103 / size**3
-    energies = (dv.StableNeoHookean(), pairs(barrier, kappa=KAPPA, dhat=dhat, self_contact=False),
-                dv.Friction(friction))  # fmt: skip
-    model = dv.Model(body, density=density, pinned=outer, energies=energies, device=device, **(faster or {}))
-    rest = model.rest_points
-    inward = torch.zeros_like(rest)
-    inward[n : n + m, 0], inward[n + m :, 0] = squeeze, -squeeze
-    gravity = torch.zeros_like(rest)
-    gravity[:n, 1] = -GRAVITY
-
-    def clamps(step: int) -> Tensor:
-        share = min(1.0, step * time_step / 0.1)
-        return torch.where(model.pinned[:, None], rest + share * inward, rest)
-
-    steps, last = round(seconds / time_step), round(0.1 / time_step)
-    course = march(Scene(model, MODULUS, time_step, sweeps, gravity=gravity, prescribed=clamps), steps)
-    loads = np.array([_pinned_load(model, x) for x in course.x[-last:]])
-    up = loads[:, n:].sum(1)[:, 1]
-    pressed = float(np.abs(loads[:, n : n + m, 0].sum(1)).mean())
-    fallen = float(course.center(-1, slice(n))[1] - course.center(0, slice(n))[1])
-    weight = 0.103 * GRAVITY
-    note = f"{up.min():.3g} to {up.max():.3g} N; pressed with {pressed:.3g} N; cube moved {1e3 * fallen:.3g} mm"
-    case = ", with ".join(["steady grip", *(faster or {})])
-    found = relative(course, "vertical force on the clamps [N]", case, float(up.mean()), weight, 0.05, note)
-    return (
-        found if sweeps >= 40 or (faster and "coarse" in faster) else found | {"target": "", "met": None}
-    )  # fewer are not expected to do
-
-
-def _pinned_load(model: dv.Model, x: Tensor) -> Array:
-    """Elastic force on each vertex that is pinned [N], downward loads positive along y; zero on the others."""
-    body = dv.Model(model.mesh)
-    leaf = x.clone().requires_grad_()
-    # at y = x and h = 1 s inertia adds nothing to the slope of the potential
-    (slope,) = torch.autograd.grad(reference.incremental_potential(body, leaf, x, MODULUS, 2 * MODULUS, 1.0), leaf)
-    return torch.where(model.pinned.cpu()[:, None], slope, 0.0).numpy()
-
-
 SPEEDS = (0.2, 1.0, 3.0, 10.0)  # [m/s]
 STRUCK = (  # cubes in a row, gap [m], speed of the first [m/s], time step [s]
     *((4, gap, speed, 0.01) for gap in (0.001, 0.005, 0.01, 0.02) for speed in (0.3, 1.0, 3.0, 10.0)),
@@ -504,10 +447,6 @@ GROUPED: dict[str, Callable[[bool, str], Made]] = {
     ],
     "spin": lambda quick, device: [spin(gap, steps, device=device)
                                    for gap, steps in ((0.002, 1), (0.002, 10), (0.01, 10))[: 1 if quick else 3]],
-    "grip": lambda quick, device: [grip(20, seconds=0.15, device=device)] if quick else [
-        *(grip(k, device=device) for k in (20, 40, 100, 400)),
-        *(grip(k, device=device, faster={"coarse": "auto"}) for k in (8, 20, 40)),
-    ],
     "gradient": lambda quick, device: [slide_gradient(surface, speed, device=device) for surface in SURFACES[:2]
                                        for speed in (SPEEDS[1:2] if quick else SPEEDS)],
     "stacks": lambda quick, device: [stack(2, seconds=0.1, device=device)] if quick else [

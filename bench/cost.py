@@ -5,10 +5,8 @@ and lam, the moduli being one number each; errors are those of x0 and v0. Conjug
 default does; iterations are those of the longest solve, and of all. Times are medians of rounds that visit all routes
 in turn. Unrolled autograd is `dv.Unrolled()`, the same sweeps in torch, vectorised over each color.
 
-Ours is compiled code, its opponents are sequences of torch operations on small tensors, as the paper's are. So the
-linear systems of the global routes are also given to scipy's sparse product in numpy's conjugate gradients, with the
-same preconditioner and tolerance: what is left of the factor then bounds what dispatch costs. The matrix-free opponent
-multiplies by hand-written products with the Hessian, where the paper's takes torch's double backward.
+Ours is compiled code, its opponents are sequences of torch operations on small tensors, as the paper's are. The matrix-
+free opponent multiplies by hand-written products with the Hessian, where the paper's takes torch's double backward.
 
 Memory, two definitions. Peak: on CUDA the growth of `torch.cuda.max_memory_allocated` over forward and backward, the
 paper's own; on the CPU that of the resident memory of a process of its own, the median of several. Kept: bytes of the
@@ -24,13 +22,10 @@ import multiprocessing
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
-from unittest import mock
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,16 +45,14 @@ from bench.exactness import (
     verify_forward,
 )
 from bench.measure import Card, kept_bytes, peak_memory, reset_peak_memory
-from bench.tables import Table, times, value_of
+from bench.tables import Table, times
 from diffvbd import testing
-from diffvbd.adjoint import implicit as global_adjoint
 
 SWEEPS = 20
 TOLERANCE = 1e-10  # of the linear solves: the default, and about the errors in the paper's table
 FULL, COMPACT = "reverse sweep, full tape", "reverse sweep, compact tape"
 GLOBAL = ("global, assembled", "global, matrix-free")
 ROUTES = (FULL, COMPACT, UNROLLED, *GLOBAL)
-PARTS = ("set_up_ms", "solve_ms", "gradients_ms", "other_ms")  # of a step of a global backward
 
 
 def route(name: str, solves: Solves | None = None) -> Any:
@@ -123,132 +116,8 @@ def _growth_here(name: str, quick: bool) -> int:
 # --- where the time of a global route goes ----------------------------------------------------------------------------
 
 
-@dataclass
-class Recorded:
-    """What a global backward has done: its seconds, the times between the parts of its steps, their linear systems."""
-
-    whole: float = 0.0
-    times: list[list[float]] = field(default_factory=list)
-    systems: list[tuple[Any, Tensor, Tensor]] = field(default_factory=list)  # product, right-hand side, solution
-
-    def milliseconds(self) -> np.ndarray:
-        """Of each of PARTS, per step."""
-        parts = np.diff(self.times, axis=-1).mean(0)
-        return 1e3 * np.append(parts, self.whole / len(self.times) - parts.sum())
-
-
-@contextmanager
-def recording(card: Card) -> Iterator[Recorded]:
-    """Within, steps of global backwards are recorded; in `diffvbd.adjoint.implicit` itself, so that it is what runs."""
-    done = Recorded()
-
-    def now() -> float:
-        card.sync()
-        return time.perf_counter()
-
-    class Potential(global_adjoint.IncrementalPotential):
-        def __init__(self, *args: Any) -> None:
-            done.times.append([now()])
-            super().__init__(*args)
-
-        def dependence(self, *args: Any) -> Any:
-            bars = super().dependence(*args)
-            done.times[-1].append(now())
-            return bars
-
-    solve = global_adjoint.conjugate_gradients
-
-    def solved(product: Any, b: Tensor, *args: Any) -> Any:
-        done.times[-1].append(now())
-        found = solve(product, b, *args)
-        done.times[-1].append(now())
-        done.systems.append((product, b, found.x))
-        return found
-
-    with mock.patch.multiple(global_adjoint, IncrementalPotential=Potential, conjugate_gradients=solved):
-        start = now()
-        yield done
-        done.whole = now() - start
-
-
-def split(card: Card, scene: Scene, name: str) -> Row:
-    """Milliseconds per step of each part of a global backward; of the assembled one, what other solvers need."""
-    task, runs = Task(scene, name), []
-    for _ in range(3 if card.quick else 15):
-        end = task.forward()
-        with recording(card) as done, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a solve that fails is a column of the table
-            task.backward(end)
-        runs.append(done)
-    row: Row = dict(zip(PARTS, np.median([run.milliseconds() for run in runs[1:]], 0).tolist(), strict=True))
-    if name == GLOBAL[0]:
-        systems = [_system(scene, *system) for system in runs[-1].systems]
-        row |= {"scipy": _by_scipy(card, systems)}
-    return row
-
-
-def _system(scene: Scene, product: Any, b: Tensor, solution: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dense matrix [3A, 3A], right-hand side and the package's solution [3A] between the A free vertices."""
-    free = (~scene.model.pinned).cpu().numpy()
-    dense = product.matrix.to_dense().cpu().numpy()
-    index = np.repeat(free, 3)
-    return dense[np.ix_(index, index)], b[0].cpu().numpy()[free].ravel(), solution[0].cpu().numpy()[free].ravel()
-
-
-def _median_ms(card: Card, work: Callable[[], Any]) -> float:
-    spans = []
-    for _ in range(3 if card.quick else 15):
-        card.sync()
-        start = time.perf_counter()
-        work()
-        card.sync()
-        spans.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(spans[1:])
-
-
-def _difference(found: np.ndarray, solution: np.ndarray) -> float:
-    return float(np.abs(found - solution).max() / np.abs(solution).max())
-
-
-def _by_scipy(card: Card, systems: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Row | None:
-    """The same systems by a compiled sparse product on the CPU; None without scipy."""
-    try:
-        from scipy import sparse
-    except ImportError:
-        return None
-    times, counts, differences = [], [], []
-    for dense, b, solution in systems:
-        each = np.arange(len(b) // 3)
-        blocks = np.linalg.inv(dense.reshape(len(each), 3, len(each), 3)[each, :, each])
-        matrix, inverse = sparse.csr_matrix(dense), sparse.bsr_matrix((blocks, each, np.arange(len(each) + 1))).tocsr()
-        found, count = _conjugate_gradients(matrix, inverse, b)
-        times.append(_median_ms(card, lambda m=matrix, i=inverse, b=b: _conjugate_gradients(m, i, b)))
-        counts.append(count)
-        differences.append(_difference(found, solution))
-    return {"ms": statistics.mean(times), "iterations": max(counts), "total_iterations": sum(counts),
-            "difference": max(differences)}  # fmt: skip
-
-
-def _conjugate_gradients(matrix: Any, inverse: Any, b: np.ndarray) -> tuple[np.ndarray, int]:
-    """Solution and iterations: the recurrence, preconditioner and end of `diffvbd.adjoint.implicit`, in numpy."""
-    x, r, goal, count = np.zeros_like(b), b.copy(), TOLERANCE**2 * (b @ b), 0
-    p = z = inverse @ r
-    rz = r @ z
-    while r @ r > goal and count < 10 * len(b):
-        q = matrix @ p
-        alpha = rz / (p @ q)
-        x += alpha * p
-        r -= alpha * q
-        z = inverse @ r
-        before, rz = rz, r @ z
-        p = z + (rz / before) * p
-        count += 1
-    return x, count
-
-
 PRESET_MODULUS = 1e4  # [Pa]
 MODULI = (1e3, PRESET_MODULUS, 1e5, paper.STIFF_MODULUS, 1e6, 5e6)  # [Pa], mu = lam
-SPLIT_AT = (PRESET_MODULUS, paper.STIFF_MODULUS)  # where the time of the global routes is taken apart
 PROCESSES = 5  # whose resident memory is read, one after another, for each route
 
 
@@ -357,7 +226,7 @@ def stiffness(card: Card) -> list[Row]:
     Three groups of tasks are measured one after another: ours alone; ours among the global routes, round by round; and
     unrolled autograd, whose graph of tens of MB would empty the caches of whatever comes next.
     """
-    moduli = SPLIT_AT if card.quick else MODULI
+    moduli = (PRESET_MODULUS, paper.STIFF_MODULUS) if card.quick else MODULI
     scenes = {m: build(replace(preset(card.quick), mu=m, lam=m), str(card.device)) for m in moduli}
     alone, among, few = (5, 3, 1) if card.quick else (201, 21, 3)
     times = []
@@ -372,37 +241,11 @@ def stiffness(card: Card) -> list[Row]:
         for name in (FULL, UNROLLED, *GLOBAL):
             measured = next(group[m, name] for group in times if (m, name) in group)
             row["routes"][name] = {**measured, **accuracy(scene, name, expected)}
-        if m in SPLIT_AT:
-            for name in GLOBAL:
-                row["routes"][name] |= {"split": split(card, scene, name)}
         rows.append(row)
     return rows
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
-
-
-def split_of(name: str) -> Table:
-    """Where a global route's time goes, beside the reverse sweep's backward of a step among the same rounds."""
-    parts = f"routes/{name}/split"
-
-    def over_ours(*keys: str) -> Callable[[Row], Any]:
-        def factor(row: Row) -> Any:
-            values = [value_of(row, f"{parts}/{key}") for key in keys]
-            ours = row["among_global"]["backward_ms"] / row["steps"]
-            return None if None in values else sum(values) / ours
-
-        return factor
-
-    others = ("set_up_ms", "gradients_ms", "other_ms")
-    return Table(
-        f"Milliseconds a step of a backward, {name}", "stiffness",
-        {"mu = lam [Pa]": "modulus", "potential and matrix": f"{parts}/set_up_ms", "solve": f"{parts}/solve_ms",
-         "gradients": f"{parts}/gradients_ms", "other": f"{parts}/other_ms",
-         "all over the reverse sweep": over_ours("solve_ms", *others),
-         "solved by scipy": over_ours("scipy/ms", *others), "solve by scipy alone": over_ours("scipy/ms")},
-        only=lambda row: "split" in row["routes"][name],
-    )  # fmt: skip
 
 
 def of_paper(key: str) -> Callable[[Row], Any]:
@@ -418,9 +261,8 @@ TABLES = (
     Table("Memory [MB]", "routes", {"route": "route", "peak": times("memory", 1e-6), "kept": times("kept", 1e-6),
                                     "paper": of_paper("memory_mb")},
           note=f"The paper: {paper.LESS_TIME_THAN_UNROLLED} times less time than unrolled autograd, and "
-               f"{paper.LESS_MEMORY_THAN_UNROLLED} times less memory; {paper.LESS_TIME_THAN_GLOBAL} times less than a global "
-               "route."),
-    *map(split_of, GLOBAL),
+               f"{paper.LESS_MEMORY_THAN_UNROLLED} times less memory; {paper.LESS_TIME_THAN_GLOBAL} times less than a "
+               "global route."),
     Table("Stiffness: backward [ms], iterations and errors", "stiffness",
           {"mu = lam [Pa]": "modulus", "reverse sweep, alone": f"routes/{FULL}/backward_ms",
            "among global": "among_global/backward_ms", "error": f"routes/{FULL}/error",

@@ -1,12 +1,10 @@
-"""Speed and memory of the CPU backend: throughput, scaling, unrolled autograd, Model building, what a scene pays.
+"""Speed and memory of the CPU backend: throughput, scaling, Model building, what a scene pays.
 
 Times are the least of several repetitions, wall clock, of the public interface, predictor and checks included.
 """
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
 import os
 import time
 from collections.abc import Callable
@@ -17,9 +15,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.measure import Card, kept_bytes, least, peak_memory, reset_peak_memory
+from bench.measure import Card, kept_bytes, least
 from bench.tables import Table, times
-from diffvbd import reference
 
 
 def clamped_cube(
@@ -106,65 +103,6 @@ def scaling(n: int, threads: int, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def _beam_rollout(route: str, steps: int, threads: int) -> tuple[float, float]:
-    """Seconds of forward + backward, and growth of the peak resident memory [bytes], in a process of its own."""
-    torch.set_num_threads(threads)
-    mesh = dv.mesh.beam(21, 7, 7, size=(0.5, 0.2, 0.2), split="kuhn")
-    model = dv.Model(mesh, pinned=torch.from_numpy(mesh.points[:, 0] < 1e-9))
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-
-    def once(steps: int) -> None:
-        mu = torch.tensor(1e5, dtype=torch.float64, requires_grad=True)
-        given: dict[str, Any] = {"steps": steps, "mu": mu, "lam": 1e6, "time_step": 2e-3, "sweeps": 15}
-        if route == "unrolled":
-            end = reference.rollout(model, x, v, **given).x[-1]
-        else:
-            end = dv.rollout(model, x, v, **given, adjoint=dv.ReverseSweep(route), checkpoint_every=None).x[-1]  # type: ignore[arg-type]
-        end.square().sum().backward()
-        assert mu.grad is not None and mu.grad != 0
-
-    once(1)  # libraries, thread pool and allocator are warm
-    gc.collect()
-    before = reset_peak_memory()
-    start = time.perf_counter()
-    once(steps)
-    seconds = [time.perf_counter() - start]
-    growth = peak_memory() - before
-    for _ in range(0 if route == "unrolled" else 9):
-        start = time.perf_counter()
-        once(steps)
-        seconds.append(time.perf_counter() - start)
-    return min(seconds), float(growth)
-
-
-def unrolled(quick: bool, threads: int) -> list[dict[str, Any]]:
-    """Both routes on the same forward, with the same number of threads, each in a process of its own."""
-    steps = 2 if quick else 10
-    results = {}
-    for route in ("unrolled", "full", "compact"):
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            results[route] = pool.apply(_beam_rollout, (route, steps, threads))
-    name = f"1,029-vertex beam, K = 15, {steps} steps, {threads} cores"
-    rows = []
-    for route, (seconds, growth) in results.items():
-        label = "unrolled autograd" if route == "unrolled" else f"reverse sweep, {route} tape"
-        rows.append(
-            {"name": f"{name}: {label}", "unit": "ms forward + backward", "value": seconds * 1e3, "target": None}
-        )
-        rows.append(
-            {"name": f"{name}: {label}, growth of peak memory", "unit": "MB", "value": growth / 1e6, "target": None}
-        )
-    theirs, theirs_bytes = results["unrolled"]
-    for route in ("full", "compact"):
-        ours, ours_bytes = results[route]
-        rows.append(
-            {"name": f"{name}: {route} tape, less time", "unit": "times", "value": theirs / ours, "target": 80.0}
-        )
-        rows.append({"name": f"{name}: {route} tape, less memory", "unit": "times",
-                     "value": theirs_bytes / max(ours_bytes, 1), "target": 70.0})  # fmt: skip
-    return rows
-
-
 def building(quick: bool) -> list[dict[str, Any]]:
     rows = []
     for n in (10, 20) if quick else (15, 30, 59):
@@ -226,13 +164,12 @@ THREADS = 1
 GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
     "throughput": lambda card: throughput(5 if card.quick else 11, 20, card.quick),
     "scaling": lambda card: scaling(9 if card.quick else 31, _threads(), card.quick),
-    "unrolled": lambda card: unrolled(card.quick, _threads()),
     "building": lambda card: building(card.quick),
     "requirements": lambda card: requirements(5 if card.quick else 11, card.quick),
 }
 COLUMNS = {"what": "name", "measured": "value", "target": "target", "unit": "unit"}
 TABLES = (
-    *(Table(name.capitalize(), name, COLUMNS) for name in ("throughput", "scaling", "unrolled", "building")),
+    *(Table(name.capitalize(), name, COLUMNS) for name in ("throughput", "scaling", "building")),
     Table("One step, K = 10", "requirements", {"gradients": "name", "forward [ms]": "forward_ms",
                                                "backward [ms]": "backward_ms", "kept [MB]": times("kept_bytes", 1e-6)}),
 )  # fmt: skip

@@ -210,8 +210,6 @@ class Body:
 
 SEED = 61
 SLIVER = 0.1  # quality below which a tet is left out of a ball
-HELD = 0.06  # height above its center from which the pressed ball is held [m]
-PRESSED, PRESSING, STEPS = 0.02, 5, 10  # the way down [m], in so many steps of so many
 
 
 @dataclass(frozen=True)
@@ -272,28 +270,6 @@ def ball(radius: float, spacing: float, seed: int = 0) -> dv.TetMesh:
     return dv.TetMesh(points, whole.tets[whole.quality > SLIVER])
 
 
-def falling_ball() -> Scene:
-    """A ball of 0.1 m and 1e5 Pa that meets the floor at 2 m/s, without gravity."""
-    shape = ball(0.1, 0.0325)
-    shape = shape.translate((0.0, 0.01 - shape.points[:, 1].min(), 0.0))
-    body = Body(shape.points, shape.tets, 1e5, 0.3, 2e-3, 2e5, 5e-3)
-    v = np.zeros_like(shape.points)
-    v[:, 1] = -2.0
-    return Scene("falling ball", shape, body, v, 60)
-
-
-def pressed_ball() -> Scene:
-    """The ball held by its upper cap, which goes 20 mm down from where the barrier begins, and stays."""
-    shape = ball(0.1, 0.0325)
-    pinned = shape.points[:, 1] > HELD
-    shape = shape.translate((0.0, 5e-3 - shape.points[:, 1].min(), 0.0))
-    body = Body(shape.points, shape.tets, 1e5, 0.3, 2e-2, 2e5, 5e-3, pinned=pinned)
-    way = PRESSED * np.minimum(1, np.arange(1, STEPS + 1) / PRESSING)
-    prescribed = shape.points - way[:, None, None] * np.array([0.0, 1.0, 0.0])
-    prescribed[:, ~pinned] = np.nan
-    return Scene("pressed ball", shape, body, np.zeros_like(shape.points), STEPS, prescribed)
-
-
 def _shape(rng: np.random.Generator) -> tuple[str, dv.TetMesh]:
     from scipy.spatial.transform import Rotation
 
@@ -350,36 +326,6 @@ MORE = (40, 80, 160, 320, 640, 1280)
 KINDS: dict[str, Any] = {"plain": None, "coarse": "auto"}
 
 
-def rebound() -> list[dict[str, Any]]:
-    """How much of its speed the ball keeps."""
-    scene = falling_ball()
-    _, v = scene.body.rollout(scene.mesh.points, scene.v, scene.steps)
-    exact, out = _upward(scene, v[-1]) / 2.0, []
-    for kind, coarse in KINDS.items():
-        for sweeps in (8, 20, 100):
-            motion, _, said = scene.executed(sweeps, coarse)
-            share = _upward(scene, motion.v[-1].numpy()) / 2.0
-            out.append({"corrections": kind, "sweeps": sweeps, "rebound": share, "converged": exact,
-                        "said": _short(said)})  # fmt: skip
-    return out
-
-
-def pressed() -> list[dict[str, Any]]:
-    """What the floor exerts on the pressed ball, and what its holder bears [N]."""
-    scene, b = (made := pressed_ball()), made.body
-    x, _ = b.rollout(scene.mesh.points, scene.v, scene.steps, scene.prescribed)
-    exact, out = b.floor_force(x[-1]), []
-    for kind, coarse in KINDS.items():
-        for sweeps in (8, 20, 100):
-            motion, model, said = scene.executed(sweeps, coarse)
-            floor = float(dv.contact.forces(model, motion.x[-1]).floors.normal[0, 0, 1])
-            held = dv.reactions(model, motion.x[-1], young=b.young, poisson=b.poisson, gravity=b.gravity)
-            out.append({"corrections": kind, "sweeps": sweeps, "floor [N]": floor,
-                        "reactions [N]": -float(held[:, 1].sum()), "converged [N]": exact,
-                        "said": _short(said)})  # fmt: skip
-    return out
-
-
 def rollouts(numbers: Iterable[int]) -> list[dict[str, Any]]:
     """Error of each drawn scene, plain and with corrections: of positions (rms over the largest rms motion, at the end
     and at worst), and of the velocity of the center of mass at the end, over that at the start."""
@@ -412,10 +358,6 @@ def apart(scene: Scene, motion: dv.Trajectory, exact: tuple[Array, Array]) -> di
     return {name: float(value) if np.isfinite(value) else np.inf for name, value in errors.items()}
 
 
-def _upward(scene: Scene, v: Array) -> float:
-    return float(scene.body.mass @ v[:, 1] / scene.body.mass.sum())
-
-
 def _short(said: list[str]) -> str:
     """Which arguments the warnings are about."""
     return ", ".join(dict.fromkeys(text.split(":")[0] for text in said))
@@ -423,13 +365,9 @@ def _short(said: list[str]) -> str:
 
 THREADS = 1
 GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
-    "rebound": lambda card: rebound(),
-    "pressed": lambda card: pressed(),
     "rollouts": lambda card: rollouts(range(QUICK_COUNT if card.quick else COUNT)),
 }
 TABLES = (
-    Table("A ball of 0.1 m and 1e5 Pa that meets the floor at 2 m/s: share of its speed that it keeps", "rebound"),
-    Table("The same ball held by its upper cap and pressed down by 20 mm", "pressed"),
     Table(f"Bodies thrown on a floor, K = {SWEEPS}", "rollouts",
           {"rollouts": count(), f"off by more than {OFF:.0%}": count("off"),
            "of them silent": count(lambda row: row["off"] and not row["said"]), "median error": median("worst"),

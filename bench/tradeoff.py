@@ -5,14 +5,13 @@ distance to a reference of much shorter steps and more sweeps (root mean square 
 motion), and that of the gradient of the mean squared way with respect to each modulus and a velocity of all vertices.
 Times are those of one rollout, and of one with its backward. Scenes run side by side, one thread each.
 
-Other solvers take part on the two cantilevers: converged steps, steps in other precisions, unrolled autograd and
-Newton's SolverVBD, which have the law of the scene and its reference; XPBD (springs along edges) and projective
-dynamics (tets that resist rotation-free change), whose laws are others, so that each is held against its own limit of
-short steps and many iterations.
+On the two cantilevers other solvers of the same law take part: converged steps, and Newton's SolverVBD where it is
+installed.
 """
 
 from __future__ import annotations
 
+import importlib
 import io
 import math
 import sys
@@ -28,12 +27,11 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench import common, newton
+from bench import common
 from bench.advice import DHAT, FRAMES, Run, Runs, Scene, advised
 from bench.common import digits
 from bench.tables import Table, markdown_table
 from diffvbd import mesh
-from diffvbd.solvers import XPBD, ProjectiveDynamics
 
 ELASTIC = dv.StableNeoHookean()
 
@@ -206,6 +204,9 @@ WAYS = [
 ASIDE = {way.name for way in WAYS if way.gradient_only}
 
 
+Distance = Callable[[Tensor], float]  # of frames [FRAMES, V, 3] to the reference of the scene
+
+
 class Front:
     """Runs of one scene, held against its reference."""
 
@@ -342,98 +343,71 @@ def summary(results: dict[str, Any], error: float = 0.01) -> str:
     return markdown_table(header, table)
 
 
-PeerStep = Callable[[Tensor, Tensor, float, int], tuple[Tensor, Tensor]]
-Distance = Callable[[Tensor], float]  # of frames [FRAMES, V, 3] to the reference of the scene
-LAW = "error against its own limit: another law"
-
-
-def framed(step: PeerStep, x: Tensor, v: Tensor, steps: int, duration: float, iterations: int) -> tuple[Tensor, float]:
-    """Frames [FRAMES, V, 3] of steps one by one, and what they took [s]."""
-    frames, began = [], time.perf_counter()
-    for n in range(1, steps + 1):
-        x, v = step(x, v, duration / steps, iterations)
-        if n % (steps // FRAMES) == 0:
-            frames.append(x)
-    return torch.stack(frames), time.perf_counter() - began
-
-
-def apart_from(frames: Tensor, truth: Tensor, x: Tensor) -> float:
-    """Root mean square distance over the motion."""
-    return float((frames - truth).square().sum(-1).mean().sqrt() / (truth - x).square().sum(-1).mean().sqrt())
-
-
-def against_itself(name: str, step: PeerStep, scene: Scene, iterations: tuple[int, ...], rungs: int) -> list[Row]:
-    """Ever more steps, held against the last of them with twice the steps and the most iterations."""
-    x = scene.model.rest_points
-    finest = FRAMES * 2**rungs
-    with torch.no_grad():
-        truth, _ = framed(step, x, scene.v, 2 * finest, scene.duration, iterations[-1])
-        rows = []
-        for count in iterations:
-            for rung in range(rungs + 1):
-                frames, seconds = framed(step, x, scene.v, FRAMES * 2**rung, scene.duration, count)
-                rows.append({"solver": name, "iterations": count, "steps": FRAMES * 2**rung, "ms": 1e3 * seconds,
-                             "error": apart_from(frames, truth, x), "note": LAW})  # fmt: skip
-    return rows
+# --- other solvers of the same law ------------------------------------------------------------------------------------
 
 
 def peers(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
-    model, rungs = scene.model, 1 if quick else 5
-    mu = float(torch.as_tensor(scene.given["mu"]))
-    return [
-        *converged(scene, distance, rungs),
-        *against_itself("XPBD, springs", _xpbd(model, mu), scene, (2,) if quick else (5, 20), rungs),
-        *against_itself("projective dynamics", _projective(model, mu), scene, (2,) if quick else (5, 20), rungs),
-        *newtons(scene, distance, quick),
-    ]  # fmt: skip
+    return [*converged(scene, distance, 1 if quick else 5), *newton(scene, distance, quick)]
 
 
 def converged(scene: Scene, distance: Distance, rungs: int) -> list[Row]:
     """dv.solve: each step of implicit Euler swept until its residual is 1e-4."""
-
-    def step(x: Tensor, v: Tensor, h: float, most: int) -> tuple[Tensor, Tensor]:
-        found = dv.solve(scene.model, x, v, time_step=h, tolerance=1e-4, max_sweeps=most, on_failure="warn",
-                         **scene.given)  # fmt: skip
-        return found.x, found.v
-
     rows = []
-    with torch.no_grad():
-        for rung in range(rungs):
-            steps = FRAMES * 2**rung
-            frames, seconds = framed(step, scene.model.rest_points, scene.v, steps, scene.duration, 5000)
-            rows.append({"solver": "dv.solve", "iterations": "to 1e-4", "steps": steps, "ms": 1e3 * seconds,
-                         "error": distance(frames), "note": "implicit Euler"})  # fmt: skip
+    for rung in range(rungs):
+        x, v, frames, steps, began = scene.model.rest_points, scene.v, [], FRAMES * 2**rung, time.perf_counter()
+        for n in range(1, steps + 1):
+            with torch.no_grad():
+                found = dv.solve(scene.model, x, v, time_step=scene.duration / steps, tolerance=1e-4, max_sweeps=5000,
+                                 on_failure="warn", **scene.given)  # fmt: skip
+            x, v = found.x, found.v
+            frames += [x] if n % (steps // FRAMES) == 0 else []
+        rows.append({"solver": "dv.solve", "iterations": "to 1e-4", "steps": steps, "note": "implicit Euler",
+                     "ms": 1e3 * (time.perf_counter() - began), "error": distance(torch.stack(frames))})  # fmt: skip
     return rows
 
 
-def _xpbd(model: dv.Model, mu: float) -> PeerStep:
-    solver = XPBD.from_mesh(model.mesh, pinned=model.pinned)
-    # a spring of a tet's size and the same modulus
-    stiffness = mu * float(model.mesh.points[model.mesh.tets].std(1).mean())
-    return lambda x, v, h, k: solver.step(x, v, stiffness=stiffness, time_step=h, sweeps=k)
-
-
-def _projective(model: dv.Model, mu: float) -> PeerStep:
-    solver = ProjectiveDynamics.from_mesh(model.mesh, pinned=model.pinned)
-    factors: dict[float, Any] = {}
-
-    def step(x: Tensor, v: Tensor, h: float, k: int) -> tuple[Tensor, Tensor]:
-        if h not in factors:
-            factors[h] = solver.factor(time_step=h, tet_stiffness=2 * mu, stiffness=None)
-        return solver.step(x, v, factor=factors[h], sweeps=k)
-
-    return step
-
-
-def newtons(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
-    """Newton's SolverVBD of the same mesh and moduli, forward, in float32 on the CPU."""
+def newton(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
+    """Newton's SolverVBD on the same mesh and moduli, forward, in float32 on the CPU, where it is installed."""
     try:
-        material = float(scene.given["mu"]), float(scene.given["lam"])
-        return newton.ladder(scene.model.mesh, scene.model.pinned.numpy(), material, scene.duration,
-                             (2,) if quick else (5, 20, 80), 1 if quick else 6, FRAMES,
-                             lambda x: distance(torch.as_tensor(x)), scene.v.numpy())  # fmt: skip
+        warp, engine = importlib.import_module("warp"), importlib.import_module("newton")
     except ImportError as error:
         return [{"solver": "Newton SolverVBD", "note": f"not available ({error})"}]
+    model, rows = newton_model(engine, scene), []
+    for count in (2,) if quick else (5, 20, 80):
+        solver = engine.solvers.SolverVBD(model, iterations=count)
+        for rung in range(-1, 1 if quick else 6):  # the first compiles
+            steps, states, seen = FRAMES * 2 ** max(rung, 0), [model.state(), model.state()], []
+            states[0].particle_qd.assign(scene.v.numpy().astype(np.float32))
+            warp.synchronize_device("cpu")
+            start = time.perf_counter()
+            for n in range(1, steps + 1):
+                solver.step(states[0], states[1], model.control(), None, scene.duration / steps)
+                states.reverse()
+                if n % (steps // FRAMES) == 0:
+                    seen.append(states[0].particle_q.numpy().copy())  # on the CPU it is a view
+            seconds = time.perf_counter() - start
+            if rung >= 0:
+                rows.append({"solver": f"Newton {engine.__version__} SolverVBD", "iterations": count, "steps": steps,
+                             "ms": 1e3 * seconds, "error": distance(torch.from_numpy(np.stack(seen).astype(float))),
+                             "note": "implicit Euler in float32"})  # fmt: skip
+    return rows
+
+
+def newton_model(engine: Any, scene: Scene) -> Any:
+    """Newton's model of a scene with one mu and lam, without surface triangles, which would only cost memory."""
+    mesh, pinned = scene.model.mesh, scene.model.pinned.numpy()
+    material = float(scene.given["mu"]), float(scene.given["lam"]), 0.0
+    shape = (mesh.points[mesh.tets[:, 1:]] - mesh.points[mesh.tets[:, :1]]).swapaxes(1, 2)  # columns are edges
+    mass = np.where(pinned, 0.0, scene.model.mass.numpy())
+    builder = engine.ModelBuilder(gravity=(0.0, -9.81, 0.0))
+    builder.add_particles(pos=list(mesh.points), vel=[(0.0, 0.0, 0.0)] * len(mass), mass=mass.tolist(),
+                          flags=np.where(pinned, 0, int(engine.ParticleFlags.ACTIVE)).tolist())  # fmt: skip
+    builder.tet_indices.extend(map(tuple, mesh.tets.tolist()))
+    builder.tet_poses.extend(np.linalg.inv(shape).tolist())
+    builder.tet_activations.extend([0.0] * len(mesh.tets))
+    builder.tet_materials.extend([material] * len(mesh.tets))
+    builder.color()
+    return builder.finalize(device="cpu")
 
 
 # --- tables and picture -----------------------------------------------------------------------------------------------

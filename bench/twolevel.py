@@ -1,10 +1,8 @@
-"""Coarse corrections between sweeps: error and time beside plain sweeps, in stiff, thin and violent scenes.
+"""Coarse corrections between sweeps: error and time beside plain sweeps, in stiff and thin scenes.
 
 Error: the largest distance of a vertex from where converged steps of the same h end, over the largest motion, after 30
 steps. Time: a whole step, on one thread, everything included; on CUDA that of a graph. With coarse corrections
-relaxation is 1.5; plain sweeps have the best of three relaxations and two starts at each K. A violent scene begins far
-from where it would rest; beside it stand plain sweeps that take as long, and the largest rise of the incremental
-potential in a step.
+relaxation is 1.5; plain sweeps have the best of three relaxations and two starts at each K.
 
 One correction: its time in
 sweeps, by differences over K; `reverse` the backward to state and material alone. Targets: 2.5 sweeps, and 3 in
@@ -26,7 +24,6 @@ import diffvbd as dv
 from bench.measure import Card
 from bench.sweeps import MATERIAL, bar
 from bench.tables import Table
-from diffvbd import reference
 
 RELAXATION = 1.5  # with corrections
 
@@ -102,39 +99,6 @@ def sheet(ratio: float, cells: int = 20) -> Scene:
     return Scene(name, mesh, mesh.points[:, 0] < 1e-9, {"mu": 1e6, "lam": 1.5e6})
 
 
-def violent_scenes(quick: bool) -> list[Scene]:
-    """A bar of 0.5 m, held at x = 0, that begins far from where it would rest."""
-    mesh = dv.mesh.beam(*((5, 3, 3) if quick else (21, 7, 7)), size=(0.5, 0.2, 0.2), split="kuhn")
-    points = torch.from_numpy(mesh.points.copy())
-    pinned = mesh.points[:, 0] < 1e-9
-    cell = 0.5 / (4 if quick else 20)
-
-    def twisted(degrees: float) -> Tensor:
-        angle = np.deg2rad(degrees) * points[:, 0] / 0.5
-        middle = points[:, 1:].mean(0)
-        y, z = (points[:, 1:] - middle).unbind(1)
-        sin, cos = torch.sin(angle), torch.cos(angle)
-        return torch.stack((points[:, 0], middle[0] + cos * y - sin * z, middle[1] + sin * y + cos * z), 1)
-
-    def along(factor: float) -> Tensor:
-        return points * torch.tensor([factor, 1.0, 1.0], dtype=torch.float64)
-
-    noise = torch.from_numpy(np.random.default_rng(0).uniform(-0.5, 0.5, points.shape))
-    noise[torch.from_numpy(pinned)] = 0
-    speed = torch.zeros_like(points)
-    speed[:, 1] = 300 * points[:, 0] / 0.5
-    states = {"twist 60 degrees": twisted(60), "twist 180 degrees": twisted(180), "stretched 3x": along(3),
-              "mirrored": along(-1), "squashed to 0.05": along(0.05), "noise of half a cell": points + cell * noise,
-              "tip at 300 m/s": points}  # fmt: skip
-    if quick:
-        states = {"twist 60 degrees": twisted(60), "mirrored": along(-1)}
-    material = {"mu": 1e6, "lam": 1.5e6}
-    return [
-        Scene(name, mesh, pinned, material, 0.01, x, speed if name.startswith("tip") else None)
-        for name, x in states.items()
-    ]
-
-
 def functions(model: dv.Model) -> int:
     return int((~model.coarse_geometry.filling).sum())
 
@@ -143,11 +107,9 @@ SWEEPS = (1, 2, 4, 5, 7, 8, 10, 11, 13, 14, 16, 17, 19, 20, 22, 23, 25, 31, 40, 
 PLAIN_SWEEPS = (5, 10, 20, 50, 100, 200, 300)
 LAST = 1000  # plain sweeps where those do not reach 1 %
 PLAIN = tuple((relaxation, start) for relaxation in (1.0, 1.6, 1.8) for start in ("auto", "inertia"))
-VIOLENT_SWEEPS = (13, 25, 49)
 ROUNDS = 7  # of times
 LEVELS = (0.01, 1e-4)
 CONVERGED = 1e-7  # of the motion, between two K
-RISE = 1e-12  # of the potential at the start of a step, below which a rise counts as none
 
 
 def converged(scene: Scene, steps: int, quick: bool, most: int = 6400) -> tuple[Tensor, dict[str, float]]:
@@ -223,66 +185,6 @@ def measure(scene: Scene, card: Card) -> dict[str, Any]:
     return row
 
 
-def violent(scene: Scene, card: Card) -> list[dict[str, Any]]:
-    """Two-level and plain sweeps of equal relaxation and time; whether steps descend from where they start."""
-    quick = card.quick
-    steps = 5 if quick else 30
-    goal, found = converged(scene, steps, quick, 1600)
-    two, plain = scene.model(), scene.model(None)
-    # where minima are several, plain sweeps may come to another; each error is to the nearer
-    other = scene.end(plain, 200 if quick else 3000, steps)
-    motion = found["motion"]
-
-    def error(way: dv.Trajectory) -> float:
-        return min(float((way.x[-1] - g).norm(dim=-1).max()) for g in (goal, other)) / motion
-
-    rows = [{"sweeps": k} for k in (VIOLENT_SWEEPS[:1] if quick else VIOLENT_SWEEPS)]
-    beside = [{"sweeps": 10}, {"sweeps": 50}]
-    least_times(scene, [(two, rows), (plain, beside)], card)
-    sweep, fixed = line(beside)
-    out = []
-    for row in rows:
-        k, ms = row["sweeps"], row["ms"]
-        same = max(1, round((ms - fixed) / sweep))
-        with dv.coarse.record() as lengths:
-            way = scene.rolled(two, k, steps)
-        plainly = scene.rolled(plain, same, steps)
-        errors = error(way), error(plainly)
-        # one K may be lucky, so means over K nearby as well
-        around = [error(scene.rolled(two, k + d, steps)) for d in (-6, -3, 0, 3, 6)]
-        plainly_around = [error(scene.rolled(plain, max(1, round(same * f)), steps)) for f in (0.8, 0.9, 1, 1.1, 1.25)]
-        out.append({
-            "scene": scene.name, "sweeps": k, "ms": ms, "plain_sweeps": same, "error": errors[0],
-            "plain_error": errors[1], "ratio": errors[0] / errors[1],
-            "ratio_near": mean(around) / mean(plainly_around),
-            "rise": rise(scene, plain, way), "plain_rise": rise(scene, plain, plainly),
-            "mean_length": float(torch.cat([s.flatten() for s in lengths]).mean()),
-            "references_apart": float((goal - other).norm(dim=-1).max()) / motion, "reference": found,
-        })  # fmt: skip
-    return out
-
-
-def mean(errors: list[float]) -> float:
-    return float(np.exp(np.mean(np.log(errors))))
-
-
-def rise(scene: Scene, model: dv.Model, way: dv.Trajectory) -> float:
-    """The largest rise of the incremental potential from where a step's sweeps start to its end, over what it is
-    there; negative where all steps descend. model: without corrections, so that no sweeps end where they start."""
-    h, worst = scene.time_step, -float("inf")
-    gravity = torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
-    for n in range(len(way.x) - 1):
-        x, v = way.x[n], way.v[n]
-        y = torch.where(model.pinned[:, None], x, x + h * v + h * h * gravity)
-        start, _ = dv.step(model, x, v, time_step=h, sweeps=0, **scene.material)
-        before, after = (
-            float(reference.incremental_potential(model, at, y, **scene.material, time_step=h, x_prev=x))
-            for at in (start, way.x[n + 1])
-        )
-        worst = max(worst, (after - before) / max(abs(before), 1e-300))
-    return worst
-
-
 FEW, MANY = 4, 13  # sweeps between whose steps a correction is measured
 
 
@@ -349,8 +251,6 @@ def _seconds(card: Card, scene: Scene, model: dv.Model, scenes: int, sweeps: int
 THREADS, ANYWHERE = 1, True
 GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
     "scenes": lambda card: [measure(scene, card) for scene in scenes(card)],
-    "violent": lambda card: [] if card.cuda else [
-        row for scene in violent_scenes(card.quick) for row in violent(scene, card)],
     "cost": cost,
 }  # fmt: skip
 REACHED: dict[str, Any] = {
@@ -363,6 +263,5 @@ TABLES = (
           {"scene": "scene", "vertices": "vertices", "functions": "functions", **REACHED,
            "ms of a plain sweep": "sweep_ms"}),
     Table("Error over motion by K, with corrections: {}", "scenes/*/two_level", ("sweeps", "error", "ms")),
-    Table("Violent states: beside plain sweeps of equal relaxation and time", "violent"),
     Table("One correction, in sweeps", "cost"),
 )  # fmt: skip
