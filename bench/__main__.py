@@ -22,10 +22,11 @@ from typing import Any
 import torch
 
 import bench
-from bench import common, gallery, report, screenshots, tables, tasks
+from bench import common, tables
 from bench.measure import Card
 
 ASKED = ("bits",)  # only when asked for by name: what it writes is no result
+OTHERS = ("report", "tasks", "gallery", "screenshots")
 PAPER = ("exactness", "ablation", "cost", "fd")  # the paper's own measurements, in its order
 
 
@@ -33,6 +34,16 @@ def benchmarks() -> dict[str, ModuleType]:
     names = sorted(m.name for m in pkgutil.iter_modules(bench.__path__) if not m.name.startswith("_"))
     modules = {name: importlib.import_module(f"bench.{name}") for name in names}
     return {name: module for name, module in modules.items() if hasattr(module, "run") or hasattr(module, "GROUPS")}
+
+
+def other(options: argparse.Namespace) -> int:
+    """What is no benchmark."""
+    module = importlib.import_module(f"bench.{options.name}")
+    if options.name == "tasks":
+        return module.main(options.only, options.device or "cpu", options.seeds, options.options, options.out,
+                           options.quick)  # fmt: skip
+    given = {"report": (), "gallery": (options.only, options.out), "screenshots": (options.out,)}
+    return module.main(*given[options.name])
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -48,16 +59,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.device and torch.device(options.device).type == "cuda" and not torch.cuda.is_available():
         parser.error(f"--device: expected a device of this machine, got {options.device}, and torch sees no CUDA here")
-    others = {
-        "report": report.main,
-        "gallery": lambda: gallery.main(options.only, options.out),
-        "screenshots": lambda: screenshots.main(options.out),
-        "tasks": lambda: tasks.main(options.only, options.device or "cpu", options.seeds, options.options, options.out,
-                                    options.quick),
-    }  # fmt: skip
-    if options.name in others:
-        return others[options.name]()
-    known = benchmarks()
+    if options.name in OTHERS:
+        return other(options)
+    if (Path(__file__).parent / f"{options.name}.py").exists():
+        known = {options.name: importlib.import_module(f"bench.{options.name}")}
+    else:
+        known = benchmarks()
     if options.name == "list":
         for name, module in known.items():
             print(f"{name:<15} {(module.__doc__ or '').splitlines()[0]}")
@@ -66,9 +73,11 @@ def main(arguments: list[str] | None = None) -> int:
         return run_all(options, known)
     if options.name in ASKED and options.out is None:
         parser.error(f"--out: {options.name} is compared between two folders, and needs one")
-    if options.name not in known:
-        parser.error(f"name: expected one of {', '.join(known)}, all, list, {', '.join(others)}, got {options.name}")
-    module = known[options.name]
+    module = known.get(options.name)
+    if module is None or not (hasattr(module, "run") or hasattr(module, "GROUPS")):
+        parser.error(
+            f"name: expected one of {', '.join(benchmarks())}, all, list, {', '.join(OTHERS)}, got {options.name}"
+        )
     takes = {"device", "only"} if hasattr(module, "GROUPS") else set(inspect.signature(module.run).parameters)
     if options.only is not None and "only" not in takes or options.device and not on_device(module, options.device):
         parser.error(f"--only, --device: {options.name} has no such option")

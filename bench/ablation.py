@@ -7,7 +7,7 @@ Each variant is a subclass of `diffvbd.solvers.VertexBlock` with one method chan
 * validity gate: the Hessian tangent only of tets with det F > 0.5, which the forward knows nothing of.
 
 Scene, the same on all meshes: the unit cube (Delaunay meshes of 26, 115 and 631 vertices), not held, paper preset
-(`dv.Model.paper`), density 1000 kg/m^3, mu = lam = 1e4 Pa, h = 1/60 s, one step under gravity. The cube starts at rest
+(`dv.VBD.paper`), density 1000 kg/m^3, mu = lam = 1e4 Pa, h = 1/60 s, one step under gravity. The cube starts at rest
 shape, turning about its vertical axis by 4 rad/s per metre of height (zero at mid-height), with uniform noise of 1 m/s
 on every velocity component. Noise of one size is a strain that grows as edges get shorter: that is what refinement does
 to any motion whose wavelength the mesh barely resolves. The loss is a fixed random linear function of the end state.
@@ -73,7 +73,7 @@ def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
     for size in testing.SIZES[:2] if quick else testing.SIZES:
         model, inputs = scene(size)
         for sweeps in SWEEPS[:1] if quick else SWEEPS:
-            expected = testing.reference_result(model, inputs, sweeps)
+            expected = testing.reference_result(model, inputs, solver_of(sweeps))
             found = {name: composed(model.to(device), inputs, sweeps, kind) for name, kind in VARIANTS.items()}
             found[STEP] = package_step(model.to(device), inputs, sweeps)
             rows += [{"variant": name, "vertices": model.num_vertices, "sweeps": sweeps, **errors(name, one, expected)}
@@ -104,7 +104,7 @@ def draws(device: str) -> list[dict[str, Any]]:
         found: dict[str, list[float]] = {name: [] for name in VARIANTS}
         for draw in range(DRAWS):
             model, inputs = scene(size, draw)
-            expected = testing.reference_result(model, inputs, 1)
+            expected = testing.reference_result(model, inputs, solver_of(1))
             for name, kind in VARIANTS.items():
                 one = composed(model.to(device), inputs, 1, kind)
                 found[name].append(errors(name, one, expected)["error"])
@@ -115,14 +115,19 @@ def draws(device: str) -> list[dict[str, Any]]:
 
 def scene(size: str, draw: int = 0) -> tuple[dv.Model, dict[str, Any]]:
     """Model and inputs of a step, on the CPU."""
-    model = dv.Model.paper(mesh_of(size), rigid=False)  # the sweeps alone, as the composed variants have them
+    model = dv.Model(mesh_of(size))
     points = model.mesh.points
     x, height, z = (points - 0.5).T
     twist = TWIST * height * np.stack((z, 0 * z, -x))
     noise = NOISE * testing.generator("ablation", size, draw).uniform(-1, 1, points.shape)
     given = {"mu": MODULUS, "lam": MODULUS, "x": points.copy(), "v": twist.T + noise, "gravity": [0.0, -9.81, 0.0]}
     tensors = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
-    return model, tensors | {"time_step": TIME_STEP}
+    return model, tensors
+
+
+def solver_of(sweeps: int) -> dv.VBD:
+    """The paper's preset by the sweeps alone, as the composed variants have them."""
+    return dv.VBD.paper(TIME_STEP, sweeps, subspace=None)
 
 
 def mesh_of(size: str) -> dv.TetMesh:
@@ -139,7 +144,7 @@ def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
     y = inputs["x"] + h * inputs["v"] + h * h * inputs["gravity"]
     corners, at_rest = y[model.tets], model.rest_points[model.tets]
     det = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / torch.linalg.det(at_rest[:, 1:] - at_rest[:, :1])
-    end, _ = dv.step(model, sweeps=1, **inputs)
+    end, _ = dv.step(model, solver=solver_of(1), **inputs)
     return {
         "vertices": model.num_vertices,
         "tets": model.num_tets,
@@ -152,23 +157,23 @@ def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
 
 def composed(model: dv.Model, inputs: dict[str, Any], sweeps: int, kind: type[VertexBlock]) -> dict[str, Tensor]:
     """`testing.evaluate` of a step whose sweep is composed of one kind of update."""
-    solver = vertex_block_descent(model, TIME_STEP, kind)
+    solver = vertex_block_descent(model, solver_of(sweeps), kind)
 
-    def step(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor, time_step: float) -> Any:
-        y = x + time_step * v + time_step**2 * gravity
+    def step(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor) -> Any:
+        y = x + TIME_STEP * v + TIME_STEP**2 * gravity
         (end,) = solver((y,), (y, mu, lam, model.mass), sweeps=sweeps)
-        return end, (end - x) / time_step
+        return end, (end - x) / TIME_STEP
 
-    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device)), "cpu")
+    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device), TIME_STEP), "cpu")
 
 
 def package_step(model: dv.Model, inputs: dict[str, Any], sweeps: int) -> dict[str, Tensor]:
     """`testing.evaluate` of the package's own step."""
 
     def step(**given: Any) -> tuple[Tensor, Tensor]:
-        return dv.step(model, sweeps=sweeps, **given)
+        return dv.step(model, solver=solver_of(sweeps), **given)
 
-    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device)), "cpu")
+    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device), TIME_STEP), "cpu")
 
 
 TABLES = (

@@ -55,7 +55,7 @@ class Run(NamedTuple):
 
 
 class Runs:
-    """Rollouts of a scene from rest shape by any settings. With a gradient: that of the mean squared way, with respect
+    """Rollouts of a scene from rest shape by any solver. With a gradient: that of the mean squared way, with respect
     to the moduli and to one velocity of all vertices, since those of single ones excite what no time step resolves."""
 
     def __init__(self, scene: Scene, gradient: bool = False, dtype: torch.dtype | None = None) -> None:
@@ -66,18 +66,17 @@ class Runs:
         self.given = {k: v.to(self.x) if isinstance(v, Tensor) else v for k, v in scene.given.items()}
         self.warm: set[str] = set()
 
-    def run(self, settings: dv.Settings, steps: int, model: dv.Model | None = None) -> Run:
+    def run(self, solver: dv.VBD, steps: int, checkpoint_every: Any = "auto") -> Run:
         """So many steps over the whole duration; a first short one, which arranges what lasts, is not timed."""
-        model = self.model if model is None else model
-        kind = f"{id(model)} {replace(settings, time_step=1.0)}"
+        kind = f"{replace(solver, time_step=1.0, prediction=None)} {solver.start}"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
                 if kind not in self.warm:
-                    self._rollout(model, settings, steps, 1 if not self.gradient else FRAMES)
+                    self._rollout(solver, steps, 1 if not self.gradient else FRAMES, checkpoint_every)
                     self.warm.add(kind)
                 began = time.perf_counter()
-                x, gradient = self._rollout(model, settings, steps, steps)
+                x, gradient = self._rollout(solver, steps, steps, checkpoint_every)
                 if x.is_cuda:
                     torch.cuda.synchronize(x.device)
             except (RuntimeError, ValueError):
@@ -86,7 +85,7 @@ class Runs:
         self.spent += seconds
         return Run(steps, x, seconds, gradient) if bool(torch.isfinite(x).all()) else Run(steps, None, seconds)
 
-    def _rollout(self, model: dv.Model, settings: dv.Settings, steps: int, count: int
+    def _rollout(self, solver: dv.VBD, steps: int, count: int, checkpoint_every: Any
                  ) -> tuple[Tensor, tuple[Tensor, ...]]:  # fmt: skip
         """``count`` of steps of the scene's duration over ``steps``."""
         h, given, v, leaves = self.scene.duration / steps, dict(self.given), self.v, []
@@ -95,14 +94,14 @@ class Runs:
                 given[name] = lambda step, x, v, value=value: value((step + 1) * h).to(x)
         if self.gradient:
             leaves = [self.x.new_zeros(3, requires_grad=True)]
-            v = torch.where(model.pinned[:, None], v, v + leaves[0])
+            v = torch.where(self.model.pinned[:, None], v, v + leaves[0])
             for name in set(given) & {"mu", "lam", "young", "poisson"}:
                 given[name] = torch.as_tensor(given[name]).to(self.x).detach().clone().requires_grad_()
                 leaves.append(given[name])
         with torch.set_grad_enabled(self.gradient):
-            x = dv.rollout(model, self.x, v, duration=count * h, settings=replace(settings, time_step=h),
-                           save=max(1, count // FRAMES), check_contact=False, check_energy=False,
-                           **given).x  # fmt: skip
+            x = dv.rollout(self.model, self.x, v, replace(solver, time_step=h), steps=count,
+                           save=max(1, count // FRAMES), checkpoint_every=checkpoint_every,
+                           checks=dv.Checks(contact=False, energy=False), **given).x  # fmt: skip
             way = (x[-1] - self.x).square().mean()
         return x.detach(), torch.autograd.grad(way, leaves) if leaves else ()
 
@@ -190,10 +189,10 @@ Row = dict[str, Any]
 SWEEPS: list[tuple[dict[str, Any], tuple[int, ...]]] = [
     ({}, (5, 10, 20, 40)),
     ({"relaxation": 1.6}, (10, 20, 40)),
-    ({"relaxation": 1.5, "coarse": "auto"}, (2, 5, 8)),
+    ({"relaxation": 1.5, "subspace": "coarse"}, (2, 5, 8)),
 ]
 GRID = [
-    dv.Settings(1.0, k, scheme, **options)
+    dv.VBD(1.0, k, integrator=scheme, **options)
     for scheme in (dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2())
     for options, counts in SWEEPS
     for k in counts
@@ -203,52 +202,51 @@ GRID = [
 # --- the promise ------------------------------------------------------------------------------------------------------
 
 
-def advised(scene: Scene, error: float, gradient: bool, patience: float) -> tuple[dv.Settings, Row]:
+def advised(scene: Scene, error: float, gradient: bool, patience: float) -> tuple[dv.VBD, Row]:
     """What is advised, and what is said of it."""
     found = dv.advise(scene.model, scene.model.rest_points, scene.v, duration=scene.duration, error=error,
-                      gradient=gradient, patience=patience, **scene.given)  # fmt: skip
-    told = found.predicted
-    assert told is not None
+                      gradient=gradient, time_budget=patience, **scene.given)  # fmt: skip
+    told = found.prediction
     row: Row = {"scene": scene.name, "asked": error, "gradient": gradient, "reached": told.reached,
-                "settings": str(replace(found, predicted=None)), "predicted": told.error, "ms": 1e3 * told.seconds,
+                "settings": str(replace(found, prediction=None)), "predicted": told.error, "ms": 1e3 * told.seconds,
                 "cost": told.cost, "spent": told.spent, "why": "" if told.reached else told.why}  # fmt: skip
     return found, row
 
 
-def exact(runs: Runs, settings: dv.Settings) -> tuple[Run, float]:
-    """A run of much smaller steps and many more sweeps than those settings, and how far one of half of them is off."""
-    steps = 4 * FRAMES * math.ceil(settings.steps(runs.scene.duration) / FRAMES)
-    sweeps = 40 if settings.coarse is None else 5 * settings.sweeps
-    fine = replace(settings, sweeps=sweeps, integrator=dv.SDIRK2(), relaxation=1.5 if settings.coarse else 1.0)
+def exact(runs: Runs, solver: dv.VBD) -> tuple[Run, float]:
+    """A run of much smaller steps and many more sweeps than those solver, and how far one of half of them is off."""
+    steps = 4 * FRAMES * math.ceil(solver.steps(runs.scene.duration) / FRAMES)
+    sweeps = 40 if solver.coarse is None else 5 * solver.sweeps
+    fine = replace(solver, sweeps=sweeps, integrator=dv.SDIRK2(), relaxation=1.5 if solver.coarse else 1.0)
     a, b = runs.run(fine, steps), runs.run(fine, 2 * steps)
     return b, max(runs.apart(a, b))
 
 
-def asked(scene: Scene, error: float, gradient: bool) -> tuple[Row, dv.Settings, Run | None]:
-    settings, row = advised(scene, error, gradient, PATIENCE)
+def asked(scene: Scene, error: float, gradient: bool) -> tuple[Row, dv.VBD, Run | None]:
+    solver, row = advised(scene, error, gradient, PATIENCE)
     if not row["reached"]:
-        return row, settings, None
+        return row, solver, None
     runs = Runs(scene, gradient)
-    truth, row["unsure"] = exact(runs, settings)
-    row["true"] = max(runs.apart(runs.run(settings, settings.steps(scene.duration)), truth))
-    return row, settings, truth
+    truth, row["unsure"] = exact(runs, solver)
+    row["true"] = max(runs.apart(runs.run(solver, solver.steps(scene.duration)), truth))
+    return row, solver, truth
 
 
-def best(scene: Scene, error: float, own: dv.Settings, truth: Run) -> Row:
-    """The fastest settings of the grid that keep the error, each with the fewest steps that do, to a factor of 1.4."""
+def best(scene: Scene, error: float, own: dv.VBD, truth: Run) -> Row:
+    """The fastest solver of the grid that keep the error, each with the fewest steps that do, to a factor of 1.4."""
     runs = Runs(scene)
     seconds = min(runs.run(own, own.steps(scene.duration)).seconds for _ in range(3))
     least, name = math.inf, "the advised"
-    for settings in GRID:
-        if scene.model.touches and (settings.coarse is not None or settings.relaxation > 1):
+    for solver in GRID:
+        if scene.model.touches and (solver.coarse is not None or solver.relaxation > 1):
             continue
         steps = float(FRAMES)
         while steps < 2**14:
-            run = runs.run(settings, FRAMES * round(steps / FRAMES))
+            run = runs.run(solver, FRAMES * round(steps / FRAMES))
             if run.seconds > min(seconds, least):
                 break
             if runs.apart(run, truth)[0] <= error:
-                least, name = run.seconds, f"{replace(settings, time_step=scene.duration / run.steps)}"
+                least, name = run.seconds, f"{replace(solver, time_step=scene.duration / run.steps)}"
                 break
             steps *= 1.4
     return {"ms": 1e3 * seconds, "best_ms": 1e3 * min(seconds, least), "best": name}
@@ -258,9 +256,9 @@ def kept_of(number: int, quick: bool) -> list[Row]:
     """The rows of one scene."""
     rows, scene = [], drawn(number)
     for error in ERRORS[: 1 if quick else None]:
-        row, settings, truth = asked(scene, error, False)
+        row, solver, truth = asked(scene, error, False)
         compare = truth is not None and number < EXHAUSTIVE and error == 0.01
-        rows.append(row | (best(scene, error, settings, truth) if compare and truth is not None else {}))
+        rows.append(row | (best(scene, error, solver, truth) if compare and truth is not None else {}))
     if number < GRADIENTS and not quick:
         rows.append(asked(scene, 0.01, True)[0])
     return rows

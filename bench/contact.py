@@ -65,7 +65,7 @@ def stepping(model: dv.Model, reverse: bool) -> Callable[[], Any]:
     ones = torch.ones_like(x)
 
     def work() -> tuple[Tensor, ...]:
-        end = dv.step(model, x, v, mu=modulus, lam=modulus, time_step=TIME_STEP, sweeps=SWEEPS, gravity=(0.0, 0.0, 0.0))
+        end = dv.step(model, x, v, dv.VBD(TIME_STEP, SWEEPS), mu=modulus, lam=modulus, gravity=(0.0, 0.0, 0.0))
         return torch.autograd.grad(end, (x, v), (ones, ones)) if reverse else end
 
     return work
@@ -134,32 +134,33 @@ def _drawn(seed: int, device: str, batch: int) -> dict[str, Any]:
     energies += (dv.FloorBarrier(kappa=1e4, dhat=FUZZ_DHAT),) if rng.random() < 0.6 else ()
     ball = dv.colliders.Sphere(center=(0.1, 0.62, 0.0), radius=0.05)
     colliders = (ball,) if rng.random() < 0.5 else ()
-    dtype, coarse = torch.float32 if seed % 5 == 2 else torch.float64, "auto" if seed % 4 == 3 else None
-    model = dv.Model(tets, energies=energies, colliders=colliders, coarse=coarse, dtype=dtype, device=device)
+    dtype, subspace = torch.float32 if seed % 5 == 2 else torch.float64, "coarse" if seed % 4 == 3 else "rigid"
+    model = dv.Model(tets, energies=energies, colliders=colliders, dtype=dtype, device=device)
     toward = rng.standard_normal((batch, tets.num_bodies, 1, 3))
     v = speed * toward / np.linalg.norm(toward, axis=-1, keepdims=True)
     v = v[:, tets.body, 0] + 0.2 * speed * rng.standard_normal((batch, tets.num_vertices, 3))
     x = model.rest_points.expand(batch, -1, -1).clone()
-    return {"model": model, "x": x, "v": torch.from_numpy(v).to(x), "sweeps": int(rng.integers(1, 9)),
-            "modulus": float(10 ** rng.uniform(3, 7)), "time_step": float(10 ** rng.uniform(-2.7, -1.3))}  # fmt: skip
+    sweeps, modulus, h = int(rng.integers(1, 9)), float(10 ** rng.uniform(3, 7)), float(10 ** rng.uniform(-2.7, -1.3))
+    solver = dv.VBD(h, sweeps, subspace=subspace, integrator=INTEGRATORS.get(seed % 7, dv.ImplicitEuler()))
+    return {"model": model, "x": x, "v": torch.from_numpy(v).to(x), "modulus": modulus, "solver": solver}
 
 
 def _crossings(seed: int, device: str, batch: int) -> tuple[int, int, int, float]:
     """Of all steps: crossings, numbers that are not finite, steps, and the mean share of cut vertices."""
     s = _drawn(seed, device, batch)
-    model, x, v = s["model"], s["x"], s["v"]
+    model, x, v, solver = s["model"], s["x"], s["v"], s["solver"]
     crossings = lost = 0
-    cut, points = [], model.collider_points
-    integrator, history = INTEGRATORS.get(seed % 7, dv.ImplicitEuler()), None
+    cut, points, history = [], model.collider_points, None
     for step in range(FUZZ_STEPS):
         given: dict[str, Any] = {}
         if len(points):  # it comes down on them
             before, points = points, points - points.new_tensor([0.0, 0.01 * (step % 3), 0.0])
             given = {"colliders": points, "colliders_before": before}
         try:
-            x, v, *past = dv.step(model, x, v, mu=s["modulus"], lam=s["modulus"], time_step=s["time_step"],
-                                  sweeps=s["sweeps"], integrator=integrator, history=history, **given)  # fmt: skip
-            history = past[0] if past else None
+            with torch.no_grad():
+                end = dv.rollout(model, x, v, solver, steps=1, mu=s["modulus"], lam=s["modulus"], history=history,
+                                 checks=dv.Checks(start=step == 0), **given)  # fmt: skip
+            x, v, history = end.x[-1], end.v[-1], end.history
         except ValueError as error:  # what is prescribed leaves bodies no way: said, not done
             if "leaves bodies a way" not in str(error):
                 raise

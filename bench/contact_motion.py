@@ -49,17 +49,16 @@ class Scene:
     gravity: Any = (0.0, -GRAVITY, 0.0)  # [3] or [V, 3] [m/s^2]
     walls: tuple[tuple[Sequence[float], float], ...] = ()  # normal and height [m] of planes that nothing may be below
     prescribed: Callable[[int], Tensor] | None = None  # pinned vertices at the end of step n
-    integrator: dv.ImplicitEuler | dv.SDIRK2 = dv.ImplicitEuler()
+    options: dict[str, Any] = field(default_factory=dict)  # of the solver
 
     def state(self) -> tuple[Tensor, Tensor]:
         x = self.model.rest_points if self.x is None else self.x
         return x, torch.zeros_like(x) if self.v is None else self.v
 
-    def arguments(self, **changed: Any) -> dict[str, Any]:
+    def arguments(self, **more: Any) -> dict[str, Any]:
         """Those of a step or rollout beside Model and state."""
-        own = {"mu": self.mu, "lam": 2 * self.mu, "time_step": self.time_step, "sweeps": self.sweeps,
-               "gravity": self.gravity, "integrator": self.integrator}  # fmt: skip
-        return own | changed
+        solver = dv.VBD(self.time_step, self.sweeps, **self.options)
+        return {"solver": solver, "mu": self.mu, "lam": 2 * self.mu, "gravity": self.gravity, **more}
 
     def finer(self, parts: int) -> Scene:
         return replace(self, time_step=self.time_step / parts)
@@ -134,8 +133,8 @@ def march(scene: Scene, steps: int, keep: int = 1, until: Callable[[Tensor], boo
 def settled(scene: Scene, steps: int = 40, gravity: Any = None) -> Scene:
     """The scene, come to rest without friction: long steps of many sweeps, each begun without velocity."""
     x, still = scene.state()[0], torch.zeros_like(scene.state()[0])
-    free = {} if scene.model.friction is None else {"parameters": {"friction.coefficient": 0.0}}
-    long = scene.arguments(time_step=0.05, sweeps=100, **free)
+    free = {} if scene.model.friction is None else {"friction": 0.0}
+    long = replace(scene, time_step=0.05, sweeps=100).arguments(**free)
     long |= {} if gravity is None else {"gravity": gravity}
     for _ in range(steps):
         x, _ = dv.step(scene.model, x, still, **long)
@@ -193,9 +192,8 @@ def hanging(contact: bool, sweeps: int, time_step: float, device: str, barrier: 
     body = mesh.sheet(9, 9, (0.4, 0.4), 0.005)
     energies = (dv.StableNeoHookean(), pairs(barrier, dhat=0.02)) if contact else (dv.StableNeoHookean(),)
     # "auto" beside pairs: without them it would be "inertia", where so few sweeps hardly move a thin sheet
-    model = dv.Model(body, pinned=torch.from_numpy(body.points[:, 0] < 1e-9), energies=energies, start="predictor",
-                     device=device)  # fmt: skip
-    return Scene(model, MODULUS, time_step, sweeps)
+    model = dv.Model(body, pinned=torch.from_numpy(body.points[:, 0] < 1e-9), energies=energies, device=device)
+    return Scene(model, MODULUS, time_step, sweeps, options={"start": "predictor"})
 
 
 def sheet(sweeps: int = 20, time_step: float = 1 / 60, device: str = "cpu", barrier: Options = None) -> Row:
@@ -212,11 +210,11 @@ def spun(gap: float | None, sweeps: int, time_step: float, device: str, barrier:
     box = mesh.box(3, 0.2, split="kuhn").translate((-0.1, 0, -0.1))
     body = box if gap is None else mesh.join([box, box.translate((0, -0.2 - gap, 0))])
     energies = (dv.StableNeoHookean(),) if gap is None else (dv.StableNeoHookean(), pairs(barrier))
-    model = dv.Model(body, energies=energies, device=device, rigid=False)
+    model = dv.Model(body, energies=energies, device=device)
     x = model.rest_points
     v = torch.zeros_like(x)
     v[:27] = rate * torch.linalg.cross(torch.tensor(UP).to(x).expand(27, 3), x[:27])
-    return Scene(model, MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0))
+    return Scene(model, MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0), options={"subspace": None})
 
 
 def spin(gap: float = 0.002, steps: int = 1, sweeps: int = 20, time_step: float = 1 / 100, device: str = "cpu",

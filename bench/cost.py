@@ -59,7 +59,7 @@ def route(name: str, solves: Solves | None = None) -> Any:
     """The adjoint of a route."""
     if name in GLOBAL:
         return dv.GlobalAdjoint(assembled=name == GLOBAL[0], tolerance=TOLERANCE, on_failure="warn", report=solves)
-    return {FULL: dv.ReverseSweep("full"), COMPACT: dv.ReverseSweep("compact"), UNROLLED: dv.Unrolled()}[name]
+    return dv.Unrolled() if name == UNROLLED else dv.ReverseSweep()
 
 
 def preset(quick: bool) -> Case:
@@ -74,6 +74,7 @@ class Task:
         moduli = [torch.full((), m, dtype=like.dtype, device=like.device) for m in (case.mu, case.lam)]
         self.leaves = tuple(t.clone().requires_grad_() for t in (scene.x, scene.v, *moduli))
         self.options = scene.options(SWEEPS)
+        self.options["solver"] = replace(self.options["solver"], tape="compact" if name == COMPACT else "full")
         self.scene, self.adjoint = scene, route(name)
         rng = testing.generator("loss")
         self.weights = [torch.from_numpy(rng.standard_normal(tuple(like.shape))).to(like) for _ in range(2)]

@@ -43,8 +43,8 @@ def time_step(
     for group in wants:
         given.update({k: t.requires_grad_() for k, t in leaf[group].items()})
     start = time.perf_counter()
-    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), time_step=5e-3, sweeps=sweeps,
-                           adjoint=dv.ReverseSweep(tape), **given)  # type: ignore[arg-type]  # fmt: skip
+    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), dv.VBD(5e-3, sweeps, tape=tape),
+                           **given)  # type: ignore[arg-type]  # fmt: skip
     middle = time.perf_counter()
     if wants:
         (x_end.sum() + v_end.sum()).backward()

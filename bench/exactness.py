@@ -1,9 +1,9 @@
 """Error of each backward route against autograd through the executed sweeps, over sweeps K, meshes and scenes.
 
-The scene. A body of about 1 m with the paper's preset (`dv.Model.paper`: block "paper", saturation 0.1 m,
-regularization 1e-6 kg), 1000 kg/m^3, under gravity, held where x lies in the lowest tenth of the body. It starts
-twisted about its long axis by 1 rad from end to end, turning by another 5 rad/s, with uniform noise of `speed` on every
-component of the velocities, so that one sweep leaves it far from stationary. Two materials at h = 10 ms:
+The scene. A body of about 1 m with the paper's preset (`dv.VBD.paper`: block "paper", saturation 0.1 m, regularization
+1e-6 kg), 1000 kg/m^3, under gravity, held where x lies in the lowest tenth of the body. It starts twisted about its
+long axis by 1 rad from end to end, turning by another 5 rad/s, with uniform noise of `speed` on every component of the
+velocities, so that one sweep leaves it far from stationary. Two materials at h = 10 ms:
 
 * preset: mu = lam = 1e4 Pa, noise of 5 m/s; what `python -m bench cost` measures, too;
 * soft: mu = 2e3 Pa, lam = 1e3 Pa, so that inertia dominates; noise of 10 m/s, so that one sweep still falls short.
@@ -81,8 +81,8 @@ class Scene:
     def options(self, sweeps: int) -> dict[str, Any]:
         c = self.case
         gravity = torch.tensor([c.amount * g for g in GRAVITY], dtype=self.x.dtype, device=self.x.device)
-        return {"steps": c.steps, "mu": c.mu, "lam": c.lam, "time_step": c.time_step, "sweeps": sweeps,
-                "gravity": gravity}  # fmt: skip
+        solver = dv.VBD.paper(c.time_step, sweeps, tape="full")
+        return {"solver": solver, "steps": c.steps, "mu": c.mu, "lam": c.lam, "gravity": gravity}
 
     def to(self, device: str) -> Scene:
         return Scene(self.case, self.model.to(device), self.x.to(device), self.v.to(device))
@@ -116,7 +116,7 @@ def build(case: Case, device: str = "cpu") -> Scene:
     spin = 5.0 * along[:, None] * np.stack([0 * along, -arm[:, 2], arm[:, 1]], -1)
     noise = testing.generator("exactness", case.kind, case.size).uniform(-1.0, 1.0, points.shape)
     v = np.where(pinned[:, None], 0.0, case.amount * (spin + case.speed * noise))
-    model = dv.Model.paper(mesh, pinned=pinned)
+    model = dv.Model(mesh, pinned=pinned)
     return Scene(case, model, torch.from_numpy(x), torch.from_numpy(v)).to(device)
 
 
@@ -148,7 +148,7 @@ def global_route(assembled: bool) -> Callable[[Solves | None, float], Any]:
 
 # Adjoints by the collector of their solves and the tolerance of these
 ROUTES: dict[str, Callable[[Solves | None, float], Any]] = {
-    OURS: lambda solves, tolerance: dv.ReverseSweep("full"),
+    OURS: lambda solves, tolerance: dv.ReverseSweep(),
     UNROLLED: lambda solves, tolerance: dv.Unrolled(),
     GLOBAL[0]: global_route(True),
     GLOBAL[1]: global_route(False),
@@ -162,7 +162,7 @@ def end_of(scene: Scene, sweeps: int, adjoint: Any, x: Tensor, v: Tensor) -> tup
 
 
 def inputs_of(scene: Scene) -> dict[str, Any]:
-    return {"x": scene.x, "v": scene.v, "time_step": scene.case.time_step}
+    return {"x": scene.x, "v": scene.v}
 
 
 def expected_of(scene: Scene, sweeps: int) -> dict[str, Tensor]:
@@ -170,22 +170,22 @@ def expected_of(scene: Scene, sweeps: int) -> dict[str, Tensor]:
     here = scene.to("cpu")
     options = here.options(sweeps)
 
-    def run(x: Tensor, v: Tensor, time_step: float) -> tuple[Tensor, Tensor]:
+    def run(x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         done = reference.rollout(here.model, x, v, **options)
         return done.x[-1], done.v[-1]
 
-    return testing.evaluate(run, inputs_of(here))
+    return testing.evaluate(run, inputs_of(here), here.case.time_step)
 
 
 def result_of(scene: Scene, sweeps: int, adjoint: Any) -> dict[str, Tensor]:
     """End state and gradients by one of the package's routes."""
 
-    def run(x: Tensor, v: Tensor, time_step: float) -> tuple[Tensor, Tensor]:
+    def run(x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         return end_of(scene, sweeps, adjoint, x, v)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a solve that fails is a column of the tables
-        return testing.evaluate(run, inputs_of(scene))
+        return testing.evaluate(run, inputs_of(scene), scene.case.time_step)
 
 
 def forward_error(got: dict[str, Tensor], expected: dict[str, Tensor], time_step: float) -> float:
@@ -294,12 +294,13 @@ def _worst_over_sweeps(scene: Scene, quick: bool) -> Row:
     found = []
     for k in SWEEPS[:1] if quick else SWEEPS:
         expected = expected_of(scene, k)
-        got, other = (result_of(scene, k, adjoint) for adjoint in (dv.ReverseSweep("full"), dv.Unrolled()))
+        got, other = (result_of(scene, k, adjoint) for adjoint in (dv.ReverseSweep(), dv.Unrolled()))
         forward = max(verify_forward(scene, g, expected, r) for g, r in ((got, OURS), (other, UNROLLED)))
         here = scene.to("cpu")
-        options = {name: value for name, value in here.options(k).items() if name not in ("steps", "sweeps")}
-        inputs = {"x": here.x, "v": here.v, **options}
-        spread = max(testing.spread(here.model, inputs, k, scene.case.steps)[f"grad_{name}"] for name in "xv")
+        options = here.options(k)
+        inputs = {"x": here.x, "v": here.v, **{name: options[name] for name in ("mu", "lam", "gravity")}}
+        spreads = testing.spread(here.model, inputs, options["solver"], scene.case.steps)
+        spread = max(spreads[f"grad_{name}"] for name in "xv")
         found.append({"sweeps": k, "forward": forward, "error": gradient_error(got, expected),
                       "unrolled_error": gradient_error(other, expected), "spread": spread, "bar": scaled_bar(spread),
                       "update": _largest_update(scene)})  # fmt: skip
@@ -313,9 +314,8 @@ def scaled_bar(spread: float) -> float:
 
 def _largest_update(scene: Scene) -> float:
     """Longest way of a vertex in the first sweep [m]."""
-    options = {name: value for name, value in scene.options(1).items() if name != "steps"}
     with torch.no_grad():
-        ends = [dv.step(scene.model, scene.x, scene.v, **{**options, "sweeps": k})[0] for k in (0, 1)]
+        ends = [dv.rollout(scene.model, scene.x, scene.v, **scene.options(k) | {"steps": 1}).x[-1] for k in (0, 1)]
     return float((ends[1] - ends[0]).norm(dim=-1).max())
 
 

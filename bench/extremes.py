@@ -67,6 +67,11 @@ class Extreme:
     quick: bool = False
 
     @property
+    def solver(self) -> dv.VBD:
+        return dv.VBD(self.time_step, self.sweeps, block=self.block, relaxation=self.relaxation,
+                      saturation=self.saturation, regularization=self.regularization)  # fmt: skip
+
+    @property
     def must_descend(self) -> bool:
         """The exact block minimises in its vertex; other blocks and barriers do not promise it."""
         return self.block == "exact" and not self.floor
@@ -167,7 +172,7 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
     mesh = dv.TetMesh(points * case.size, tets)
     points = torch.from_numpy(mesh.points.copy())
     half = torch.from_numpy(mesh.points[mesh.tets].mean(1)[:, 1] > 0.5 * case.size)
-    energies: tuple[Any, ...] = (dv.StableNeoHookean(case.block),)
+    energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
     if case.floor:
         energies += (dv.FloorBarrier(height=-0.05 * case.size, kappa=1e4, dhat=0.04 * case.size, damping=10.0),)
     model = dv.Model(
@@ -175,9 +180,6 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
         density=torch.where(half, case.density * case.mass_contrast, case.density).to(torch.float64),
         pinned=mesh.points[:, 0] < 1e-9 * case.size if case.pinned else None,
         energies=energies,
-        saturation=case.saturation,
-        regularization=case.regularization,
-        relaxation=case.relaxation,
     )
     stiff = torch.where(half, case.contrast, 1.0).to(torch.float64)
     noise = torch.from_numpy(rng.uniform(-1, 1, (2, *mesh.points.shape)))
@@ -188,8 +190,7 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
     x = torch.where(model.pinned[:, None], points, x)
     inputs: dict[str, Any] = {"x": x, "v": v, "mu": case.mu * stiff, "lam": case.lam * stiff, "density": model.density,
                               "rest_points": points, "force": 0.1 * model.mass[:, None] * noise[1],
-                              "gravity": torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64),
-                              "time_step": case.time_step}  # fmt: skip
+                              "gravity": torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)}  # fmt: skip
     return model, inputs
 
 
@@ -227,18 +228,18 @@ def check(case: Extreme) -> dict[str, Any]:
     model, inputs = build(case)
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        trajectory = dv.rollout(model, steps=case.steps, sweeps=case.sweeps, save="last", **options)
+        trajectory = dv.rollout(model, solver=case.solver, steps=case.steps, save="last", **options)
         return trajectory.x[-1], trajectory.v[-1]
 
-    expected = testing.reference_result(model, inputs, case.sweeps, case.steps)
-    spread = testing.spread(model, inputs, case.sweeps, case.steps, expected)
-    got = testing.evaluate(run, inputs)
+    expected = testing.reference_result(model, inputs, case.solver, case.steps)
+    spread = testing.spread(model, inputs, case.solver, case.steps, expected)
+    got = testing.evaluate(run, inputs, case.time_step)
     errors = {k: testing.relative_error(got[k], expected[k]) for k in got if k.startswith("grad_")}
     margin = {k: errors[k] / testing.bar(spread[k]) for k in errors}
     condition = dict.fromkeys(errors, 0.0)
     # one perturbation underestimates the worst by chance: beyond the bar more are tried
     for seed in range(1 if all(m <= 1 for m in margin.values()) else 8):
-        rounded = testing.reference_result(model, _rounded(inputs, seed), case.sweeps, case.steps)
+        rounded = testing.reference_result(model, _rounded(inputs, seed), case.solver, case.steps)
         condition = {k: max(c, testing.relative_error(rounded[k], expected[k])) for k, c in condition.items()}
     beyond = {k: errors[k] / max(testing.bar(spread[k]), 10 * condition[k]) for k in errors}
     worst = max(margin, key=lambda k: margin[k] if math.isfinite(margin[k]) else math.inf)
@@ -270,8 +271,7 @@ def _rounded(inputs: dict[str, Any], seed: int) -> dict[str, Any]:
 def potential_rise(case: Extreme, model: dv.Model, inputs: dict[str, Any]) -> float:
     """Largest rise of the incremental potential from one sweep to the next, in roundings of its terms; without rigid
     corrections, since how much the last one takes off differs from one number of sweeps to the next."""
-    model = model.replace(rigid=False)
-    options = {k: inputs[k] for k in ("mu", "lam", "force", "gravity", "time_step")}
+    options = {k: inputs[k] for k in ("mu", "lam", "force", "gravity")}
     counts = [k for k in (*range(11), 12, 15, 20, 35, 50, 75, 100, 200, 500, 1000) if k <= max(case.sweeps, 5)]
     x, v, h = inputs["x"], inputs["v"], case.time_step
     y = x + h * v + h**2 * (options["gravity"] + options["force"] / model.mass[:, None])
@@ -279,7 +279,7 @@ def potential_rise(case: Extreme, model: dv.Model, inputs: dict[str, Any]) -> fl
     rise, last = 0.0, math.inf
     for k in counts:
         with torch.no_grad():
-            at, _ = dv.step(model, x, v, sweeps=k, **options)
+            at, _ = dv.step(model, x, v, replace(case.solver, sweeps=k, subspace=None), **options)
             value = float(reference.incremental_potential(model, at, y, options["mu"], options["lam"], h, x))
         if not math.isfinite(value):
             return math.inf
@@ -306,19 +306,19 @@ def _rounding_scale(model: dv.Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tens
 
 def check_rollout(case: Rollout) -> dict[str, Any]:
     mesh = dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
-    energies: tuple[Any, ...] = (dv.StableNeoHookean(case.block),)
+    energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
     if case.floor:
         energies += (dv.FloorBarrier(height=-0.2, kappa=1e4, damping=1.0),)
-    options = {"saturation": 0.1, "regularization": 1e-6} if case.block == "paper" else {}
+    make = dv.VBD.paper if case.block == "paper" else dv.VBD
+    solver = make(1 / 60, case.sweeps, relaxation=case.relaxation)
     pinned = None if case.floor else mesh.points[:, 0] < 1e-9
-    model = dv.Model(mesh, pinned=pinned, energies=energies, relaxation=case.relaxation, **options)
+    model = dv.Model(mesh, pinned=pinned, energies=energies)
     x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
     weights = torch.from_numpy(testing.generator("rollout").standard_normal(tuple(x.shape)))
     lowest: list[float] = []
 
     def loss(scale: Tensor, steps: int = case.steps) -> Tensor:
-        trajectory = dv.rollout(model, x, v, steps=steps, mu=1e5 * scale, lam=1.5e5 * scale, time_step=1 / 60,
-                                sweeps=case.sweeps, save="last")  # fmt: skip
+        trajectory = dv.rollout(model, x, v, solver, steps=steps, mu=1e5 * scale, lam=1.5e5 * scale, save="last")
         lowest.append(float(trajectory.x[-1][:, 1].detach().min()))
         return (weights * trajectory.x[-1]).sum()
 
@@ -405,29 +405,29 @@ AXES: dict[str, dict[str, Any]] = {
 }
 QUICK_AXES = ("none", "mu 1e10 Pa, K = 1", "1000 m/s", "float32, size 1e-4 m")
 
-# scene, options of the Model, integrator
-FEATURES: dict[str, tuple[str, dict[str, Any], Any]] = {
-    "plain, pinned": ("pinned", {}, None),
-    "plain, free": ("free", {}, None),
-    "coarse, pinned": ("pinned", {"coarse": "auto"}, None),
-    "coarse, free": ("free", {"coarse": "auto", "relaxation": 1.5}, None),
-    "SDIRK2, pinned": ("pinned", {}, dv.SDIRK2()),
-    "SDIRK2, free": ("free", {}, dv.SDIRK2()),
-    "BDF2, pinned": ("pinned", {}, dv.BDF2()),
-    "BDF2, free": ("free", {}, dv.BDF2()),
-    "floor": ("floor", {}, None),
-    "floor, friction": ("floor", {"friction": 0.5}, None),
-    "floor, coarse, BDF2": ("floor", {"coarse": "auto"}, dv.BDF2()),
-    "plane": ("plane", {}, None),
-    "plane, friction": ("plane", {"friction": 0.5}, None),
-    "sphere, friction": ("sphere", {"friction": 0.5}, None),
-    "pairs": ("pairs", {}, None),
-    "pairs, friction": ("pairs", {"friction": 0.5}, None),
-    "pairs, friction, coarse": ("pairs", {"friction": 0.5, "coarse": "auto"}, None),
-    "pairs, SDIRK2": ("pairs", {}, dv.SDIRK2()),
-    "pairs, BDF2": ("pairs", {}, dv.BDF2()),
-    "self-contact": ("horseshoe", {}, None),
-    "self-contact, friction, coarse": ("horseshoe", {"friction": 0.5, "coarse": "auto"}, None),
+# scene, friction, options of the solver
+FEATURES: dict[str, tuple[str, float, dict[str, Any]]] = {
+    "plain, pinned": ("pinned", 0.0, {}),
+    "plain, free": ("free", 0.0, {}),
+    "coarse, pinned": ("pinned", 0.0, {"subspace": "coarse"}),
+    "coarse, free": ("free", 0.0, {"subspace": "coarse", "relaxation": 1.5}),
+    "SDIRK2, pinned": ("pinned", 0.0, {"integrator": dv.SDIRK2()}),
+    "SDIRK2, free": ("free", 0.0, {"integrator": dv.SDIRK2()}),
+    "BDF2, pinned": ("pinned", 0.0, {"integrator": dv.BDF2()}),
+    "BDF2, free": ("free", 0.0, {"integrator": dv.BDF2()}),
+    "floor": ("floor", 0.0, {}),
+    "floor, friction": ("floor", 0.5, {}),
+    "floor, coarse, BDF2": ("floor", 0.0, {"subspace": "coarse", "integrator": dv.BDF2()}),
+    "plane": ("plane", 0.0, {}),
+    "plane, friction": ("plane", 0.5, {}),
+    "sphere, friction": ("sphere", 0.5, {}),
+    "pairs": ("pairs", 0.0, {}),
+    "pairs, friction": ("pairs", 0.5, {}),
+    "pairs, friction, coarse": ("pairs", 0.5, {"subspace": "coarse"}),
+    "pairs, SDIRK2": ("pairs", 0.0, {"integrator": dv.SDIRK2()}),
+    "pairs, BDF2": ("pairs", 0.0, {"integrator": dv.BDF2()}),
+    "self-contact": ("horseshoe", 0.0, {}),
+    "self-contact, friction, coarse": ("horseshoe", 0.5, {"subspace": "coarse"}),
 }  # fmt: skip
 
 FEATURE_CASES = [replace(Case(), feature=f, axis=a, **given) for f in FEATURES for a, given in AXES.items()]
@@ -465,8 +465,7 @@ def _with_slivers(body: dv.TetMesh, thickness: float) -> dv.TetMesh:
 
 def build_feature(case: Case) -> tuple[dv.Model, Tensor, Tensor, dict[str, Any]]:
     """Model, state, and the material of each tet."""
-    kind, options, _ = FEATURES[case.feature]
-    options = dict(options)
+    kind, friction, _ = FEATURES[case.feature]
     tets = bodies(case)
     scaled = tets.transform(case.size * np.eye(3))
     upper = np.array(tets.points[tets.tets].mean(1)[:, 0] > 0.5 * np.ptp(tets.points[:, 0]))
@@ -483,13 +482,13 @@ def build_feature(case: Case) -> tuple[dv.Model, Tensor, Tensor, dict[str, Any]]
         colliders = (dv.colliders.Plane(),)
     elif kind == "sphere":
         colliders = (dv.colliders.Sphere((0.2 * case.size, -0.5 * case.size, 0.2 * case.size), 0.5 * case.size),)
-    if "friction" in options:
-        energies.append(dv.Friction(options.pop("friction"), velocity=0.01 * case.speed))
+    if friction:
+        energies.append(dv.Friction(friction, velocity=0.01 * case.speed))
     pinned = np.isclose(tets.points[:, 0], 0.0) if kind == "pinned" else None
     density = torch.where(half, case.density * case.mass_contrast, case.density).to(torch.float64)
     dtype = torch.float32 if case.single else torch.float64
     model = dv.Model(scaled, density=density.to(dtype), pinned=pinned, energies=energies, colliders=colliders,
-                     dtype=dtype, **options)  # fmt: skip
+                     dtype=dtype)  # fmt: skip
     stiffness = torch.where(half, case.contrast, 1.0).to(dtype) * case.mu
     lam = stiffness * (2 * case.poisson / (1 - 2 * case.poisson))
     points = torch.from_numpy(tets.points.copy()).to(dtype)
@@ -537,13 +536,8 @@ def check_feature(case: Case) -> dict[str, Any]:
 
 def _run(case: Case) -> dict[str, Any]:
     model, x, v, material = build_feature(case)
-    integrator = FEATURES[case.feature][2]
-    options: dict[str, Any] = {
-        "steps": case.steps,
-        "time_step": case.time_step,
-        "sweeps": case.sweeps,
-        "integrator": integrator,
-    }
+    solver = dv.VBD(case.time_step, case.sweeps, **FEATURES[case.feature][2])
+    options: dict[str, Any] = {"steps": case.steps, "solver": solver}
     begun = time.perf_counter()
     given: dict[str, Any] = {**options, **material}
     with torch.no_grad():
@@ -558,11 +552,11 @@ def _run(case: Case) -> dict[str, Any]:
     return row | _gradient(case, model, x, v, material, options)
 
 
-def gained(case: Case, motion: dv.Trajectory, material: dict[str, Tensor]) -> float:
+def gained(case: Case, motion: dv.results.Trajectory, material: dict[str, Tensor]) -> float:
     """Most energy of a frame beyond that of the first, over what the scene had and what gravity did; barriers, which
     hold none at the start and are never negative, left out."""
     double = build_feature(replace(case, single=False))[0]
-    body = dv.Model(double.mesh, density=double._density, energies=(dv.StableNeoHookean(),), rigid=False)
+    body = dv.Model(double.mesh, density=double._density, energies=(dv.StableNeoHookean(),))
     x, v = motion.x.to(torch.float64), motion.v.to(torch.float64)
     mu, lam = (material[k].to(torch.float64) for k in ("mu", "lam"))
     elastic = torch.stack([reference.incremental_potential(body, a, a, mu, lam, 1.0) for a in x])
@@ -576,7 +570,7 @@ def gained(case: Case, motion: dv.Trajectory, material: dict[str, Tensor]) -> fl
     return float(((moving + elastic + fallen).max() - moving[0] - elastic[0]) / scale)
 
 
-def _crossings(case: Case, model: dv.Model, motion: dv.Trajectory) -> int:
+def _crossings(case: Case, model: dv.Model, motion: dv.results.Trajectory) -> int:
     """Edges through triangles at the end, and vertices of the surface at or below the floor or plane."""
     kind = FEATURES[case.feature][0]
     end = motion.x[-1]
@@ -608,7 +602,7 @@ def _gradient(case: Case, model: dv.Model, x: Tensor, v: Tensor, material: dict[
     def loss(s: Tensor) -> Tensor:
         given: dict[str, Any] = {k: m * (1 + s) for k, m in material.items()}
         end = dv.rollout(
-            model, x, v + s * way, **options, **given, save="last", check_contact=False, check_energy=False
+            model, x, v + s * way, **options, **given, save="last", checks=dv.Checks(contact=False, energy=False)
         )
         return (weights * (end.x[-1] - x)).sum() / case.size
 

@@ -221,7 +221,6 @@ class Scene:
     body: Body
     v: Array  # [V, 3] [m/s]
     steps: int
-    prescribed: Array | None = None  # [steps, V, 3] [m]
 
     @property
     def spacing(self) -> float:
@@ -238,15 +237,15 @@ class Scene:
         rubs = (dv.Friction(b.friction, velocity=b.eps_v),) if b.friction else ()
         return (dv.StableNeoHookean(), dv.FloorBarrier(kappa=b.kappa, dhat=b.dhat), *rubs)
 
-    def executed(self, sweeps: int, coarse: Any = None, **options: Any) -> tuple[dv.Trajectory, dv.Model, list[str]]:
-        """Its rollout, the Model, and what was said of either."""
-        b, held = self.body, self.prescribed
+    def executed(self, sweeps: int, **options: Any) -> tuple[dv.results.Trajectory, dv.Model, list[str]]:
+        """Its rollout by a solver of these options, the Model, and what was said of either."""
+        b = self.body
         with warnings.catch_warnings(record=True) as said, torch.no_grad():
             warnings.simplefilter("always")
-            model = dv.Model(self.mesh, b.density, b.pinned, self.energies(), coarse=coarse, **options)
-            motion = dv.rollout(model, model.rest_points, torch.from_numpy(self.v), steps=self.steps, young=b.young,
-                                poisson=b.poisson, time_step=b.time_step, sweeps=sweeps, gravity=b.gravity,
-                                prescribed=None if held is None else dv.per_step(torch.from_numpy(held)))  # fmt: skip
+            model = dv.Model(self.mesh, b.density, b.pinned, self.energies())
+            solver = dv.VBD(b.time_step, sweeps, **options)
+            motion = dv.rollout(model, model.rest_points, torch.from_numpy(self.v), solver, steps=self.steps,
+                                young=b.young, poisson=b.poisson, gravity=b.gravity)  # fmt: skip
         return motion, model, [str(w.message) for w in said]
 
 
@@ -323,7 +322,7 @@ def drawn(number: int) -> Scene:
 COUNT, QUICK_COUNT = 300, 30
 SWEEPS, OFF = 20, 0.05
 MORE = (40, 80, 160, 320, 640, 1280)
-KINDS: dict[str, Any] = {"plain": None, "coarse": "auto"}
+KINDS: dict[str, dict[str, Any]] = {"plain": {}, "coarse": {"subspace": "coarse"}}
 
 
 def rollouts(numbers: Iterable[int]) -> list[dict[str, Any]]:
@@ -334,21 +333,21 @@ def rollouts(numbers: Iterable[int]) -> list[dict[str, Any]]:
         scene = drawn(number)
         b = scene.body
         exact = b.rollout(scene.mesh.points, scene.v, scene.steps)
-        for kind, coarse in KINDS.items():
-            motion, _, said = scene.executed(SWEEPS, coarse)
+        for kind, options in KINDS.items():
+            motion, _, said = scene.executed(SWEEPS, **options)
             errors = apart(scene, motion, exact)
             row = {"scene": scene.name, "young": b.young, "poisson": b.poisson, "speed": -float(scene.v[0, 1]),
                    "time_step": b.time_step, "steps": scene.steps, "kappa": b.kappa, "dhat": b.dhat,
                    "friction": b.friction, "gravity": b.gravity[1], "stiffness": scene.stiffness,
                    "corrections": kind, **errors, "off": max(errors.values()) > OFF, "said": _short(said)}  # fmt: skip
             if row["off"]:
-                enough = (k for k in MORE if max(apart(scene, scene.executed(k, coarse)[0], exact).values()) < OFF)
+                enough = (k for k in MORE if max(apart(scene, scene.executed(k, **options)[0], exact).values()) < OFF)
                 row["needs"] = next(enough, None)
             out.append(row)
     return out
 
 
-def apart(scene: Scene, motion: dv.Trajectory, exact: tuple[Array, Array]) -> dict[str, float]:
+def apart(scene: Scene, motion: dv.results.Trajectory, exact: tuple[Array, Array]) -> dict[str, float]:
     x, v = exact
     off = np.sqrt(((motion.x.numpy() - x) ** 2).sum(-1).mean(-1))
     moved = np.sqrt(((x - x[0]) ** 2).sum(-1).mean(-1)).max()

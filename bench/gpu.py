@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from bench.tables import Table, times
 from bench.tradeoff import gripper
 from diffvbd.tasks import cover_the_spot
 from diffvbd.tasks.problem import Settings
+from diffvbd.testing import regime
 
 GRADIENTS = ("x", "v", "material")
 
@@ -119,11 +121,12 @@ def cubes(card: Card) -> list[Row]:
     """A million scenes of one cube of eight vertices, mu of each scene; forward without tape, and with reverse. By
     sweeps alone, too: to choose a start and to correct rigid motion is work around them."""
     scenes, rows = (100 if card.quick else 1_000_000), []
-    for note, options in (("", {}), (", sweeps alone", {"rigid": False, "start": "predictor"})):
-        model = model_of(dv.mesh.cube(size=0.003, split="kuhn"), card, pinned=False, **options)
-        scene = scene_of(model, scenes, "per scene", noise=1e-5)
+    model = model_of(dv.mesh.cube(size=0.003, split="kuhn"), card, pinned=False)
+    scene = scene_of(model, scenes, "per scene", noise=1e-5)
+    for note, plain in (("", False), (", sweeps alone", True)):
         about = {"name": f"{scenes} scenes of {label(model, 5)}{note}", "material": "per scene"}
-        timed_parts(card, rows, about, scene, 5, 2 if card.quick else 10, ("recompute",), (1.2, None), ("x", "v", "mu"))
+        timed_parts(card, rows, about, replace(scene, plain=plain), 5, 2 if card.quick else 10, ("recompute",),
+                    (1.2, None), ("x", "v", "mu"))  # fmt: skip
     return rows
 
 
@@ -157,8 +160,8 @@ def rollout_reverse(scene: Scene, sweeps: int, steps: int, tape: Any, every: Any
     wanted = [t for t in scene.leaves if t.requires_grad]
 
     def work() -> Any:
-        end = dv.rollout(scene.model, scene.x, scene.v, steps=steps, mu=scene.mu, lam=scene.lam, time_step=STEP,
-                         sweeps=sweeps, adjoint=dv.ReverseSweep(tape), checkpoint_every=every, save="last")  # fmt: skip
+        end = dv.rollout(scene.model, scene.x, scene.v, dv.VBD(STEP, sweeps, tape=tape), steps=steps, mu=scene.mu,
+                         lam=scene.lam, checkpoint_every=every, save="last")  # fmt: skip
         return torch.autograd.grad((end.x[-1], end.v[-1]), wanted, (ones, ones))
 
     return work
@@ -201,7 +204,7 @@ def _grid_row(card: Card, mesh: dv.TetMesh, sweeps: int) -> Row:
     if 2 * GRID_STEPS * step_ms > 15e3 or not card.cuda:
         return {**row, "note": f"peak of {GRID_STEPS} steps not measured"}
     row["rollout_peak"] = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "auto", "auto"))
-    predicted = model.memory(sweeps=sweeps, steps=GRID_STEPS, tape="full", checkpoint_every=None)
+    predicted = model.memory(dv.VBD(0.01, sweeps, tape="full"), steps=GRID_STEPS, checkpoint_every=None)
     if predicted["total"] < room(card):
         own = card.allocated() - before - scene.bytes
         peak = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None))
@@ -245,7 +248,7 @@ def _regimes_row(card: Card, mesh: dv.TetMesh, scenes: int, sweeps: int, exhaust
             make = forward if part == "forward" else forward_reverse
             scene = plain if part == "forward" else wanted
             try:
-                with nullcontext() if name == "auto" else dv.regime(name):
+                with nullcontext() if name == "auto" else regime(name):
                     cell[name] = _cell(card, make(scene, sweeps, 1), make(scene, sweeps, steps), steps)
             except ValueError as error:
                 if "regime" not in str(error):
@@ -313,8 +316,8 @@ def landed_step(card: Card) -> Work:
     """A step and its gradients where disks lie on the floor and on one another."""
     settings = Settings(Path("unused"), str(card.device))
     fall = cover_the_spot.Fall(settings, cover_the_spot.RADIUS, cover_the_spot.FULL)
-    given: dict[str, Any] = {"mu": cover_the_spot.MU, "lam": cover_the_spot.LAM, "time_step": cover_the_spot.TIME_STEP,
-                             "sweeps": cover_the_spot.SWEEPS}  # fmt: skip
+    given: dict[str, Any] = {"mu": cover_the_spot.MU, "lam": cover_the_spot.LAM,
+                             "solver": dv.VBD(cover_the_spot.TIME_STEP, cover_the_spot.SWEEPS)}  # fmt: skip
     x, v = fall.model.rest_points, fall.velocity[:, None].expand(-1, fall.disk.num_vertices, -1).flatten(0, 1)
     with torch.no_grad():
         end = dv.rollout(fall.model, x, v, steps=fall.version.steps, save="last", **given)
@@ -346,9 +349,7 @@ def grippers(card: Card, scenes: int, steps: int) -> tuple[Row, Work, Work]:
         return rest + shares * (end - rest)
 
     def step(at: Tensor, speed: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        return dv.step(
-            model, at, speed, mu=1e5, lam=2e5, time_step=CLAMPED_STEP, sweeps=CLAMPED_SWEEPS, prescribed=ends_of[k]
-        )
+        return dv.step(model, at, speed, dv.VBD(CLAMPED_STEP, CLAMPED_SWEEPS), mu=1e5, lam=2e5, prescribed=ends_of[k])
 
     ends_of = [ends(k + 1) for k in range(CLOSING + steps)]
     with torch.no_grad():

@@ -23,13 +23,13 @@ def beam(quick: bool) -> list[dict[str, Any]]:
     """A cantilever of 0.6 m released from rest: error of its end state over its motion after 0.4 s, and the time that
     takes, of ladders of steps. Sweeps fall with the step, so that each ladder does about the same number of them."""
     mesh = dv.mesh.beam(*((7, 3, 3) if quick else (13, 4, 4)), size=(0.6, 0.15, 0.15), split="kuhn")
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, relaxation=1.6)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 
     def end(steps: int, sweeps: int, integrator: Any) -> Tensor:
-        options = {"steps": steps, "time_step": SECONDS / steps, "sweeps": sweeps, "save": "last", **MATERIAL}
+        solver = dv.VBD(SECONDS / steps, sweeps, relaxation=1.6, integrator=integrator)
         with torch.no_grad():
-            return dv.rollout(model, x, v, integrator=integrator, **options).x[-1]
+            return dv.rollout(model, x, v, solver, steps=steps, save="last", **MATERIAL).x[-1]
 
     exact = end(200 if quick else 3200, 40, dv.SDIRK2())
     motion, out = float((exact - x).norm()), []
@@ -78,8 +78,8 @@ def impacts(quick: bool) -> list[dict[str, Any]]:
     for kind, time_step, (name, integrator) in cases[:3] if quick else cases:
         with torch.no_grad():
             steps = round((0.1 if quick else 0.3) / time_step)
-            motion = dv.rollout(models[kind], x, v, steps=steps, time_step=time_step, sweeps=15, mu=mu, lam=lam,
-                                integrator=integrator, check_contact=False)  # fmt: skip
+            motion = dv.rollout(models[kind], x, v, dv.VBD(time_step, 15, integrator=integrator), steps=steps, mu=mu,
+                                lam=lam, checks=dv.Checks(contact=False))  # fmt: skip
             over = torch.stack([energy(a, b) for a, b in zip(motion.x[1:], motion.v[1:], strict=True)]) / start - 1
         out.append({"integrator": name, "floor": kind, "time step [s]": time_step, "impacts": count,
                     "scenes that gain": int((over.amax(0) > GAIN).sum()), "most gained": float(over.max()),

@@ -62,7 +62,7 @@ def _collapsed(model: dv.Model, f: Tensor, mu: float, lam: float) -> Tensor:
     # steps short enough to follow the force, long enough in all to arrive
     for h, steps in ((0.02, 400), (0.2, 100)):
         for _ in range(steps):
-            x, _ = dv.step(model, x, v, mu=mu, lam=lam, time_step=h, sweeps=20, gravity=(0.0, 0.0, 0.0))
+            x, _ = dv.step(model, x, v, dv.VBD(h, 20), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
     return (x[:, 1:] - x[:, :1]).norm(dim=(-2, -1)) < 1e-2
 
 
@@ -86,14 +86,14 @@ def float32(quick: bool) -> list[dict[str, Any]]:
         small = {k: t.float() for k, t in exact.items()}
         same = {k: t.double() for k, t in small.items()}
         local, truth = _float32_step(model.to(dtype=torch.float32), small), _float32_step(model, same)
-        naive = testing.reference_result(model.to(dtype=torch.float32), small | {"time_step": 1 / 60}, 10)
+        naive = testing.reference_result(model.to(dtype=torch.float32), small, dv.VBD(1 / 60, 10))
         unrounded = _float32_step(model, exact)
 
         def worst(value: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
             return max(testing.relative_error(value[k], expected[k]) for k in ARGUMENTS)
 
         versions = ((model, exact), (model.to(dtype=torch.float32), small))
-        options = {"mu": 1e4, "lam": 2e4, "time_step": 1 / 60, "sweeps": 10, "save": "last"}
+        options = {"mu": 1e4, "lam": 2e4, "save": "last", "solver": dv.VBD(1 / 60, 10)}
         ends = [dv.rollout(m, i["x"], i["v"], steps=100, **options).x[-1] for m, i in versions]
         row = {
             "offset": float(offset),
@@ -109,7 +109,7 @@ def float32(quick: bool) -> list[dict[str, Any]]:
 
 
 def _float32_step(model: dv.Model, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-    return testing.evaluate(lambda **o: dv.step(model, sweeps=10, **o), inputs | {"time_step": 1 / 60})
+    return testing.evaluate(lambda **o: dv.step(model, solver=dv.VBD(1 / 60, 10), **o), inputs, 1 / 60)
 
 
 # --- conditioning of the gradient -------------------------------------------------------------------------------------
@@ -124,10 +124,10 @@ def conditioning(quick: bool) -> list[dict[str, Any]]:
         )
         with mock.patch.dict(testing.CASES, {"strain": case}):
             scene = testing.build_scene("strain")
-        model, inputs = scene.model(), scene.inputs()
-        expected = testing.reference_result(model, inputs, 5)
-        spread = testing.spread(model, inputs, 5, expected=expected)
-        got = testing.evaluate(lambda m=model, **o: dv.step(m, sweeps=5, **o), inputs)
+        model, inputs, solver = scene.model(), scene.inputs(), scene.solver(5)
+        expected = testing.reference_result(model, inputs, solver)
+        spread = testing.spread(model, inputs, solver, expected=expected)
+        got = testing.evaluate(lambda m=model, s=solver, **o: dv.step(m, solver=s, **o), inputs, solver.time_step)
         errors = {k: testing.relative_error(got[k], expected[k]) for k in expected if k.startswith("grad_")}
         worst = max(errors, key=lambda k: errors[k])
         out.append(
@@ -157,13 +157,13 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
     mu, lam = (torch.tensor([m[i] for _ in range(3) for m in materials])[:, None].double() for i in (0, 1))
     out = []
     for omega in (1.0, 1.9) if quick else (1.0, 1.5, 1.6, 1.7, 1.8, 1.85, 1.9, 1.95):
-        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=omega)
+        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
         grown, total = 0, 0
         for h in (1 / 60, 0.2):
             x = torch.where(model.pinned[:, None], points, states)
             v, lost = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool)
             for _ in range(50 if quick else 300):
-                x, v = dv.step(model, x, v, mu=mu, lam=lam, time_step=h, sweeps=5, gravity=(0.0, 0.0, 0.0))
+                x, v = dv.step(model, x, v, dv.VBD(h, 5, relaxation=omega), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
                 # no start is longer than 3 m: at 30 m the sweeps have added energy
                 lost |= (~torch.isfinite(x).all(-1) | (x.norm(dim=-1) > 30)).any(-1)
                 x, v = torch.where(lost[:, None, None], points, x), torch.where(lost[:, None, None], 0.0, v)
@@ -173,29 +173,36 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
     return out
 
 
-# --- the paper's preset on bodies of other sizes ----------------------------------------------------------------------
-
+# --- bodies at rest ---------------------------------------------------------------------------------------------------
 
 REST_SWEEPS = (0, 1, 2, 3, 5, 10)
 H, GROUND = 0.01, {"height": 0.0, "kappa": 1e3, "dhat": 1e-2}
 
 
-def _cube(device: str, lift: float, relaxation: float, rigid: bool) -> dv.Model:
-    """27 vertices, 0.2 m, 3000 kg/m^3, above a floor without friction."""
-    mesh = dv.mesh.cube(3, size=0.2, split="kuhn").translate((0.0, lift, 0.0))
+def at_rest(quick: bool, device: str) -> list[dict[str, Any]]:
+    """A cube of 27 vertices, 0.2 m and 3000 kg/m^3, let go 2 mm above where the barrier of a frictionless floor begins,
+    1,500 steps."""
+    mesh = dv.mesh.cube(3, size=0.2, split="kuhn").translate((0.0, 0.012, 0.0))
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND))
-    return dv.Model(mesh, density=3000.0, energies=energies, relaxation=relaxation, rigid=rigid, device=device)
+    model, out = dv.Model(mesh, density=3000.0, energies=energies, device=device), []
+    steps = 50 if quick else (1500 if device == "cpu" else 400)
+    for subspace in (None, "rigid"):
+        for sweeps in (1, 5) if quick else REST_SWEEPS:
+            for relaxation in (1.0,) if quick else (0.5, 1.0, 1.6):
+                solver = dv.VBD(H, sweeps, relaxation=relaxation, subspace=subspace)
+                row = {"rigid": subspace == "rigid", "sweeps": sweeps, "relaxation": relaxation, "steps": steps}
+                out.append(row | _watched(model, solver, steps))
+    return out
 
 
 @torch.no_grad()
-def _watched(model: dv.Model, steps: int, sweeps: int, speed: float = 0.0) -> dict[str, Any]:
-    """What became of a body that was let go, or thrown down."""
+def _watched(model: dv.Model, solver: dv.VBD, steps: int) -> dict[str, Any]:
+    """What became of a body that was let go."""
     x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
-    v[:, 1] -= speed
     low, mu = torch.full((), torch.inf, dtype=x.dtype, device=x.device), 2e5
     for _ in range(steps):
         try:
-            x, v = dv.step(model, x, v, mu=mu, lam=2 * mu, time_step=H, sweeps=sweeps)
+            x, v = dv.step(model, x, v, solver, mu=mu, lam=2 * mu)
         except ValueError:  # the state before was no longer finite, or below the floor
             x, v, low = x * torch.nan, v * torch.nan, low * torch.nan
             break
@@ -209,18 +216,7 @@ def _watched(model: dv.Model, steps: int, sweeps: int, speed: float = 0.0) -> di
     }
 
 
-def at_rest(quick: bool, device: str) -> list[dict[str, Any]]:
-    """A cube let go 2 mm above where its barrier begins, 1,500 steps."""
-    out = []
-    for rigid in (False, True):
-        for sweeps in (1, 5) if quick else REST_SWEEPS:
-            for relaxation in (1.0,) if quick else (0.5, 1.0, 1.6):
-                model = _cube(device, 0.012, relaxation, rigid)
-                steps = 50 if quick else (1500 if device == "cpu" else 400)
-                row = {"rigid": rigid, "sweeps": sweeps, "relaxation": relaxation, "steps": steps}
-                out.append(row | _watched(model, steps, sweeps))
-    return out
-
+# --- one direction far stiffer than the others ------------------------------------------------------------------------
 
 GAPS = (1e-3, 1e-4, 1e-5, 1e-6, 3e-7, 1e-7)  # [m]
 NORMALS = ((0.0, 1.0, 0.0), (0.3, 0.9, -0.3), (1.0, 2.0, 3.0), (-0.7, 0.7, 0.02))
@@ -230,14 +226,18 @@ SWEEPS = (1, 3)
 GRAVITY = (0.0, -9.81, 0.0)
 PLACE = np.array([0.3, 0.7, 0.2])  # of the cube [m]: coordinates without zeros have an ulp to move by
 STATE = ("x", "mu", "lam")
-PLANES = tuple(f"floor_barrier.{name}" for name in ("height", "normal", "kappa", "dhat"))
+PLANES = ("floor_height", "floor_normal", "floor_kappa", "floor_dhat")
+TIME_STEP = 1 / 60  # [s]
 
 
 class Scene(NamedTuple):
     model: dv.Model
     inputs: dict[str, Any]
     names: tuple[str, ...]  # of the inputs that are differentiated
-    block: str
+    options: dict[str, Any]  # of the solver
+
+    def solver(self, sweeps: int, tape: Any = "full") -> dv.VBD:
+        return dv.VBD(TIME_STEP, sweeps, start="predictor", tape=tape, **self.options)
 
 
 def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
@@ -248,7 +248,7 @@ def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
     planes = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
     height = (points @ planes.T).min(0) - gap
     floor = dv.FloorBarrier(height=height.tolist(), normal=planes.tolist(), kappa=2e4, dhat=0.1, damping=0.0)
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor), rigid=False, start="predictor")
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor))
     noise = testing.generator("oblique").uniform(-1, 1, points.shape)
     across = np.linalg.pinv(planes) @ planes  # what of a vector changes the gaps
     away = np.linalg.pinv(planes) @ np.full(len(planes), 0.01 * gap * 60)
@@ -260,10 +260,9 @@ def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
         "mu": torch.tensor(1e4, dtype=torch.float64),
         "lam": torch.tensor(2e4, dtype=torch.float64),
         "gravity": torch.tensor(GRAVITY, dtype=torch.float64),
-        "time_step": 1 / 60,
-        "parameters": {f"floor_barrier.{k}": torch.as_tensor(v, dtype=torch.float64) for k, v in number.items()},
+        **{f"floor_{k}": torch.as_tensor(v, dtype=torch.float64) for k, v in number.items()},
     }
-    return Scene(model, inputs, STATE + PLANES, "exact")
+    return Scene(model, inputs, STATE + PLANES, {"subspace": None})
 
 
 def volumetric(ratio: float, block: str = "exact") -> Scene:
@@ -272,16 +271,15 @@ def volumetric(ratio: float, block: str = "exact") -> Scene:
     rng = testing.generator("volumetric")
     points = torch.from_numpy(mesh.points.copy())
     pinned = mesh.points[:, 0] < 1e-9
-    model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(block),), start="predictor")
+    model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(),))
     mu = 1e4 * torch.from_numpy(rng.uniform(0.8, 1.2, mesh.num_tets))
     inputs = {
         "x": points + 0.05 * torch.from_numpy(rng.uniform(-1, 1, points.shape)) + torch.from_numpy(PLACE),
         "v": torch.from_numpy(rng.uniform(-1, 1, points.shape)),
         "mu": mu,
         "lam": ratio * mu,
-        "time_step": 1 / 60,
     }
-    return Scene(model, inputs, STATE, block)
+    return Scene(model, inputs, STATE, {"block": block})
 
 
 class Errors(NamedTuple):
@@ -303,19 +301,22 @@ class Errors(NamedTuple):
 
 def measure(scene: Scene, truth: many_digits.Exact, sweeps: int, tape: Any = "full", device: str = "cpu") -> Errors:
     """A step and its gradients against 120 digits, which `exact` has of the same scene."""
-    model, inputs = scene.model, scene.inputs
-    there, adjoint = model.to(device), dv.ReverseSweep(tape=tape)
+    there, solver = scene.model.to(device), scene.solver(sweeps, tape)
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        return dv.step(there, sweeps=sweeps, adjoint=adjoint, **options)
+        return dv.step(there, solver=solver, **options)
 
-    return Errors(truth.sensitivity, many_digits.compare(run, truth, testing.on_device(inputs, device)))
+    found = testing.evaluate(run, testing.on_device(scene.inputs, device), TIME_STEP)
+    found = testing.on_device(found, "cpu")
+    errors = {name: testing.relative_error(found[name], value) for name, value in truth.values.items()}
+    return Errors(truth.sensitivity, errors)
 
 
 def exact(scene: Scene, sweeps: int) -> many_digits.Exact:
     rng = testing.generator("loss")  # that of testing.evaluate
     weights = [torch.as_tensor(rng.standard_normal(tuple(scene.inputs["x"].shape))) for _ in range(2)]
-    return many_digits.exact_step(scene.model, scene.inputs, sweeps, weights, scene.names, scene.block)
+    inputs = {**scene.inputs, "time_step": TIME_STEP}
+    return many_digits.exact_step(scene.model, inputs, sweeps, weights, scene.names, scene.solver(sweeps).block)
 
 
 def row(scene: Scene, device: Any) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import gc
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +132,11 @@ class Scene:
     v: Tensor
     mu: Tensor
     lam: Tensor
+    plain: bool = False  # sweeps alone: from the predictor, without rigid correction
+
+    def solver(self, sweeps: int, tape: Any = "auto") -> dv.VBD:
+        plain = {"subspace": None, "start": "predictor"} if self.plain else {}
+        return dv.VBD(STEP, sweeps, tape=tape, **plain)
 
     @property
     def leaves(self) -> tuple[Tensor, ...]:
@@ -144,8 +149,8 @@ class Scene:
     def requiring(self, *names: str) -> Scene:
         """The same scene with tensors of its own, of which those named require grad (mu and lam are "material")."""
         names = tuple(n for name in names for n in (("mu", "lam") if name == "material" else (name,)))
-        return Scene(self.model, *(getattr(self, k).detach().clone().requires_grad_(k in names)
-                                   for k in ("x", "v", "mu", "lam")))  # fmt: skip
+        own = {k: getattr(self, k).detach().clone().requires_grad_(k in names) for k in ("x", "v", "mu", "lam")}
+        return replace(self, **own)
 
 
 def model_of(
@@ -174,8 +179,7 @@ def forward(scene: Scene, sweeps: int, steps: int, tape: Any = "auto") -> Work:
     def work() -> tuple[Tensor, Tensor]:
         x, v = scene.x, scene.v
         for _ in range(steps):
-            x, v = dv.step(scene.model, x, v, mu=scene.mu, lam=scene.lam, time_step=STEP, sweeps=sweeps,
-                           adjoint=dv.ReverseSweep(tape))  # fmt: skip
+            x, v = dv.step(scene.model, x, v, scene.solver(sweeps, tape), mu=scene.mu, lam=scene.lam)
         return x, v
 
     return work

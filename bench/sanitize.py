@@ -25,6 +25,7 @@ import diffvbd as dv
 from bench import common
 from bench.tables import Table
 from diffvbd import mesh
+from diffvbd.testing import regime
 
 DEVICE = "cuda"
 SANITIZER = "compute-sanitizer"
@@ -42,28 +43,30 @@ WORKERS = 14  # processes side by side: each keeps one core and little of the de
 Scene = Callable[[], tuple[dv.Model, Tensor, dict[str, Any]]]
 
 
-def _free(regime: str | None, energies: tuple[Any, ...] = (), **options: Any) -> Scene:
+def _free(regime: str | None, energies: tuple[Any, ...] = (), dtype: torch.dtype = torch.float64, **solver: Any
+          ) -> Scene:  # fmt: skip
     """Scenes without pairs: a beam that is held at one end, bent by its weight, and one that flies."""
 
     def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
         body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
         both = mesh.join([body, body.translate((0.0, 0.3, 0.0))])
         held = torch.tensor((both.points[:, 0] < 1e-9) & (both.body == 0))
-        model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, **options)
-        return model, _moving(model, 3), {"regime": regime}
+        model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, dtype=dtype)
+        return model, _moving(model, 3), {"regime": regime, "solver": solver}
 
     return scene
 
 
-def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, ...] = (), **options: Any) -> Scene:
+def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, ...] = (),
+              dtype: torch.dtype = torch.float64, **solver: Any) -> Scene:  # fmt: skip
     """Three cubes that fly into one another, on what else there is."""
 
     def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
         cube = mesh.box(size, 0.1, split="kuhn")
         bodies = mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
         model = dv.Model(bodies, energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=2e-3), *energies),
-                         colliders=colliders, device=DEVICE, **options)  # fmt: skip
-        return model, _moving(model, scenes), {"regime": None}
+                         colliders=colliders, device=DEVICE, dtype=dtype)  # fmt: skip
+        return model, _moving(model, scenes), {"regime": None, "solver": solver}
 
     return scene
 
@@ -86,11 +89,11 @@ SCENES: dict[str, Scene] = {
     "floor, float32": _free("block", (FLOOR,), dtype=torch.float32),
     "floor, thread": _free("thread", (FLOOR,)),
     "floor and friction": _free("color", (FLOOR, FRICTION)),
-    "coarse": _free(None, coarse="auto", relaxation=1.5),
+    "coarse": _free(None, subspace="coarse", relaxation=1.5),
     "pairs": _touching(1),
     "pairs, friction, a collider": _touching(2, FRICTION, colliders=(PLANE,)),
     "pairs, floor, float32": _touching(2, FLOOR, dtype=torch.float32),
-    "pairs, coarse": _touching(1, coarse="auto"),
+    "pairs, coarse": _touching(1, subspace="coarse"),
     "pairs, many scenes": _touching(70),
     "pairs, a larger scene": _touching(1, size=12),
 }
@@ -104,10 +107,10 @@ def step_of(scene: Scene, steps: int, sweeps: int) -> None:
     for tape in tapes:
         leaves = [t.clone().requires_grad_() for t in (x, v, x.new_full((1, model.num_tets), 1e5))]
         now, speed, mu = leaves
-        with dv.regime(options["regime"]):
+        solver = dv.VBD(0.005, sweeps, tape=tape, **options["solver"])
+        with regime(options["regime"]):
             for _ in range(steps):
-                now, speed = dv.step(model, now, speed, mu=mu, lam=1e5, time_step=0.005, sweeps=sweeps,
-                                     adjoint=dv.ReverseSweep(tape))  # fmt: skip
+                now, speed = dv.step(model, now, speed, solver, mu=mu, lam=1e5)
             gradients = torch.autograd.grad((now - x).square().sum(), leaves)
         assert all(bool(g.abs().max() > 0) for g in gradients)
 

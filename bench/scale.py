@@ -126,8 +126,8 @@ def _scenes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
 
     def loss(part: slice) -> Tensor:
         v = network(goals[part])[:, None].expand(-1, model.num_vertices, -1)
-        end = dv.rollout(model, stretched.expand_as(v), v, steps=STEPS, mu=log_mu.exp(), lam=MODULUS, time_step=STEP,
-                         sweeps=SWEEPS, save="last")  # fmt: skip
+        end = dv.rollout(model, stretched.expand_as(v), v, dv.VBD(STEP, SWEEPS), steps=STEPS, mu=log_mu.exp(),
+                         lam=MODULUS, save="last")  # fmt: skip
         return (end.x[-1] - goals[part, None]).square().sum() / scenes
 
     def gradient(parts: int) -> Tensor:

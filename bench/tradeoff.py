@@ -161,45 +161,42 @@ FULL, QUICK = Effort(0.5, 40.0, 40.0, 3e-4), Effort(0.05, 1.0, 1.0, 2e-2)
 
 @dataclass(frozen=True)
 class Way:
-    """Settings but for the step, and numbers of sweeps; `changes` are arguments of Model.replace."""
+    """A solver but for its step, and numbers of sweeps."""
 
     name: str
-    settings: dv.Settings
+    solver: dv.VBD
     sweeps: tuple[int, ...]
-    changes: tuple[tuple[str, Any], ...] = ()
+    dtype: torch.dtype | None = None
+    checkpoint_every: Any = "auto"
     elastic: bool = True  # whether it is for scenes without contact
     contact: bool = True  # and with it
     gradient_only: bool = False  # what changes no motion
 
 
-def _plain(**options: Any) -> dv.Settings:
-    return dv.Settings(1.0, 1, **options)
+def _vbd(**options: Any) -> dv.VBD:
+    return dv.VBD(1.0, 1, **options)
 
 
-COARSE: dict[str, Any] = {"relaxation": 1.5, "coarse": "auto"}
+COARSE: dict[str, Any] = {"relaxation": 1.5, "subspace": "coarse"}
 SDIRK2, BDF2 = dv.SDIRK2(), dv.BDF2()
 WAYS = [
-    Way("implicit Euler", _plain(), (5, 20, 80)),
-    Way("implicit Euler, relaxation 1.6", _plain(relaxation=1.6), (20, 80), contact=False),
-    Way("implicit Euler, start at y", _plain(), (20,), (("start", "predictor"),)),
-    Way("implicit Euler, start at x + h v", _plain(), (20,), (("start", "inertia"),)),
-    Way("implicit Euler, coarse", _plain(**COARSE), (2, 8)),
-    Way("implicit Euler, block of the paper", _plain(block="paper"), (20,)),
-    Way("SDIRK2", _plain(integrator=SDIRK2), (5, 20, 80)),
-    Way("SDIRK2, relaxation 1.6", _plain(integrator=SDIRK2, relaxation=1.6), (20, 80), contact=False),
-    Way("SDIRK2, coarse", _plain(integrator=SDIRK2, **COARSE), (2, 8)),
-    Way("SDIRK2, coarse, float32", _plain(integrator=SDIRK2, dtype=torch.float32, **COARSE), (8,), contact=False),
-    Way("SDIRK2, float32", _plain(integrator=SDIRK2, dtype=torch.float32), (20,), elastic=False),
-    Way("BDF2", _plain(integrator=BDF2), (20,)),
-    Way("BDF2, coarse", _plain(integrator=BDF2, **COARSE), (2, 8)),
-    Way("SDIRK2, full tape", _plain(integrator=SDIRK2, tape="full"), (20,), gradient_only=True),
-    Way("SDIRK2, compact tape", _plain(integrator=SDIRK2, tape="compact"), (20,), gradient_only=True),
-    Way("SDIRK2, recomputed tape", _plain(integrator=SDIRK2, tape="recompute"), (20,), gradient_only=True),
-    Way("SDIRK2, a checkpoint every 8 steps", _plain(integrator=SDIRK2, checkpoint_every=8), (20,),
-        gradient_only=True),
+    Way("implicit Euler", _vbd(), (5, 20, 80)),
+    Way("implicit Euler, relaxation 1.6", _vbd(relaxation=1.6), (20, 80), contact=False),
+    Way("implicit Euler, start at y", _vbd(start="predictor"), (20,)),
+    Way("implicit Euler, start at x + h v", _vbd(start="inertia"), (20,)),
+    Way("implicit Euler, coarse", _vbd(**COARSE), (2, 8)),
+    Way("implicit Euler, block of the paper", _vbd(block="paper"), (20,)),
+    Way("SDIRK2", _vbd(integrator=SDIRK2), (5, 20, 80)),
+    Way("SDIRK2, relaxation 1.6", _vbd(integrator=SDIRK2, relaxation=1.6), (20, 80), contact=False),
+    Way("SDIRK2, coarse", _vbd(integrator=SDIRK2, **COARSE), (2, 8)),
+    Way("SDIRK2, coarse, float32", _vbd(integrator=SDIRK2, **COARSE), (8,), torch.float32, contact=False),
+    Way("SDIRK2, float32", _vbd(integrator=SDIRK2), (20,), torch.float32, elastic=False),
+    Way("BDF2", _vbd(integrator=BDF2), (20,)),
+    Way("BDF2, coarse", _vbd(integrator=BDF2, **COARSE), (2, 8)),
+    *(Way(f"SDIRK2, {name} tape", _vbd(integrator=SDIRK2, tape=tape), (20,), gradient_only=True)
+      for name, tape in (("full", "full"), ("compact", "compact"), ("recomputed", "recompute"))),
+    Way("SDIRK2, a checkpoint every 8 steps", _vbd(integrator=SDIRK2), (20,), checkpoint_every=8, gradient_only=True),
 ]  # fmt: skip
-
-
 # ways that differ in the backward alone
 ASIDE = {way.name for way in WAYS if way.gradient_only}
 
@@ -221,11 +218,11 @@ class Front:
 
     def reference(self) -> tuple[Run, tuple[float, float]]:
         """The last of ever finer runs, and how far its motion and its gradient may be off."""
-        settings = _plain(integrator=SDIRK2) if self.scene.touches else _plain(integrator=SDIRK2, **COARSE)
-        settings = replace(settings, sweeps=80 if self.scene.touches else 20)
+        solver = _vbd(integrator=SDIRK2) if self.scene.touches else _vbd(integrator=SDIRK2, **COARSE)
+        solver = replace(solver, sweeps=80 if self.scene.touches else 20)
         steps, last, off = self.first_steps(), None, (math.inf, math.inf)
         while True:
-            now = self.runs.run(settings, steps)
+            now = self.runs.run(solver, steps)
             if last is not None and now.x is not None:
                 off = self.runs.apart(now, last)
             last = now if now.x is not None else last
@@ -243,13 +240,12 @@ class Front:
         return self.runs.apart(Run(FRAMES, x, 0.0), self.truth)[0]
 
     def way(self, way: Way) -> list[Row]:
-        forward, both = (Runs(self.scene, gradient, way.settings.dtype) for gradient in (False, True))
-        model = forward.model.replace(**dict(way.changes)) if way.changes else forward.model
+        forward, both = (Runs(self.scene, gradient, way.dtype) for gradient in (False, True))
         out = []
         for sweeps in way.sweeps:
-            settings, steps = replace(way.settings, sweeps=sweeps), self.first_steps()
+            solver, steps = replace(way.solver, sweeps=sweeps), self.first_steps()
             while True:
-                run, back = forward.run(settings, steps, model), both.run(settings, steps, model)
+                run, back = (runs.run(solver, steps, way.checkpoint_every) for runs in (forward, both))
                 motion, gradient = self.runs.apart(back if back.gradient else run, self.truth)
                 out.append({"way": way.name, "sweeps": sweeps, "steps": steps, "ms": 1e3 * run.seconds,
                             "error": motion, "both_ms": 1e3 * back.seconds, "gradient_error": gradient})  # fmt: skip
@@ -263,8 +259,8 @@ class Front:
         """What dv.advise says, run against the same reference."""
         runs, out = Runs(self.scene), []
         for error in ERRORS:
-            settings, row = advised(self.scene, error, False, self.effort.patience)
-            run = runs.run(settings, settings.steps(self.scene.duration))
+            solver, row = advised(self.scene, error, False, self.effort.patience)
+            run = runs.run(solver, solver.steps(self.scene.duration))
             out.append(row | {"ms": 1e3 * run.seconds, "error": runs.apart(run, self.truth)[0]})
         return out
 
@@ -357,7 +353,7 @@ def converged(scene: Scene, distance: Distance, rungs: int) -> list[Row]:
         x, v, frames, steps, began = scene.model.rest_points, scene.v, [], FRAMES * 2**rung, time.perf_counter()
         for n in range(1, steps + 1):
             with torch.no_grad():
-                found = dv.solve(scene.model, x, v, time_step=scene.duration / steps, tolerance=1e-4, max_sweeps=5000,
+                found = dv.solve(scene.model, x, v, dv.VBD(scene.duration / steps, 1), tolerance=1e-4, max_sweeps=5000,
                                  on_failure="warn", **scene.given)  # fmt: skip
             x, v = found.x, found.v
             frames += [x] if n % (steps // FRAMES) == 0 else []

@@ -11,9 +11,9 @@ reverse.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,10 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.measure import Card
+from bench.measure import Card, timed
 from bench.sweeps import MATERIAL, bar
 from bench.tables import Table
+from diffvbd.model.system import system_of
 
 RELAXATION = 1.5  # with corrections
 
@@ -37,38 +38,35 @@ class Scene:
     time_step: float = 1 / 60
     x: Tensor | None = None  # None: at rest
     v: Tensor | None = None
-
     device: str = "cpu"
 
     def state(self) -> tuple[Tensor, Tensor]:
         x = torch.from_numpy(self.mesh.points.copy()) if self.x is None else self.x
         return x.to(self.device), (torch.zeros_like(x) if self.v is None else self.v).to(self.device)
 
-    def model(self, coarse: Any = "auto", relaxation: float = RELAXATION, start: Any = "auto") -> dv.Model:
-        return dv.Model(self.mesh, pinned=torch.from_numpy(self.pinned), relaxation=relaxation, start=start,
-                        coarse=coarse, device=self.device)  # fmt: skip
+    @cached_property
+    def model(self) -> dv.Model:
+        return dv.Model(self.mesh, pinned=torch.from_numpy(self.pinned), device=self.device)
 
-    def rolled(self, model: dv.Model, sweeps: int, steps: int, save: Any = "all") -> dv.Trajectory:
-        options = {"steps": steps, "time_step": self.time_step, "sweeps": sweeps, "save": save, **self.material}
+    def solver(self, sweeps: int = 1, subspace: Any = "coarse", relaxation: float = RELAXATION, start: Any = "auto"
+               ) -> dv.VBD:  # fmt: skip
+        return dv.VBD(self.time_step, sweeps, subspace=subspace, relaxation=relaxation, start=start)
+
+    def rolled(self, solver: dv.VBD, steps: int, save: Any = "all") -> dv.results.Trajectory:
         with torch.no_grad():
-            return dv.rollout(model, *self.state(), **options)
+            return dv.rollout(self.model, *self.state(), solver, steps=steps, save=save, **self.material)
 
-    def end(self, model: dv.Model, sweeps: int, steps: int) -> Tensor:
-        return self.rolled(model, sweeps, steps, "last").x[-1]
-
-    def seconds(self, model: dv.Model, sweeps: int, card: Card) -> float:
+    def seconds(self, solver: dv.VBD, card: Card) -> float:
         """Of a step: of a CUDA graph, or over ten."""
         x, v = self.state()
 
         def work() -> Any:
             with torch.no_grad():
-                return dv.step(model, x, v, time_step=self.time_step, sweeps=sweeps, **self.material)
+                return dv.step(self.model, x, v, solver, **self.material)
 
         if card.cuda:
             return card.graph(work) or 0.0
-        begun = time.perf_counter()
-        self.rolled(model, sweeps, 10, "last")
-        return (time.perf_counter() - begun) / 10
+        return timed(lambda: self.rolled(solver, 10, "last")) / 10
 
 
 def scenes(card: Card) -> list[Scene]:
@@ -99,8 +97,8 @@ def sheet(ratio: float, cells: int = 20) -> Scene:
     return Scene(name, mesh, mesh.points[:, 0] < 1e-9, {"mu": 1e6, "lam": 1.5e6})
 
 
-def functions(model: dv.Model) -> int:
-    return int((~model.coarse_geometry.filling).sum())
+def functions(scene: Scene) -> int:
+    return int((~system_of(scene.model, scene.solver()).coarse_geometry.filling).sum())
 
 
 SWEEPS = (1, 2, 4, 5, 7, 8, 10, 11, 13, 14, 16, 17, 19, 20, 22, 23, 25, 31, 40, 52, 70, 100, 150, 200, 300)
@@ -114,29 +112,29 @@ CONVERGED = 1e-7  # of the motion, between two K
 
 def converged(scene: Scene, steps: int, quick: bool, most: int = 6400) -> tuple[Tensor, dict[str, float]]:
     """Where converged steps end, and how well they have: of the last step the share of its forces left over."""
-    model = scene.model()
     sweeps, last, apart = 100 if quick else 200, None, float("inf")
     while True:
-        way = scene.rolled(model, sweeps, steps)
+        way = scene.rolled(scene.solver(sweeps), steps)
         moved = float((way.x[-1] - way.x[0]).norm(dim=-1).max())
         if last is not None:
             apart = float((way.x[-1] - last).norm(dim=-1).max()) / moved
         if apart < CONVERGED or sweeps >= most:
             break
         last, sweeps = way.x[-1], 2 * sweeps
-    left = dv.diagnose(model, way.x[-1], time_step=scene.time_step, previous=(way.x[-2], way.v[-2]), warn=False,
+    left = dv.diagnose(scene.model, way.x[-1], scene.solver(sweeps), previous=(way.x[-2], way.v[-2]), warn=False,
                        **scene.material)  # fmt: skip
     found = {"sweeps": sweeps, "apart": apart, "unbalanced": left.unbalanced, "motion": moved, "courant": left.courant}
     return way.x[-1], found
 
 
-def least_times(scene: Scene, models: list[tuple[dv.Model, list[dict[str, Any]]]], card: Card) -> None:
+def least_times(scene: Scene, solvers: list[tuple[dv.VBD, list[dict[str, Any]]]], card: Card) -> None:
     """Adds to each row the time of a step, the least of several rounds of all: the machine is not always as fast."""
     for n in range(2 if card.quick else ROUNDS):
-        for model, rows in models:
+        for solver, rows in solvers:
             for row in rows:
                 if row["sweeps"] <= 100 or n < 2:
-                    row["ms"] = min(row.get("ms", float("inf")), 1e3 * scene.seconds(model, row["sweeps"], card))
+                    seconds = scene.seconds(replace(solver, sweeps=row["sweeps"]), card)
+                    row["ms"] = min(row.get("ms", float("inf")), 1e3 * seconds)
 
 
 def line(rows: list[dict[str, Any]]) -> tuple[float, float]:
@@ -161,21 +159,22 @@ def measure(scene: Scene, card: Card) -> dict[str, Any]:
     steps = 5 if card.quick else 30
     goal, found = converged(scene, steps, card.quick)
 
-    def error(model: dv.Model, sweeps: int) -> float:
-        return float((scene.end(model, sweeps, steps) - goal).norm(dim=-1).max()) / found["motion"]
+    def error(solver: dv.VBD, sweeps: int) -> float:
+        end = scene.rolled(replace(solver, sweeps=sweeps), steps, "last").x[-1]
+        return float((end - goal).norm(dim=-1).max()) / found["motion"]
 
-    two, models = scene.model(), {options: scene.model(None, *options) for options in PLAIN}
+    two, solvers = scene.solver(), {options: scene.solver(1, "rigid", *options) for options in PLAIN}
     rows = [{"sweeps": k, "error": error(two, k)} for k in SWEEPS[: 6 if card.quick else None]]
     plain = []
     for k in PLAIN_SWEEPS[: 4 if card.quick else None]:
-        best = min((error(m, k), *options) for options, m in models.items())
+        best = min((error(solver, k), *options) for options, solver in solvers.items())
         plain.append({"sweeps": k, "error": best[0], "relaxation": best[1], "start": best[2]})
     if not card.quick and plain[-1]["error"] > LEVELS[0]:
         options = (plain[-1]["relaxation"], plain[-1]["start"])
-        plain.append({**plain[-1], "sweeps": LAST, "error": error(models[options], LAST)})
-    least_times(scene, [(two, rows), (models[PLAIN[0]], plain)], card)
+        plain.append({**plain[-1], "sweeps": LAST, "error": error(solvers[options], LAST)})
+    least_times(scene, [(two, rows), (solvers[PLAIN[0]], plain)], card)
     sweep, fixed = line(plain)
-    row: dict[str, Any] = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(two),
+    row: dict[str, Any] = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(scene),
                            "reference": found, "sweep_ms": sweep, "fixed_ms": fixed}  # fmt: skip
     for name, own in (("two_level", rows), ("plain", plain)):
         row[name] = own
@@ -208,41 +207,40 @@ def cost(card: Card) -> list[dict[str, Any]]:
 
 
 def _cost(card: Card, scene: Scene, scenes: int) -> dict[str, Any]:
-    begun, scene = time.perf_counter(), replace(scene, device=str(card.device))
-    models = {name: scene.model(name) for name in (None, "auto")}
-    built = time.perf_counter() - begun
+    scene = replace(scene, device=str(card.device))
     took: dict[tuple, float] = {}
-    for name, model in models.items():
+    for subspace in ("rigid", "coarse"):
         for sweeps in (FEW, MANY):
             for backward in (False, True):
-                took[name, sweeps, backward] = 1e3 * _seconds(card, scene, model, scenes, sweeps, backward)
+                seconds = _seconds(card, scene, scene.solver(sweeps, subspace), scenes, backward)
+                took[subspace, sweeps, backward] = 1e3 * seconds
         card.tidy()
     corrections = dv.CoarseSpace().corrections(MANY) - dv.CoarseSpace().corrections(FEW)
-    row: dict[str, Any] = {"scene": scene.name, "functions": functions(models["auto"]), "build_s": built}
+    row: dict[str, Any] = {"scene": scene.name, "functions": functions(scene)}
     for part, minus in (("forward", False), ("reverse", True)):
 
-        def of(name: Any, sweeps: int, part: str = part, minus: bool = minus) -> float:
-            whole = took[name, sweeps, part == "reverse"]
-            return whole - took[name, sweeps, False] if minus else whole
+        def of(subspace: str, sweeps: int, part: str = part, minus: bool = minus) -> float:
+            whole = took[subspace, sweeps, part == "reverse"]
+            return whole - took[subspace, sweeps, False] if minus else whole
 
-        sweep = (of(None, MANY) - of(None, FEW)) / (MANY - FEW)
-        one = (of("auto", MANY) - of("auto", FEW) - (of(None, MANY) - of(None, FEW))) / corrections
-        besides = of("auto", FEW) - of(None, FEW) - one * dv.CoarseSpace().corrections(FEW)
+        sweep = (of("rigid", MANY) - of("rigid", FEW)) / (MANY - FEW)
+        one = (of("coarse", MANY) - of("coarse", FEW) - (of("rigid", MANY) - of("rigid", FEW))) / corrections
+        besides = of("coarse", FEW) - of("rigid", FEW) - one * dv.CoarseSpace().corrections(FEW)
         row |= {f"{part}_sweep_ms": sweep, f"{part}_correction_ms": one, f"{part}_besides_ms": besides}
     for name, unit in (("forward", "forward"), ("reverse", "forward"), ("reverse", "reverse")):
         row[f"{name}_correction_in_{unit}_sweeps"] = row[f"{name}_correction_ms"] / row[f"{unit}_sweep_ms"]
     return row
 
 
-def _seconds(card: Card, scene: Scene, model: dv.Model, scenes: int, sweeps: int, backward: bool) -> float:
-    x, v = (t.to(model.device).expand(scenes, -1, -1).contiguous().requires_grad_(backward) for t in scene.state())
+def _seconds(card: Card, scene: Scene, solver: dv.VBD, scenes: int, backward: bool) -> float:
+    x, v = (t.expand(scenes, -1, -1).contiguous().requires_grad_(backward) for t in scene.state())
     material: dict[str, Any] = {
         k: x.new_tensor(m).expand(scenes, 1).clone().requires_grad_(backward) for k, m in scene.material.items()
     }
 
     def work() -> Any:
         with torch.set_grad_enabled(backward):
-            ends, _ = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, **material)
+            ends, _ = dv.step(scene.model, x, v, solver, **material)
             return torch.autograd.grad(ends.sum(), (x, v, *material.values())) if backward else ends
 
     return card.graph(work) or card.eager(work)
