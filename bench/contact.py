@@ -155,7 +155,7 @@ def _crossings(seed: int, device: str, batch: int) -> tuple[int, int, int, float
         given: dict[str, Any] = {}
         if len(points):  # it comes down on them
             before, points = points, points - points.new_tensor([0.0, 0.01 * (step % 3), 0.0])
-            given = {"colliders": points, "colliders_before": before}
+            given = {"colliders": dv.per_step(points[None]), "colliders_before": before}
         try:
             with torch.no_grad():
                 end = dv.rollout(model, x, v, solver, steps=1, mu=s["modulus"], lam=s["modulus"], history=history,

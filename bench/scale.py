@@ -28,7 +28,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench.tables import Table
 from diffvbd.tasks import Settings, million_cubes
-from diffvbd.tasks.capture import captured
+from diffvbd.tasks.runner import captured
 
 DEVICE = "cuda"
 RANKS = (1, 2)

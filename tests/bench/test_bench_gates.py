@@ -31,7 +31,7 @@ def test_a_plain_step_calls_two_operators() -> None:
     model = dv.Model(dv.mesh.cube(3), pinned=[0])
     x = model.rest_points
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as seen:
-        dv.step(model, x, 0 * x, mu=1e5, lam=1e5, time_step=0.01, sweeps=5)
+        dv.step(model, x, 0 * x, dv.VBD(0.01, 5), mu=1e5, lam=1e5)
     called = {event.key: event.count for event in seen.key_averages() if event.key.startswith("diffvbd::")}
     assert called == {"diffvbd::begin": 1, "diffvbd::sweep": 1} and model.surface_of_contact is None
 
@@ -58,12 +58,12 @@ def a_ball(friction: float) -> floors.Scene:
     return floors.Scene("ball", mesh, body, np.zeros_like(mesh.points) + (0.5, -2.0, 0.0), 12)
 
 
-@pytest.mark.parametrize(("coarse", "friction"), [(None, 0.0), (None, 0.3), ("auto", 0.0)])
-def test_sweeps_on_a_floor_come_to_a_converged_step_that_shares_no_code(coarse: Any, friction: float) -> None:
+@pytest.mark.parametrize(("subspace", "friction"), [("rigid", 0.0), ("rigid", 0.3), ("coarse", 0.0)])
+def test_sweeps_on_a_floor_come_to_a_converged_step_that_shares_no_code(subspace: Any, friction: float) -> None:
     scene = a_ball(friction)
     exact = scene.body.rollout(scene.mesh.points, scene.v, scene.steps)
     assert max(scene.body.iterations) > 3 and exact[1][-1, :, 1].mean() > 0.5  # it has left the floor again
-    motion, _, _ = scene.executed(200, coarse)
+    motion, _, _ = scene.executed(200, subspace=subspace)
     assert max(floors.apart(scene, motion, exact).values()) < tolerance("converged_floor")
 
 
