@@ -22,6 +22,7 @@ from bench.measure import Card
 from bench.tables import Table
 from diffvbd import testing
 from diffvbd.inspect.diagnose import collapse_stretch
+from diffvbd.model.system import system_of
 from diffvbd.testing import many_digits
 
 ARGUMENTS = ("grad_x", "grad_v", "grad_mu", "grad_lam")
@@ -316,7 +317,8 @@ def exact(scene: Scene, sweeps: int) -> many_digits.Exact:
     rng = testing.generator("loss")  # that of testing.evaluate
     weights = [torch.as_tensor(rng.standard_normal(tuple(scene.inputs["x"].shape))) for _ in range(2)]
     inputs = {**scene.inputs, "time_step": TIME_STEP}
-    return many_digits.exact_step(scene.model, inputs, sweeps, weights, scene.names, scene.solver(sweeps).block)
+    system = system_of(scene.model, scene.solver(sweeps))  # it has what the solver decides
+    return many_digits.exact_step(system, inputs, sweeps, weights, scene.names, scene.solver(sweeps).block)
 
 
 def row(scene: Scene, device: Any) -> dict[str, Any]:
