@@ -1,4 +1,4 @@
-"""What the GPU benchmark measures with: CUDA graphs timed by events, copy rate, peak memory, bytes that must move."""
+"""How benchmarks measure: wall clock and CUDA graphs, memory, and the steps that are measured."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import gc
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +17,6 @@ import diffvbd as dv
 
 STEP = 5e-3  # [s]
 MODULUS = 1e5  # [Pa], mu and lam
-TAPE_SCALARS = {None: 0, "recompute": 0, "compact": 3, "full": 9}  # per vertex and sweep
 Work = Callable[[], Any]
 Row = dict[str, Any]
 
@@ -45,14 +44,6 @@ class Card:
 
     def allocated(self) -> int:
         return torch.cuda.memory_allocated(self.device) if self.cuda else 0
-
-    def copy_rate(self) -> float:
-        """Bytes per second that a large copy within the device's memory reads and writes together."""
-        size = 2**24 if self.quick else 2**31
-        source = torch.zeros(size, dtype=torch.uint8, device=self.device)
-        target = torch.empty_like(source)
-        spans = self._spans(lambda: target.copy_(source), 25)[5:]
-        return 2 * size / statistics.median(spans)
 
     def eager(self, work: Work, repetitions: int = 5) -> float:
         """Median seconds of `work`, called anew each time, after a first call that does not count."""
@@ -129,7 +120,7 @@ def attempt(card: Card, rows: list[Row], about: Row, measure: Callable[[], Row |
         pass  # a broken context: the rows that follow will say so themselves
 
 
-# --- scenes -----------------------------------------------------------------------------------------------------------
+# --- steps of one scene -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -141,6 +132,11 @@ class Scene:
     v: Tensor
     mu: Tensor
     lam: Tensor
+    plain: bool = False  # sweeps alone: from the predictor, without rigid correction
+
+    def solver(self, sweeps: int, tape: Any = "auto") -> dv.VBD:
+        plain = {"subspace": None, "start": "predictor"} if self.plain else {}
+        return dv.VBD(STEP, sweeps, tape=tape, **plain)
 
     @property
     def leaves(self) -> tuple[Tensor, ...]:
@@ -153,8 +149,8 @@ class Scene:
     def requiring(self, *names: str) -> Scene:
         """The same scene with tensors of its own, of which those named require grad (mu and lam are "material")."""
         names = tuple(n for name in names for n in (("mu", "lam") if name == "material" else (name,)))
-        return Scene(self.model, *(getattr(self, k).detach().clone().requires_grad_(k in names)
-                                   for k in ("x", "v", "mu", "lam")))  # fmt: skip
+        own = {k: getattr(self, k).detach().clone().requires_grad_(k in names) for k in ("x", "v", "mu", "lam")}
+        return replace(self, **own)
 
 
 def model_of(
@@ -183,8 +179,7 @@ def forward(scene: Scene, sweeps: int, steps: int, tape: Any = "auto") -> Work:
     def work() -> tuple[Tensor, Tensor]:
         x, v = scene.x, scene.v
         for _ in range(steps):
-            x, v = dv.step(scene.model, x, v, mu=scene.mu, lam=scene.lam, time_step=STEP, sweeps=sweeps,
-                           adjoint=dv.ReverseSweep(tape))  # fmt: skip
+            x, v = dv.step(scene.model, x, v, scene.solver(sweeps, tape), mu=scene.mu, lam=scene.lam)
         return x, v
 
     return work
@@ -198,57 +193,60 @@ def forward_reverse(scene: Scene, sweeps: int, steps: int, tape: Any = "auto") -
     return lambda: torch.autograd.grad(run(), wanted, (ones, ones))
 
 
-# --- bytes ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Sizes that traffic is proportional to: vertices, those that sweeps move, their (vertex, tet) pairs and edges."""
-
-    vertices: int
-    active: int
-    pairs: int
-    edges: int  # directed, from active vertices: the sum of their degrees
-
-    @classmethod
-    def of(cls, model: dv.Model) -> Counts:
-        tets, active = model.mesh.tets, ~model.pinned.cpu().numpy()
-        ends = tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
-        ends = np.sort(ends, axis=1)
-        key = np.unique(ends[:, 0] * model.num_vertices + ends[:, 1])
-        low, high = np.divmod(key, model.num_vertices)
-        return cls(model.num_vertices, int(active.sum()), int(active[tets].sum()),
-                   int(active[low].sum() + active[high].sum()))  # fmt: skip
-
-
-def sweep_traffic(
-    counts: Counts, sweeps: int, item: int, *, per_tet: bool, tape: str | None = None, reverse: bool = False
-) -> tuple[int, int]:
-    """Bytes that a step must move where a mesh does not fit the caches: (through memory, neighbours through L2).
-
-    A pair: four rest scalars, packed local indices, and two moduli if given per tet. A vertex: its row read and written
-    (four scalars), y, mass, tape, and four bytes for each neighbour's index. The neighbours' rows come from L2 and are
-    stated apart. Reverse: the same with the tape read; a row written and one read along each edge; four scalars for
-    each pair where moduli are per tet; 19 scalars of adjoints for each vertex. A step reads x, v and writes x', v'.
-    """
-    pair = 4 * item + 4 + (2 * item if per_tet else 0)
-    vertex = (8 + 3 + 1 + TAPE_SCALARS[tape]) * item
-    through = counts.pairs * pair + counts.active * vertex + 4 * counts.edges
-    if reverse:
-        through += counts.edges * 8 * item + counts.active * 19 * item + (counts.pairs * 4 * item if per_tet else 0)
-    return sweeps * through + 12 * item * counts.vertices, sweeps * counts.edges * 4 * item
-
-
-def resident_traffic(vertices: int, item: int, reverse: bool = False) -> int:
-    """Bytes of a step whose sweeps stay on chip: reads x, v, writes x', v'; its reverse reads x, v and two adjoints."""
-    return (18 if reverse else 12) * item * vertices
-
-
-def rated(row: Row, seconds: float | None, moved: int, rate: float) -> Row:
-    """A row with its bytes, the time that they need at the copy rate, and the fraction of that rate achieved."""
-    return {**row, "bytes": moved, "floor_ms": 1e3 * moved / rate,
-            "fraction": None if seconds is None else moved / seconds / rate}  # fmt: skip
-
-
 def milliseconds(seconds: float | None, steps: int = 1) -> float | None:
     return None if seconds is None else 1e3 * seconds / steps
+
+
+# --- time and memory of this process ---------------------------------------------------------------------------------
+
+
+def timed(work: Work) -> float:
+    """Seconds of a call."""
+    begun = time.perf_counter()
+    work()
+    return time.perf_counter() - begun
+
+
+def least(function: Callable[[], float], repetitions: int) -> float:
+    """The least of what a function returns; garbage of one run does not count in the next."""
+    best = float("inf")
+    for _ in range(repetitions):
+        gc.collect()
+        best = min(best, function())
+    return best
+
+
+def reset_peak_memory() -> int:
+    """Resident bytes now; from here on the kernel counts the peak anew (Linux)."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return _status("VmRSS")
+
+
+def peak_memory() -> int:
+    return _status("VmHWM")
+
+
+def _status(field: str) -> int:
+    line = next(a for a in Path("/proc/self/status").read_text().splitlines() if a.startswith(field))
+    return int(line.split()[1]) * 1024
+
+
+def kept_bytes(once: Callable[[], Any]) -> int:
+    """Bytes that the graph of a forward keeps for its backward, without what a second graph shares with it (Model,
+    arguments, index tables)."""
+    storages: list[dict[int, int]] = []
+    alive: list[Tensor] = []
+    for _ in range(2):
+        found: dict[int, int] = {}
+
+        def pack(t: Tensor, found: dict[int, int] = found) -> Tensor:
+            storage = t.untyped_storage()
+            found[storage.data_ptr()] = storage.nbytes()
+            alive.append(t.detach())
+            return t.detach()
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+            once()
+        storages.append(found)
+    first, second = storages
+    return sum(size for address, size in second.items() if address not in first)
