@@ -14,7 +14,8 @@ TAPES = ("full", "compact", "recompute")
 
 def evaluated(model: dv.Model, inputs: dict[str, Any], sweeps: int = 3, tape: str = "full") -> dict[str, Tensor]:
     """State and gradients of one step, by `testing.evaluate`."""
-    return evaluate(lambda **o: dv.step(model, sweeps=sweeps, adjoint=dv.ReverseSweep(tape), **o), inputs)
+    # TODO62: the solver of this call
+    return evaluate(lambda **o: dv.step(model, **o, sweeps=sweeps, adjoint=dv.ReverseSweep(tape)), inputs)
 
 
 def assert_same_bits(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
