@@ -53,7 +53,6 @@ CPU_SOURCES = [
     "csrc/cpu/neighbors.cpp",
     "csrc/cpu/plan.cpp",
     "csrc/bind/cpu/sweep.cpp",
-    "csrc/bind/cpu/anderson.cpp",
     "csrc/bind/cpu/begin.cpp",
     "csrc/bind/cpu/coarse.cpp",
     "csrc/bind/cpu/contact.cpp",

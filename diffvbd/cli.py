@@ -246,7 +246,6 @@ def _in_python(settings: dv.Settings) -> str:
     given = [f"{settings.time_step!r}, {settings.sweeps}, dv.{settings.integrator!r}"]
     given += [f"relaxation={settings.relaxation!r}"] if settings.relaxation != 1 else []
     given += [f"coarse={settings.coarse!r}"] if settings.coarse is not None else []
-    given += [f"acceleration=dv.{settings.acceleration!r}"] if settings.acceleration is not None else []
     return ", ".join(given)
 
 

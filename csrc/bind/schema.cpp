@@ -207,12 +207,6 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "Tensor bar, int[] sizes, bool wants_rest) -> (Tensor mu, Tensor lam, Tensor gradients, Tensor volume)");
   m.def("coarse_mass(Tensor mass, Tensor plan, Tensor weights, int[] sizes) -> Tensor");
   m.def("coarse_mass_backward(Tensor bar, Tensor plan, Tensor weights, int[] sizes) -> Tensor");
-  // CPU only: the combination of iterates, states [2, window + 1, scenes, vertices, 3] (of which each cycle began, and
-  // ended), the inverse of each body's system [scenes, bodies, window, window] and its solution
-  m.def(
-      "anderson_combine(Tensor states, Tensor mass, Tensor order, Tensor ptr, float regularization, float noise) -> "
-      "(Tensor to, "
-      "Tensor inverse, Tensor gamma)");
   // By how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
   // [scenes, bodies, 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by
   // body; material [1 | scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex)

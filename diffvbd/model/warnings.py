@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,18 +10,16 @@ from torch import Tensor
 
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
-from ..said import page, silence, warn
+from ..said import page, warn
 from .tet_shapes import inside_out, thinness
 
 if TYPE_CHECKING:
     from .model import Model
+    from .system import System
 
 INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts grew; 49 did not
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
-# of accelerated plain sweeps, from which on gradients are erratic: that of docs/contact.md was a third off at 15, had
-# the wrong sign at 20 and at 40 was 7e5 times too large
-ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 TOO_STIFF = 0.55  # times aspect^2: so much too stiff were sheets of one layer, from 3.4 to 24
 MOST_BODIES = 8  # whose bending is looked at
@@ -31,10 +27,6 @@ BENT = 0.01  # of the height of a tet, by which a body is no longer an affine im
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 SOFTEST = 10.0  # [Pa] Young's modulus; soft gels have 100 Pa or more
 LONGEST_STEP = 1.0  # [s]
-
-# of a Model's _derived: what is said once, or ever more seldom
-HELD_UP_SEEN, ERRATIC = "steps held up", "erratic gradients"
-ONCE = (HELD_UP_SEEN, ERRATIC)
 
 
 def warn_of(model: Model, pinned: Any) -> None:
@@ -47,6 +39,10 @@ def warn_of(model: Model, pinned: Any) -> None:
         warn(f"pinned: all {model.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
     if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
         warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
+
+
+def warn_of_solver(model: System) -> None:
+    """Warns (UserWarning) of safeguards and relaxations outside the range in which they make sense."""
     if model.relaxation > STABLE_RELAXATION:
         warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {model.relaxation:g}")
     if model.relaxation > 1 and model.friction is not None:
@@ -54,28 +50,16 @@ def warn_of(model: Model, pinned: Any) -> None:
             f"relaxation: {model.relaxation:g} with Friction: above 1 gradients were seen to grow by ten decades while "
             "vertices stick; take relaxation=1 and more sweeps where gradients matter"
         )
-    paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in model.energies)
-    if paper and model.relaxation > 1 and model.saturation is None:
+    if model.block == "paper" and model.relaxation > 1 and model.saturation is None:
         warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
+    if not model.regularization:
+        return
     active = model._mass[~model._pinned]
     if active.numel() and model.regularization > HEAVY_REGULARIZATION * float(active.min()):
         warn(
             f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
             "lightest vertex; the sweeps converge that much more slowly"
         )
-
-
-def warn_of_erratic_gradients(model: Model, sweeps: int) -> None:
-    """Warns, once, of gradients through sweeps that are accelerated without coarse corrections. To be called where a
-    step of so many sweeps is differentiated."""
-    if model.acceleration is None or model.coarse is not None or sweeps < ERRATIC_SWEEPS or ERRATIC in model._derived:
-        return
-    model._derived[ERRATIC] = True
-    warn(
-        "acceleration: gradients through accelerated plain sweeps are exact for what ran, but may depend erratically "
-        "on the input and be wrong by orders of magnitude where positions are right; for gradients add "
-        'coarse="auto" to the Model, or take plain sweeps and more of them; ' + page("numerics.md")
-    )
 
 
 def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:
@@ -95,7 +79,7 @@ def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:
         warn(
             f"x: all tets of body {body} in scene {scene}{others} are inverted (J <= 0) at the start, as where "
             "positions are mirrored: it will turn itself inside out. Positions of another mesh need a Model of that "
-            "mesh; check_start=False starts without a word"
+            "mesh; checks=dv.Checks(start=False) starts without a word"
         )
 
 
@@ -104,25 +88,6 @@ def _bodies_of(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     found = np.unique(labels.cpu(), return_index=True, return_inverse=True)
     names, first, of = (torch.as_tensor(a, device=labels.device) for a in found)
     return names, first, of
-
-
-@contextlib.contextmanager
-def silent(model: Model) -> Iterator[None]:
-    """Inside, nothing is warned of, and what would have been said once of this Model is still to be said after it."""
-    before = {id(m): {name: m._derived[name] for name in ONCE if name in m._derived} for m in _with_settings(model)}
-    with silence():
-        try:
-            yield
-        finally:
-            for m in _with_settings(model):
-                for name in ONCE:
-                    m._derived.pop(name, None)
-                m._derived.update(before.get(id(m), {}))
-
-
-def _with_settings(model: Model) -> list[Model]:
-    """A Model and those that run in its place with settings."""
-    return [model, *(m for m in model._derived.values() if isinstance(m, type(model)))]
 
 
 def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
@@ -142,7 +107,7 @@ def warn_of_units(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> No
         warn(f"mu: Young's modulus is at most {young:.4g} Pa, softer than any gel; moduli are in Pa: 1 MPa is 1e6")
 
 
-def warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> bool:
+def warn_of_over_relaxation(model: System, mu: Tensor, lam: Tensor) -> bool:
     """Warns of over-relaxed sweeps of what is nearly incompressible, whose growth may be too slow to be measured;
     whether it did."""
     if model.relaxation <= 1 or not any(isinstance(e, StableNeoHookean) for e in model.energies):
@@ -152,12 +117,12 @@ def warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> bool:
     warn(
         f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
         "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
-        'coarse="auto" in place of it',
+        'subspace="coarse" in place of it',
     )
     return True
 
 
-def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+def warn_of_thin_tets(model: System, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
     """Warns of tets so thin that few sweeps leave a sheet without stiffness; moduli [Pa] that may be looked at.
 
     The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and

@@ -21,7 +21,7 @@ from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, outer6
 from .rigid_contact import Correction
 from .scene import Scene, build_scene
-from .sweep import check_start, color_masses, predictor, run_sweeps, started
+from .sweep import check_start, color_masses, executed, predictor, run_sweeps, started
 
 
 class Part(NamedTuple):
@@ -36,8 +36,6 @@ class Part(NamedTuple):
     corrections: Tensor
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
     frames: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
-    # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
-    combined: Any = None
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
     sweeps: int | None = None  # None: its share of those of the step
@@ -106,7 +104,7 @@ class PairBarrier:
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:
         self.weight, self.pairs, self.colliders = scene.time_step**2, pairs, colliders
-        self.kappa = pairs.per_pair(scene.parameter("pair_barrier", scene.model.contact, "kappa"))
+        self.kappa = pairs.per_pair(scene.parameter(scene.model.contact, "kappa"))
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         pair, local, _, together = self.pairs.entries[k]
@@ -150,16 +148,16 @@ class LaggedPairForces:
         # Weights of the first primitive sum to 1, so the gradients w_k n of its corners sum to the normal.
         both = (pairs.kind == EDGE_EDGE)[:, None]
         self.normal = self.slope[:, 0] + torch.where(both, self.slope[:, 1], 0.0)
-        kappa = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "kappa"))
+        kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
         force = -e * first
         whole = force + FADE * kappa * pairs.dhat
         share = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
-        self.damping = share * pairs.per_pair(scene.parameter("pair_barrier", model.contact, "damping"))
+        self.damping = share * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
-            self.largest = -pairs.per_pair(scene.parameter("friction", friction, "coefficient")) * e * first
+            self.largest = -pairs.per_pair(scene.parameter(friction, "coefficient")) * e * first
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -221,23 +219,22 @@ def contact_step(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     parts: Sequence[Part],
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     colliders: Tensor | None = None,
     colliders_before: Tensor | None = None,
     order: Sequence[Tensor] | None = None,
     tet_order: Tensor | None = None,
     chord: float = 1.0,
+    **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
 
@@ -246,10 +243,11 @@ def contact_step(
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
     permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation; chord:
     how far back along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h.
-    parameters may hold "pair_barrier.kappa" [N/m], "pair_barrier.damping" [N s/m] and "friction.coefficient".
+    parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction".
     Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
     Returns (x', v').
     """
+    model, time_step, sweeps = executed(model, solver), solver.time_step, solver.sweeps
     count = model.contact.detections or len(parts)
     stages = model.contact.detections or 1  # of what is prescribed
     for name, value in (("parts", parts), ("order", order)):

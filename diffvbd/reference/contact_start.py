@@ -64,7 +64,7 @@ def unsupported(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor,
     model, scenes, count = scene.model, len(colliders), int(scene.model.body.max()) + 1
     points = corner_points(x, colliders)
     gap, slope, e, _ = pairs.measures(points, torch.arange(len(pairs.kind), device=x.device))
-    kappa = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "kappa"))
+    kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
     _, first, _ = log_barrier(gap, kappa, pairs.dhat)
     push = -(e * first)[:, None, None] * slope
     force = torch.zeros_like(points).index_put((pairs.batch[:, None], pairs.corners), push, accumulate=True)

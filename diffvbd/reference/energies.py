@@ -36,7 +36,7 @@ class StableNeoHookean:
 
     def __init__(self, energy: Any, scene: Scene) -> None:
         self.scene = scene
-        self.exact = exact = energy.block == "exact"
+        self.exact = exact = getattr(scene.model, "block", "exact") == "exact"
         weight = scene.time_step**2 * scene.volume
         lb = scene.mu + scene.lam
         per_tet = torch.stack(torch.broadcast_tensors(weight * scene.mu, weight * lb, weight * scene.lam), -2)
@@ -110,7 +110,7 @@ class FloorBarrier:
     def __init__(self, energy: Any, scene: Scene) -> None:
         self.scene = scene
         kappa, dhat, damping, height, normal = (
-            scene.parameter("floor_barrier", energy, name) for name in ("kappa", "dhat", "damping", "height", "normal")
+            scene.parameter(energy, name) for name in ("kappa", "dhat", "damping", "height", "normal")
         )
         # Shapes against gaps [..., planes, n]; a scene dimension of a parameter stays in front.
         self.kappa, self.dhat, self.damping = (p[..., None, None] for p in (kappa, dhat, damping))
@@ -118,7 +118,7 @@ class FloorBarrier:
         normal = torch.atleast_2d(normal)
         self.normal = (normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True))[..., None]
         self.outer = outer6(self.normal)
-        self.damped = "floor_barrier.damping" in scene.parameters or bool((damping != 0).any())
+        self.damped = "floor_damping" in scene.parameters or bool((damping != 0).any())
 
     def gap(self, x: Tensor) -> Tensor:
         return dot(self.normal, x.unsqueeze(-3)) - self.height
@@ -244,7 +244,7 @@ class Anchor:
 
     def __init__(self, energy: Any, scene: Scene) -> None:
         self.scene = scene
-        stiffness = scene.parameter("anchor", energy, "stiffness")
+        stiffness = scene.parameter(energy, "stiffness")
         count = scene.rest_points.shape[-1]
         chosen = torch.ones(count, dtype=torch.bool, device=scene.like.device)
         if energy.vertices is not None:
@@ -253,7 +253,7 @@ class Anchor:
             chosen[index] = True
         chosen = chosen & ~scene.model.pinned
         self.stiffness = torch.where(chosen, stiffness, 0.0)  # [..., V]
-        points = scene.parameters.get("anchor.points", energy.points)
+        points = scene.parameters.get("anchor_points", energy.points)
         # Without points a vertex hangs on its constant rest position: a differentiated rest shape does not move it.
         points = scene.model.rest_points if points is None else points
         self.points = scene.tensor(points).transpose(-1, -2)
@@ -278,7 +278,7 @@ class Anchor:
 
 ENERGIES: dict[str, type] = {
     "stable_neo_hookean": StableNeoHookean,
-    "floor_barrier": FloorBarrier,
+    "floor": FloorBarrier,
     "anchor": Anchor,
 }
 

@@ -38,7 +38,7 @@ class FloorFriction:
     def __init__(self, scene: Scene, floor: FloorBarrier) -> None:
         friction = scene.model.friction
         self.scene, self.floor = scene, floor
-        self.coefficient = scene.parameter("friction", friction, "coefficient")[..., None, None]
+        self.coefficient = scene.parameter(friction, "coefficient")[..., None, None]
         self.reach = scene.time_step * friction.velocity
 
     def _full(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:

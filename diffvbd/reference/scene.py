@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import input_name
 from .layout import Layout, cross, dot
 
 
@@ -25,9 +26,9 @@ class Scene:
     mass: Tensor  # [..., V]
     parameters: dict[str, Any]
 
-    def parameter(self, kind: str, energy: Any, name: str) -> Tensor:
+    def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
-        return self.tensor(self.parameters.get(f"{kind}.{name}", getattr(energy, name)))
+        return self.tensor(self.parameters.get(input_name(energy, key), getattr(energy, key)))
 
     def tensor(self, value: Any) -> Tensor:
         return torch.as_tensor(value, dtype=self.like.dtype, device=self.like.device)

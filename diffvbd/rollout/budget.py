@@ -9,20 +9,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_number, check_positive, check_time_step, fail
+from ..checks import check_kind, check_number, check_positive, check_time_step, fail
 from ..contact.barrier import PairBarrier
+from ..model.inputs import MODULI
+from ..model.integrators import SDIRK2, ImplicitEuler
 from ..model.model import Model
+from ..model.solver import VBD
+from ..model.system import system_of
 from ..said import percent
-from ..step.arguments import check_state, prepare
+from ..step.arguments import check_state, given_of, prepare
 from ..step.held_up import cut_share
-from ..step.integrators import SAME_TIME_STEP, SDIRK2, ImplicitEuler, Integrator, check_integrator
+from ..step.integrators import SAME_TIME_STEP
+from .checks import NONE
 from .contact_check import unbalanced_friction
 from .halved import halved, of_parts
 from .pilots import FRAMES, Pilot, Pilots, Quantity, changes, converted, of_time, pilots_of, relative
+from .prediction import aligned
 from .reference import MOST_SWEEPS, is_balanced, unreached, with_more_sweeps
 from .rollout import rollout
 from .search import start_of
-from .settings import Settings, aligned
 from .trajectory import StepAverage
 
 FINER = 4  # times the steps of the finest run
@@ -56,7 +61,7 @@ class ErrorBudget:
     """The error of a rollout by cause, see :func:`error_budget`. As text: a table.
 
     Attributes:
-        settings: Whose error it is.
+        solver: Whose error it is.
         shares: One for each cause, the largest first, then "all but mesh" together, which need not be their sum.
         duration: Of the motion that was looked at [s].
         cut: The largest share of vertices that pairs held up in a step [-]; None without pairs.
@@ -65,7 +70,7 @@ class ErrorBudget:
             has not, its note says so, and what is compared with it says little.
     """
 
-    settings: Settings
+    solver: VBD
     shares: tuple[Share, ...]
     duration: float
     cut: float | None
@@ -88,7 +93,7 @@ class ErrorBudget:
         header = ("cause", "motion", "quantity", "gradient", "s", "compared with")
         rows = [(s.cause, shown(s.motion), shown(s.quantity), shown(s.gradient), f"{s.seconds:.2g}", s.note)
                 for s in self.shares]  # fmt: skip
-        lines = [f"{self.settings}, {self.duration:.3g} s of motion", *aligned([header, *rows])]
+        lines = [f"{self.solver}, {self.duration:.3g} s of motion", *aligned([header, *rows])]
         if self.cut is not None:
             lines.append(f"pairs held up at most {percent(self.cut)} of the vertices in a step")
         if self.friction is not None:
@@ -101,16 +106,15 @@ def error_budget(
     model: Model,
     x: Tensor,
     v: Tensor,
+    solver: VBD,
     *,
     duration: float,
-    time_step: float,
-    sweeps: int,
-    integrator: Integrator | None = None,
-    part: float = 1.0,
+    fraction: float = 1.0,
     quantity: Quantity | None = None,
     gradient: bool = False,
     mesh: bool = False,
-    **given: Any,
+    progress: bool = False,
+    **inputs: Any,
 ) -> ErrorBudget:
     """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
 
@@ -120,36 +124,34 @@ def error_budget(
     mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
 
     Args:
-        model, x, v: As in :func:`diffvbd.rollout`.
-        duration, time_step, sweeps, integrator: Of the rollout that is judged; pilots take a multiple of four
-            steps.
-        part: The share of the duration that pilots run, from its start, in (0, 1]. Errors mostly grow with time: a part
-            says which is largest sooner than how large it will be.
+        model, x, v, solver, duration: Of the rollout that is judged; trial runs take a multiple of four steps.
+        fraction: Of the duration, from its start, that trials run, in (0, 1]. Errors mostly grow with time: a part says
+            which is largest sooner than how large it will be.
         quantity, gradient: As in :func:`diffvbd.advise`.
         mesh: Whether to compare with a subdivided mesh, which takes some eight to sixteen times a run.
-        given: As in :func:`diffvbd.advise`.
+        progress, inputs: As in :func:`diffvbd.advise`.
 
     Raises:
-        ValueError, TypeError: As rollout; a part outside (0, 1]; ``mesh`` with what belongs to single vertices.
+        ValueError, TypeError: As rollout; a fraction outside (0, 1]; ``mesh`` with what belongs to single vertices.
         RuntimeError: The rollout itself does not run to its end.
     """
     check_state(model, x, v)
-    h, duration = check_time_step(time_step, model.dtype), check_positive("duration", duration, "s")
+    check_kind("solver", solver, VBD)
+    h, duration = check_time_step(solver.time_step, model.dtype), check_positive("duration", duration, "s")
     if not h <= (1 + SAME_TIME_STEP) * duration:
-        fail("time_step", f"at most the duration, {duration:g} s", f"{h:g} s")
+        fail("solver", f"a time step of at most the duration, {duration:g} s", f"{h:g} s")
     if not isinstance(mesh, bool):
         raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
-    part = check_number("part", part)
-    if not 0 < part <= 1:
-        fail("part", "a number in (0, 1]", repr(part))
-    steps = FRAMES * max(1, round(part * duration / (h * FRAMES)))
-    pilots = pilots_of(rollout, model, x, v, steps * h, quantity, gradient, given)
-    own = Settings(h, sweeps, check_integrator(integrator), model.relaxation, model.coarse, model.acceleration)
-    return _Budget(pilots, own, steps).run(mesh)
+    fraction = check_number("fraction", fraction)
+    if not 0 < fraction <= 1:
+        fail("fraction", "a number in (0, 1]", repr(fraction))
+    steps = FRAMES * max(1, round(fraction * duration / (h * FRAMES)))
+    pilots = pilots_of(rollout, model, x, v, steps * h, quantity, gradient, inputs, progress)
+    return _Budget(pilots, replace(solver, prediction=None), steps).run(mesh)
 
 
 class _Budget:
-    def __init__(self, pilots: Pilots, own: Settings, steps: int) -> None:
+    def __init__(self, pilots: Pilots, own: VBD, steps: int) -> None:
         self.pilots, self.own, self.steps = pilots, own, steps
         self.shares: list[Share] = []
         self.failed: dict[str, str] = {}  # by cause: why its reference is none
@@ -169,13 +171,13 @@ class _Budget:
         return ErrorBudget(self.own, (*shares, whole), p.duration, cut, friction, not self.failed)
 
     @staticmethod
-    def _run(pilots: Pilots, settings: Settings, steps: int) -> Pilot:
+    def _run(pilots: Pilots, settings: VBD, steps: int) -> Pilot:
         done = pilots.run(settings, steps)
         if done.x is None:
             raise RuntimeError(f"error_budget: expected a rollout that runs to its end; {done.failure}")
         return done
 
-    def _settled(self, pilots: Pilots, settings: Settings, steps: int, cause: str) -> tuple[Pilot, str]:
+    def _settled(self, pilots: Pilots, settings: VBD, steps: int, cause: str) -> tuple[Pilot, str]:
         """A run with sweeps until its steps balance their forces, and a note: its settings, or why that failed."""
         left, before = math.inf, math.inf
         while True:
@@ -238,26 +240,21 @@ class _Budget:
         if not model.touches:
             return None, None
         settings, cuts, before = self.own, list[Tensor](), [(p.x, p.v)]
+        system = system_of(model, settings)
 
-        def look(x: Tensor, v: Tensor, step: int) -> None:
-            cuts.append(cut_share(model))
+        def look(step: int, x: Tensor, v: Tensor) -> None:
+            cuts.append(cut_share(system))
             if step == self.steps - 1:
                 before[0] = (x, v)
 
         given = p.at_steps(dict(p.given), settings.time_step, self.steps, 0.0)
-        end = p.execute(model, p.x, p.v, steps=self.steps, time_step=settings.time_step, sweeps=settings.sweeps,
-                        integrator=settings.integrator, save="last", observe=look, check_contact=False,
-                        check_energy=False, check_start=False, **given)  # fmt: skip
+        end = p.execute(model, p.x, p.v, settings, steps=self.steps, save="last", observe=look, checks=NONE, **given)
         cut = None if model.contact is None else float(torch.stack(cuts).max())
         if model.friction is None or changes(p.given) or not isinstance(settings.integrator, ImplicitEuler):
             return cut, None
-        static: dict[str, Any] = {
-            name: p.given.get(name) for name in ("mu", "lam", "young", "poisson", "rest_points", "density")
-        }
-        prepared = prepare(model, tuple(p.x.shape[:-2]), time_step=settings.time_step, sweeps=settings.sweeps,
-                           parameters=p.given.get("parameters"), **static)  # fmt: skip
-        loads = {name: p.given.get(name) for name in ("force", "prescribed", "colliders", "colliders_before")}
-        return cut, unbalanced_friction(model, before[0], end.x[-1], prepared, loads | {"gravity": p.gravity})
+        inputs = given_of(system, p.given)
+        prepared = prepare(system, tuple(p.x.shape[:-2]), inputs, time_step=settings.time_step, sweeps=settings.sweeps)
+        return cut, unbalanced_friction(system, before[0], end.x[-1], prepared, inputs.loads)
 
     def _sweeps(self, run: Pilot) -> Pilot:
         """The same steps with sweeps enough that more change little."""
@@ -312,10 +309,10 @@ def _of_parts(value: Any, tets: int) -> Any:
 def finer_mesh(p: Pilots) -> Pilots:
     """Pilot runs on the subdivided mesh, whose first vertices are those of the mesh."""
     given = dict(p.given)
-    for name in ("force", "prescribed", "rest_points", "parameters"):
-        if given.get(name) is not None:
+    for name in given:
+        if given[name] is not None and name not in (*MODULI, "density", "gravity", "colliders", "colliders_before"):
             fail(name, "None beside mesh=True, which has other vertices", type(given[name]).__name__)
     fine = halved(p.model)
-    for name in ("mu", "lam", "young", "poisson", "density"):
+    for name in (*MODULI, "density"):
         given[name] = _of_parts(given.get(name), p.model.num_tets)
     return replace(p, model=fine.model, x=fine.between(p.x), v=fine.between(p.v), given=given, quantity=None, wrt=None)

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
-from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
+from ..adjoint.routes import Adjoint, TapedSweep, Unrolled
 from ..checks import check_count, fail, is_word
-from ..model.model import Model
+from ..model.system import System
 from ..scopes import Scope, transformed
 
 MAX_REPEATS = 64  # of a step under BinomialCheckpoints: each is a nested checkpoint, and a run of the step
@@ -72,7 +72,7 @@ def checked_schedule(given: Any) -> Any:
 def choose_schedule(
     checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None,
     adjoint: Adjoint,
-    model: Model,
+    model: System,
     scenes: int,
     steps: int,
     sweeps: int,
@@ -96,16 +96,16 @@ def choose_schedule(
     if checkpoint_every != "auto":
         return checkpoint_every, adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
-    if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
+    if not isinstance(adjoint, TapedSweep):  # a step of GlobalAdjoint keeps a few states and no tape
         kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
         return None if inside or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
     candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
     for tape in candidates:
-        policy = ReverseSweep(tape).policy(0, 0, 0, model.device)
+        policy = TapedSweep(tape).policy(0, 0, 0, model.device)
         if steps * row * ops.tape_rows(policy, model.energy_mask) <= TAPE_BUDGET:
-            return None, ReverseSweep(tape)
+            return None, TapedSweep(tape)
     if inside:
-        return None, ReverseSweep(candidates[-1])
+        return None, TapedSweep(candidates[-1])
     return max(1, math.isqrt(steps)), adjoint
 
 

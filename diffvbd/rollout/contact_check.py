@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..model.model import Model
+from ..model.system import System
 from ..said import is_silent, page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
@@ -21,7 +21,7 @@ from ..step.unsolved import unsolved
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 
 
-def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> bool:
+def checks_contact(asked: bool | None, model: System, x: Tensor, steps: int) -> bool:
     """Whether a rollout of so many steps ends with a look at its contact. A look reads values: never in what is
     compiled, transformed or captured, and on CUDA, where it waits for the device, only where it is asked for."""
     if asked is False or not model.touches or steps == 0 or x.numel() == 0 or torch.compiler.is_compiling():
@@ -33,7 +33,7 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
     return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and not is_silent()
 
 
-def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
+def unbalanced_friction(model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
                         given: dict[str, Any]) -> float:  # fmt: skip
     """What a step left unbalanced along the contact of a body, over the most that friction can bear there [-], the
     largest; 0 where it cannot be told.
@@ -57,7 +57,7 @@ def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, 
             return 0.0
 
 
-def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
+def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
                     given: dict[str, Any]) -> None:  # fmt: skip
     """Warns (UserWarning) of the steps of a rollout.
 
@@ -68,12 +68,12 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     left = unbalanced_friction(model, before, x, prepared, given)
     if cut > CUT:
         warn(
-            f"pair_barrier: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
+            f"contact: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
             f"{percent(CUT)}); " + what_helps(model),
         )
     if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
-        faster = ' a Model with coarse="auto",' if model.coarse is None else ""
+        faster = ' subspace="coarse",' if model.coarse is None else ""
         warn(
             f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
             f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
@@ -81,7 +81,9 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
         )
 
 
-def _matters(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]) -> bool:
+def _matters(
+    model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]
+) -> bool:
     """Whether what a step has left unbalanced would have moved a body, beside what forces do in a step."""
     found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
     return found is not None and found.error > UNBALANCED_FRICTION * found.forced

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,28 +11,34 @@ import torch
 from torch import Tensor
 
 from ..adjoint.implicit import global_sweep
-from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..checks import check_count, check_positive, fail, is_word
+from ..adjoint.routes import Adjoint, GlobalAdjoint, check_adjoint
+from ..checks import check_bool, check_count, check_positive, fail, is_word
+from ..model.integrators import BDF2
 from ..model.model import Model
+from ..model.solver import VBD
+from ..model.system import System
 from ..ops import SweepSettings
 from ..said import warn
 from ..scopes import refuse_refinement, refuse_transforms
 from ..step.advance import advance, swept
 from ..step.arguments import (
-    GRAVITY,
     Prepared,
     acceleration_of,
     check_prescribed,
     check_state,
     collider_state,
+    given_of,
     prepare,
     refuse_non_finite,
+    system_for,
 )
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
-from ..step.integrators import History, Integrator, check_history, check_integrator, check_staged, take
+from ..step.integrators import check_staged, take
 from ..step.met import outcomes
 from ..step.predict import Begun, begin
 from ..tuples import replaced
+
+LOGGER = logging.getLogger("diffvbd")
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,6 @@ class Solution:
         residual: Left-over force over the forces of the step [-], the largest over scenes, with contact over bodies,
             and over the solves of the step.
         converged: Whether in every scene that meets the tolerance, or is no more than rounding leaves.
-        history: With BDF2(), what the next step takes; else None.
     """
 
     x: Tensor
@@ -53,34 +58,21 @@ class Solution:
     sweeps: int
     residual: float
     converged: bool
-    history: History | None = None
 
 
 def solve(
     model: Model,
     x: Tensor,
     v: Tensor,
+    solver: VBD,
     *,
-    mu: float | Tensor | None = None,
-    lam: float | Tensor | None = None,
-    young: float | Tensor | None = None,
-    poisson: float | Tensor | None = None,
-    time_step: float,
     tolerance: float = 1e-8,
     max_sweeps: int = 10_000,
     check_every: int = 10,
     on_failure: Literal["raise", "warn"] = "raise",
-    force: Tensor | None = None,
-    gravity: Sequence[float] | Tensor = GRAVITY,
-    prescribed: Tensor | tuple[Tensor, Tensor] | None = None,
-    colliders: Tensor | tuple[Tensor, Tensor] | None = None,
-    colliders_before: Tensor | None = None,
-    rest_points: Tensor | None = None,
-    density: float | Tensor | None = None,
-    parameters: dict[str, Any] | None = None,
     adjoint: Adjoint | None = None,
-    integrator: Integrator | None = None,
-    history: History | None = None,
+    progress: bool = False,
+    **inputs: Any,
 ) -> Solution:
     """One implicit step, swept until it has converged in every scene.
 
@@ -93,8 +85,8 @@ def solve(
     others ended. Where pairs hold it up no number of sweeps converges.
 
     Args:
-        model, x, v, mu, lam, young, poisson, time_step: As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
-        force, gravity, prescribed, colliders, colliders_before, rest_points, density, parameters: As there.
+        model, x, v, solver, inputs: As in :func:`diffvbd.step`; the number of sweeps of the solver is not used. Each
+            solve of a step of SDIRK2 is swept until it has converged.
         tolerance: Residual in (0, 1) at which the sweeps end. A gradient of GlobalAdjoint is off by about that, times
             the conditioning of the step.
         max_sweeps: Number of sweeps after which to give up.
@@ -103,7 +95,7 @@ def solve(
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
         adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
             the same sweeps again and differentiate them. With contact ReverseSweep(), and no other.
-        integrator, history: As in :func:`diffvbd.step`; each solve of the step is swept until it has converged.
+        progress: Log each look at the residual (logger "diffvbd", level INFO).
 
     Returns:
         A :class:`Solution`.
@@ -117,27 +109,27 @@ def solve(
     """
     refuse_refinement("dv.solve")
     refuse_transforms("dv.solve, which looks at values (dv.step has them)")
-    lead, scheme = check_state(model, x, v), check_integrator(integrator)
-    check_history(scheme, history, x, time_step)
-    if adjoint is None:
-        adjoint = ReverseSweep() if model.touches else GlobalAdjoint()
-    adjoint = check_adjoint(adjoint)
+    lead, system, scheme = check_state(model, x, v), system_for(model, solver), solver.integrator
+    if isinstance(scheme, BDF2):
+        fail("solver", "ImplicitEuler() or SDIRK2() in a step: BDF2() needs the step before", "BDF2()")
+    if adjoint is None and not model.touches:
+        adjoint = GlobalAdjoint()
+    adjoint = check_adjoint(adjoint, solver.tape)
     if check_positive("tolerance", tolerance) >= 1:
         fail("tolerance", "a number in (0, 1)", tolerance)
     max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)
     if not is_word(on_failure, "raise", "warn"):
         fail("on_failure", '"raise" or "warn"', repr(on_failure))
-    options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
-                               "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
-    prepared = prepare(model, lead, sweeps=0, adjoint=adjoint, **options)
+    check_bool("progress", progress)
+    given = given_of(system, inputs)
+    prepared = prepare(system, lead, given, time_step=solver.time_step, sweeps=0, adjoint=adjoint)
+    prescribed = given.loads["prescribed"]
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
-        check_prescribed(model, value, x)
-    loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
-                             "colliders_before": colliders_before}  # fmt: skip
-    check_staged(scheme, loads)
-    run = _Converging(adjoint, tolerance, max_sweeps, check_every, on_failure)
-    taken = take(scheme, model, x, v, history, prepared, loads, run)
-    return Solution(taken.x, taken.v, run.count, run.residual, run.converged, taken.history)
+        check_prescribed(system, value, x)
+    check_staged(scheme, given.loads)
+    run = _Converging(adjoint, tolerance, max_sweeps, check_every, on_failure, progress)
+    taken = take(scheme, system, x, v, None, prepared, given.loads, run)
+    return Solution(taken.x, taken.v, run.count, run.residual, run.converged)
 
 
 class _Converging:
@@ -147,18 +139,20 @@ class _Converging:
         count, residual, converged: As in :class:`Solution`, of all solves so far.
     """
 
-    def __init__(self, adjoint: Adjoint, tolerance: float, max_sweeps: int, check_every: int, on_failure: str) -> None:
+    def __init__(self, adjoint: Adjoint, tolerance: float, max_sweeps: int, check_every: int, on_failure: str,
+                 progress: bool) -> None:  # fmt: skip
         self.adjoint, self.tolerance, self.on_failure = adjoint, tolerance, on_failure
-        self.most = max_sweeps, check_every
+        self.most, self.progress = (max_sweeps, check_every), progress
         self.count, self.residual, self.converged = 0, 0.0, True
 
-    def __call__(self, model: Model, x: Tensor, v: Tensor, prepared: Prepared, **loads: Any) -> tuple[Tensor, Tensor]:
+    def __call__(self, model: System, x: Tensor, v: Tensor, prepared: Prepared, **loads: Any) -> tuple[Tensor, Tensor]:
         loads["gravity"] = acceleration_of(loads["gravity"], x)
         where = collider_state(model, x, loads["colliders"], loads["colliders_before"])
         begun = begin(model, x, v, prepared, loads["force"], loads["gravity"], loads["prescribed"])
         with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
             swept_only = replaced(prepared, unrolled=None)
-            done = _Sweeping(model, begun.detached(), swept_only, {"x": x, "v": v, **loads}, where, self.tolerance)
+            done = _Sweeping(model, begun.detached(), swept_only, {"x": x, "v": v, **loads}, where, self.tolerance,
+                             self.progress)  # fmt: skip
             done.run(*self.most)
             if not math.isfinite(done.residual):
                 refuse_non_finite(model, {"x": x, "v": v, **loads, "mu": prepared.mu, "lam": prepared.lam})
@@ -205,12 +199,13 @@ class _Sweeping:
 
     def __init__(
         self,
-        model: Model,
+        model: System,
         begun: Begun,
         prepared: Prepared,
         given: dict[str, Any],
         where: tuple[Tensor, Tensor] | None,
         tolerance: float,
+        progress: bool,
     ) -> None:
         """where: collider points at the start and at the end of the step, None without contact."""
         self.model, self.begun, self.prepared, self.given = model, begun, prepared, given
@@ -219,7 +214,7 @@ class _Sweeping:
         self.contact = contact_of_step(model, begun, prepared, self.where)
         # The end of a step is its last sweep, which may be relaxed less, and its correction: what was swept before them
         # is what further sweeps go on from.
-        self.before, self.count = begun.x_start, 0
+        self.before, self.count, self.progress = begun.x_start, 0, progress
         numbers = prepared.settings.numbers
         self.over = replaced(prepared.settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
         self.rounding: Tensor | None = None
@@ -231,14 +226,13 @@ class _Sweeping:
     def remedy(self) -> str:
         """What else may help where the sweeps do not converge."""
         if self.where is None and self.model.coarse is not None:
-            return "plain sweeps (a Model with coarse=None), in case the corrections stall"
+            return 'plain sweeps (subspace="rigid"), in case the corrections stall'
         if self.where is None:
             return "with the exact block a relaxation between 1.5 and 1.7"
-        outcome = outcomes.get(self.model)
+        outcome = outcomes.get(self.model.model)
         if outcome is not None and bool(outcome.cut.any()):
             return "more detections or a larger reach of the PairBarrier, whose pairs have held this step up"
-        unused = "acceleration=Anderson() or " if self.model.acceleration is None else ""
-        unused += 'coarse="auto" or ' if self.model.coarse is None else ""
+        unused = 'subspace="coarse" or ' if self.model.coarse is None else ""
         return unused + "a larger Friction(velocity=)"
 
     def run(self, max_sweeps: int, check_every: int) -> None:
@@ -285,3 +279,5 @@ class _Sweeping:
         # what rounding leaves is converged, and no residual to speak of where a body is only a part of the scene
         shown = ratio if self.contact is None else torch.where(done & (ratio > self.tolerance), 0, ratio)
         self.residual, self.converged = float(torch.nan_to_num(shown, nan=torch.inf).max()), bool(done.all())
+        if self.progress:
+            LOGGER.info("solve: residual %.3g after %d sweeps", self.residual, self.count)

@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from ..mask import ELASTIC
-from ..model.model import Model
+from ..model.integrators import Integrator
+from ..model.system import System
 from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
 from ..said import is_silent, page, percent, warn
 from ..scopes import looks_at, may_copy
 from ..step.arguments import Prepared
-from ..step.integrators import Integrator, Solve
+from ..step.integrators import Solve
 from ..step.lost import FAR, fault_of, reach_of, size_of
 from ..step.unsolved import Unsolved, unsolved
 from ..tuples import replaced
@@ -40,7 +41,7 @@ class EndLook:
     w^2 = a over the way the two are the same estimate, of the motion's relative error.
     """
 
-    model: Model
+    model: System
     integrator: Integrator
     start: tuple[Tensor, ...]  # positions and velocities
     steps: int
@@ -134,14 +135,14 @@ class EndLook:
         worst = max(found, key=lambda u: u.error)
         of = f", worst in body {worst.body}" if int(self.model.body.max()) else ""
         of += f" of scene {worst.scene}" if worst.scene else ""
-        faster = "" if self.model.coarse is not None else ', coarse="auto"'
+        faster = "" if self.model.coarse is not None else ', subspace="coarse"'
         warn(
             f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
             f"take more sweeps{faster} or a smaller time_step, and compare; " + page("numerics.md")
         )
 
 
-def look_at_end(asked: bool | None, model: Model, integrator: Integrator, x: Tensor, v: Tensor, steps: int,
+def look_at_end(asked: bool | None, model: System, integrator: Integrator, x: Tensor, v: Tensor, steps: int,
                 settings: SweepSettings) -> EndLook | None:  # fmt: skip
     """A look at a rollout; None where nothing may be looked at."""
     if steps == 0 or x.numel() == 0 or is_silent() or not (looks_at(x) or may_copy(x)):
@@ -156,7 +157,7 @@ def look_at_end(asked: bool | None, model: Model, integrator: Integrator, x: Ten
 # --- on CUDA, where looking waits for the device ----------------------------------------------------------------------
 
 
-def _say_later(model: Model, good: Tensor) -> None:
+def _say_later(model: System, good: Tensor) -> None:
     """Copies an answer to the host meanwhile; the Model's next rollout that finds it there says what it was."""
     said = torch.empty(2, dtype=torch.bool, pin_memory=True)
     said.copy_(good, non_blocking=True)
@@ -165,7 +166,7 @@ def _say_later(model: Model, good: Tensor) -> None:
     model._derived.setdefault(ENDED, []).append((said, done))
 
 
-def warn_of_last_end(model: Model, x: Tensor) -> None:
+def warn_of_last_end(model: System, x: Tensor) -> None:
     """Warns of the Model's rollouts before this one, on CUDA, as far as they are done."""
     if not model._derived.get(ENDED) or not may_copy(x):
         return

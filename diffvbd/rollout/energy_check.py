@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..energies import Anchor
 from ..mask import ELASTIC
-from ..model.model import Model
 from ..model.rest import rest_metric
+from ..model.system import System
 from ..said import is_silent, page, percent, warn
 from ..scopes import looks_at, may_copy
 from ..step.arguments import Prepared, acceleration_of
@@ -33,7 +33,7 @@ ROUNDING = 64.0  # times the energy of strains that are rounding
 _Chunk = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def _elastic_of(model: Model, prepared: Prepared) -> Iterator[_Chunk]:
+def _elastic_of(model: System, prepared: Prepared) -> Iterator[_Chunk]:
     chunk = max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
     for first in range(0, model.num_tets, chunk):
         rows = slice(first, first + chunk)
@@ -46,7 +46,7 @@ def _elastic_of(model: Model, prepared: Prepared) -> Iterator[_Chunk]:
 class EnergyLook:
     """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps, [B] each."""
 
-    model: Model
+    model: System
     prepared: Prepared
     gravity: Tensor
     start: Tensor
@@ -60,8 +60,8 @@ class EnergyLook:
         """After a step; one that runs again is not seen twice."""
         if step in self.at and step not in self.found:
             with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-                if not self.found and self.model.contact is not None and self.model in outcomes:
-                    self.pressed = self.pressed | (outcomes[self.model].smallest[0] < self.model.contact.dhat)
+                if not self.found and self.model.contact is not None and self.model.model in outcomes:
+                    self.pressed = self.pressed | (outcomes[self.model.model].smallest[0] < self.model.contact.dhat)
                 energy = mechanical_energy(self.model, self.prepared, x.detach(), v.detach(), self.elastic)
                 way = (x.detach().double() - self.start.double()) * self.gravity.double()
                 mass = _free_mass(self.model, self.prepared)
@@ -82,7 +82,7 @@ class EnergyLook:
         if most > MANY:
             size = f"{most * all_of:.3g} J, where it had and gravity gave it {all_of:.3g} J"
         of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
-        faster = "" if self.model.coarse is not None else ', coarse="auto"'
+        faster = "" if self.model.coarse is not None else ', subspace="coarse"'
         pressed = ""
         if bool(self.pressed[scene]):
             pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
@@ -93,7 +93,7 @@ class EnergyLook:
         )
 
 
-def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
+def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
                    gravity: Any) -> EnergyLook | None:  # fmt: skip
     """A look at a rollout of so many steps that nothing but gravity drives, or None where nobody asks for one.
 
@@ -132,7 +132,7 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
         return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps), elastic, pressed)
 
 
-def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
+def _looked_at(asked: bool | None, model: System, steps: int) -> frozenset[int]:
     """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
     many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
     meets = model.touches or model.floor is not None
@@ -141,12 +141,12 @@ def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
     return frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
 
 
-def _free_mass(model: Model, prepared: Prepared) -> Tensor:
+def _free_mass(model: System, prepared: Prepared) -> Tensor:
     """Mass of what can move [kg], float64 [1 | B, V]."""
     return torch.where(model._pinned, 0.0, prepared.mass.double())
 
 
-def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor, elastic: list[_Chunk] | None = None
+def mechanical_energy(model: System, prepared: Prepared, x: Tensor, v: Tensor, elastic: list[_Chunk] | None = None
                       ) -> Tensor:  # fmt: skip
     """Kinetic and elastic energy of each scene [J], float64 [B]; the rest shape has none of the latter.
 
@@ -169,16 +169,16 @@ def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor, el
     return moving + total
 
 
-def _rest_of(model: Model, prepared: Prepared, rows: slice) -> Tensor:
+def _rest_of(model: System, prepared: Prepared, rows: slice) -> Tensor:
     """Rest scalars of some tets, [1 | B, t, 7]. A Model that does not keep them is not made to."""
     if prepared.rest is not None:
         return prepared.rest[:, rows]
-    if model._rest_scalars.numel() or "rest" in model._derived:
+    if "rest" in model.model._derived:
         return model.rest_scalars[:, rows]
     return rest_metric(model._rest_points[None, model.tets[rows]])[0]
 
 
-def _rounding(model: Model, prepared: Prepared, x: Tensor) -> Tensor:
+def _rounding(model: System, prepared: Prepared, x: Tensor) -> Tensor:
     """Elastic energy of strains that rounding of the positions makes [J], float64 [1 | B]."""
     volume = torch.tensor(model.mesh.volume, device=x.device)
     strain = torch.finfo(x.dtype).eps * x.abs().amax().double() / volume.pow(1 / 3)

@@ -4,76 +4,78 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..model.model import Model
+from ..model.solver import VBD
 from ..scopes import Finer, record_to, refined
 from ..step.integrators import History, is_step_of
+from .checks import check_checks
 from .halved import halved, on_halved
 from .reference import unbalanced, with_other_sweeps
 from .trajectory import PerStep, StepAverage, Trajectory, stacked
 
-# given at the steps of the caller and held over the smaller ones; `prescribed` and `colliders` move in between
-_HELD = ("mu", "lam", "young", "poisson", "force", "gravity", "rest_points", "density")
+_MOVING = ("prescribed", "colliders", "colliders_before")  # other inputs are held over the smaller steps
 
 
-def rollout_finer(rollout: Callable[..., Trajectory], *, finer: Finer, **given: Any) -> Trajectory:
-    """``rollout`` of the arguments ``given``, as much finer as ``finer`` says.
+def rollout_finer(rollout: Callable[..., Trajectory], finer: Finer, model: Model, x: Tensor, v: Tensor, solver: VBD,
+                  steps: int, inputs: dict[str, Any], options: dict[str, Any]) -> Trajectory:  # fmt: skip
+    """``rollout`` of these arguments, as much finer as ``finer`` says.
 
-    The result looks like that of ``rollout(**given)``: the same vertices, frames, and observations at the same times.
-    What is given per step, or by a callable, is asked at the steps of ``given`` and held in between; prescribed
+    The result looks like that of the rollout itself: the same vertices, frames, and observations at the same times.
+    What is given per step, or by a function, is asked at the steps of the caller and held in between; prescribed
     vertices and colliders go in straight lines between the ends of these.
     """
-    given = {name: value for name, value in given.items() if name not in ("settings", "duration")}  # none
-    steps, parts, vertices = given["steps"], finer.steps, given["model"].num_vertices if finer.mesh else None
+    parts, vertices, asked = finer.steps, model.num_vertices if finer.mesh else None, steps
+    options = dict(options)
     if parts > 1 or finer.mesh:
         # dv.refine has run this as it stands before, which has checked the arguments
-        if given["estimate_errors"]:
-            raise NotImplementedError("refine: expected rollouts without estimate_errors")
-        given |= {"progress": False}
+        if check_checks(options["checks"], model).errors:
+            raise NotImplementedError("refine: expected rollouts without Checks(errors=True)")
+        options |= {"progress": False}
     if finer.mesh:
-        given = on_halved(given, halved(given["model"])) | {"history": None}
+        fine = halved(model)
+        inputs, x, v, options["history"] = on_halved(inputs, model, fine), fine.between(x), fine.between(v), None
+        model = fine.model
     if parts > 1:
-        given = _of_smaller_steps(given, parts)
-    given["sweeps"] = finer.sweeps * given["sweeps"]
+        solver = replace(solver, time_step=solver.time_step / parts)
+        history, save = options["history"], options["save"]
+        if isinstance(history, History) and not is_step_of(history, solver.time_step):  # but that of a refined rollout
+            raise NotImplementedError("refine: expected rollouts that begin without a history of larger steps")
+        options["save"] = save if save == "last" else parts * (1 if save == "all" else save)
+        inputs, steps = _of_smaller_steps(inputs, parts, model), parts * steps
+    solver = replace(solver, sweeps=finer.sweeps * solver.sweeps)
     if finer.others:
-        given["model"] = with_other_sweeps(given["model"])
-    observe, observed = given["observe"], []
+        solver = with_other_sweeps(model, solver)
+    observe, observed = options["observe"], []
 
-    def observe_some(x: Tensor, v: Tensor, step: int) -> None:
+    def observe_some(step: int, x: Tensor, v: Tensor) -> None:
         if step % parts == 0:
-            observed.append(observe(x[..., :vertices, :], v[..., :vertices, :], step // parts))
+            observed.append(observe(step // parts, x[..., :vertices, :], v[..., :vertices, :]))
 
     solves: list[Any] = []
     looks = record_to(solves, "solve") if finer.sweeps > 1 else nullcontext()
+    options["observe"] = None if observe is None else observe_some
     with refined(None), looks:
-        found = rollout(**given | {"observe": None if observe is None else observe_some})
-    finer.ran.append((steps, unbalanced(solves)))
+        found = rollout(model, x, v, solver, steps=steps, **options, **inputs)
+    finer.ran.append((asked, unbalanced(solves)))
     history = None if finer.mesh else found.history
     return Trajectory(found.x[..., :vertices, :], found.v[..., :vertices, :],
                       [step // parts for step in found.steps], stacked(observed), found.errors, history)  # fmt: skip
 
 
-def _of_smaller_steps(given: dict[str, Any], parts: int) -> dict[str, Any]:
-    time_step, history = given["time_step"] / parts, given["history"]
-    if isinstance(history, History) and not is_step_of(history, time_step):  # but that of a refined rollout before
-        raise NotImplementedError("refine: expected rollouts that begin without a history of larger steps")
-    save, model = given["save"], given["model"]
-    out = given | {
-        "steps": parts * given["steps"],
-        "time_step": time_step,
-        "save": save if save == "last" else parts * (1 if save == "all" else save),
-    }
-    for name in _HELD:
-        out[name] = _held(given[name], parts)
-    out["parameters"] = {name: _held(value, parts) for name, value in (given["parameters"] or {}).items()}
-    out["prescribed"] = _moving(given["prescribed"], parts, model)
-    if isinstance(given["colliders"], PerStep):
-        first = model.collider_points if given["colliders_before"] is None else given["colliders_before"]
-        out["colliders"] = _between(given["colliders"].values, first, parts)
+def _of_smaller_steps(inputs: dict[str, Any], parts: int, model: Model) -> dict[str, Any]:
+    out = {name: value if name in _MOVING else _held(value, parts) for name, value in inputs.items()}
+    if "prescribed" in out:
+        out["prescribed"] = _moving(out["prescribed"], parts, model)
+    if isinstance(out.get("colliders"), PerStep):
+        before = out.get("colliders_before")
+        first = model.collider_points if before is None else before
+        out["colliders"] = _between(out["colliders"].values, first, parts)
     return out
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from ..checks import fail
 from ..energies import Anchor
 from ..mesh import subdivide
+from ..model.inputs import MODULI
 from ..model.model import Model
-from ..model.replaced import replaced_arguments
 from .trajectory import PerStep, StepAverage
 
 TETS = 8  # of each
@@ -42,7 +42,8 @@ def _halved(model: Model) -> Halved:
     ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
     density = model.density.cpu().repeat_interleave(TETS)
     changes = {"density": density, "pinned": torch.cat([pinned, pinned[ends].all(1)]) if pinned.any() else None}
-    fine = Model(subdivide(model.mesh), **replaced_arguments(model, changes))
+    fine = Model(subdivide(model.mesh), energies=model.replace().energies, colliders=model.colliders, dtype=model.dtype,
+                 device=model.device, **changes)  # fmt: skip
     return Halved(fine, ends.to(model.device), model.num_vertices)
 
 
@@ -52,9 +53,9 @@ def of_parts(value: Any, tets: int) -> Any:
     return value.repeat_interleave(TETS, -1) if each else value
 
 
-def on_halved(given: dict[str, Any], fine: Halved) -> dict[str, Any]:
-    """The arguments of a rollout on the finer mesh. Forces stay at the vertices of the mesh."""
-    model, count = given["model"], fine.vertices
+def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, Any]:
+    """The inputs of a rollout on the finer mesh. Forces stay at the vertices of the mesh."""
+    count = fine.vertices
     tets, pinned = model.num_tets, fine.model.pinned[:, None]
 
     def mapped(name: str, change: Callable[[Any], Any]) -> Any:
@@ -87,8 +88,9 @@ def on_halved(given: dict[str, Any], fine: Halved) -> dict[str, Any]:
     def shaped(points: Any) -> Any:
         return None if points is None else fine.between(points)
 
-    out = dict(given) | {"model": fine.model, "x": fine.between(given["x"]), "v": fine.between(given["v"])}
-    for name in ("mu", "lam", "young", "poisson", "density"):
-        out[name] = mapped(name, lambda value: of_parts(value, tets))
+    def of_each(value: Any) -> Any:
+        return of_parts(value, tets)
+
     changes = {"force": pushed, "gravity": accelerated, "prescribed": moved, "rest_points": shaped}
-    return out | {name: mapped(name, change) for name, change in changes.items()}
+    changes |= dict.fromkeys((*MODULI, "density"), of_each)
+    return {name: mapped(name, changes[name]) if name in changes else value for name, value in given.items()}

@@ -9,38 +9,38 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import combinations_of, cycles_of
-from ..adjoint.routes import ReverseSweep
+from ..adjoint.routes import TapedSweep
 from ..checks import check_bool, check_count, is_word
 from ..mask import KEEPS_POSITIONS
+from ..model.integrators import BDF2
 from ..model.model import Model
+from ..model.solver import VBD
+from ..model.system import System, system_of
 from ..step.contact_cycles import sweeps_of_parts
-from ..step.integrators import BDF2, Integrator, check_integrator, solves_of
+from ..step.integrators import solves_of
 from ..step.memory import cuda_scratch
 from .checkpoints import BinomialCheckpoints, _left, choose_schedule
 
 
-def predict(
+def memory(
     model: Model,
+    solver: VBD,
     *,
-    sweeps: int,
     steps: int = 1,
     scenes: int = 1,
-    tape: str = "auto",
     checkpoint_every: Any = "auto",
     save: Any = "last",
     material: bool = True,
     rest: bool = False,
-    integrator: Integrator | None = None,
 ) -> dict[str, int]:
     """Bytes that a differentiated rollout keeps and works with (default arguments otherwise, no force). The lists of
     contact are not counted: about 0.2 KB for each pair, step and detection, and 1 KB in the backward of one step. Nor
     are the sweeps that a step takes beyond its K where pairs hold bodies up (docs/contact.md).
 
     Args:
-        sweeps, steps, scenes: K, number of steps, product of x's leading dimensions.
-        tape, checkpoint_every, save: As in ReverseSweep and rollout.
-        integrator: As in rollout.
+        model, solver: As in rollout.
+        steps, scenes: Number of steps, product of x's leading dimensions.
+        checkpoint_every, save: As in rollout.
         material, rest: Whether material and rest-shape gradients are wanted (they take scratch in the backward).
 
     Returns:
@@ -58,16 +58,18 @@ def predict(
             total: kept + scratch.
 
     Raises:
-        ValueError, TypeError: For what ReverseSweep or rollout would refuse; it names the argument.
+        ValueError, TypeError: For what rollout would refuse; it names the argument.
     """
+    model, sweeps, scheme = system_of(model, solver), solver.sweeps, solver.integrator
     item = model._mass.element_size()
-    steps, scenes, sweeps = check_count("steps", steps), check_count("scenes", scenes), check_count("sweeps", sweeps)
+    steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
     for name, asked in (("material", material), ("rest", rest)):
         check_bool(name, asked)
-    scheme = check_integrator(integrator)
     solves = solves_of(scheme)
-    schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]
-    assert isinstance(adjoint, ReverseSweep)
+    schedule, adjoint = choose_schedule(
+        checkpoint_every, TapedSweep(solver.tape), model, scenes, steps, solves * sweeps
+    )
+    assert isinstance(adjoint, TapedSweep)
     scalars = scenes * sweeps * model.num_active
     policy = adjoint.policy(scalars, item, model.energy_mask, model.device)
     tape_bytes = scalars * ops.tape_rows(policy, model.energy_mask) * item
@@ -77,7 +79,6 @@ def predict(
     per_step = (5 if local else 3) * state + tape_bytes
     per_step += scenes * sum(model._data_count) * item if local else 0
     per_step += scenes * coarse_scalars(model, sweeps) * item
-    per_step += accelerated_states(model, sweeps) * state + scenes * accelerated_scalars(model, sweeps) * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
@@ -121,7 +122,6 @@ def predict(
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
     parts += () if model.coarse is None else (model._coarse_plan,)
-    parts += () if model.acceleration is None else (model._moving,)
     tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
     return {
         "model": sum(t.numel() * t.element_size() for t in tensors),
@@ -133,7 +133,7 @@ def predict(
     }
 
 
-def coarse_scalars(model: Model, sweeps: int) -> int:
+def coarse_scalars(model: System, sweeps: int) -> int:
     """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrices or
     their factors, and what each correction has done; with a floor also where it began."""
     if model.coarse is None or not model.coarse_geometry.bodies:
@@ -147,27 +147,12 @@ def coarse_scalars(model: Model, sweeps: int) -> int:
     return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
 
 
-def accelerated_states(model: Model, sweeps: int) -> int:
-    """States that an accelerated step keeps besides its own start and end: of each cycle, and each combination."""
-    return sum(len(cycles_of(model, n)) - 1 + combinations_of(model, n)
-               for n in _parts(model, sweeps) if combinations_of(model, n))  # fmt: skip
-
-
-def accelerated_scalars(model: Model, sweeps: int) -> int:
-    """Scalars of the small systems of its bodies, for each scene."""
-    if model.acceleration is None:
-        return 0
-    window = model.acceleration.window
-    sizes = [min(n + 1, window) for part in _parts(model, sweeps) for n in range(combinations_of(model, part))]
-    return model._moving.number * sum(n * (n + 1) for n in sizes)
-
-
-def _parts(model: Model, sweeps: int) -> list[int]:
+def _parts(model: System, sweeps: int) -> list[int]:
     """Sweeps of each part of a step: one for each detection of pairs. More parts have fewer cycles, and need less."""
     return sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections or 1)
 
 
-def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:
+def _cpu_scratch(model: System, scenes: int, material: bool, rest: bool) -> int:
     blocks, slots, edge_slots = (ops.LANES["cpu"] * n for n in model._plan[4:7].tolist())
     # packed state and its adjoints, rows along edges, one row per (vertex, tet) pair of what is differentiated
     work = blocks * (22 if model.floor else 16) + 4 * edge_slots

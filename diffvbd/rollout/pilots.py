@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -14,27 +15,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
+from ..model.inputs import MODULI, sorted_inputs
 from ..model.model import Model
-from ..model.warnings import silent
+from ..model.solver import VBD
+from ..model.system import system_of
+from ..said import silence
 from ..scopes import record_to, refined, refuse_transforms
-from ..step.arguments import GRAVITY, Prepared, prepare
+from ..step.arguments import GRAVITY, Prepared, material_of, prepare
 from .between import SWINGS, unseen
+from .checks import NONE
 from .energy_check import mechanical_energy
+from .prediction import on
 from .reference import unbalanced
-from .settings import Settings
 from .trajectory import PerStep, StepAverage, Trajectory, refuse_average
 
+LOGGER = logging.getLogger("diffvbd")
 SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
 NO_PART = 1e-8  # of quantity over modulus: a gradient below it counts as one of this size
 LOADS = ("force", "gravity")
 MOVING = ("prescribed", "colliders")
-MODULI = ("mu", "lam", "young", "poisson")
-OTHERS = (*MODULI, "rest_points", "density", "parameters")
-GIVEN = (*OTHERS, *LOADS, *MOVING)
 Quantity = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -42,7 +44,7 @@ Quantity = Callable[[Tensor, Tensor], Tensor]
 class Pilot:
     """A run: its frames, and what it took."""
 
-    settings: Settings
+    settings: VBD
     steps: int
     x: Tensor | None  # [FRAMES + 1, ..., V, 3], the first is the start; None: it failed
     v: Tensor | None
@@ -70,6 +72,7 @@ class Pilots:
     wrt: Sequence[str] | None = None  # of the material: gradients with respect to them and a velocity of the whole
     spent: float = 0.0  # [s]
     runs: int = 0
+    progress: bool = False  # whether each run is logged
     _ready: set[str] = field(default_factory=set)
     _solves: list[Any] = field(default_factory=list)  # of the last run
 
@@ -78,9 +81,7 @@ class Pilots:
         limits, h = torch.finfo(self.model.dtype), SHORTEST * self.duration
         if not limits.tiny <= h * h <= limits.max:
             fail("duration", f"a number of seconds of which {SHORTEST:g} is a time step", self.duration)
-        parameters = self.given.get("parameters")
-        named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
-        for name, value in {**self.given, **named}.items():
+        for name, value in self.given.items():
             if name in MOVING:
                 refuse_average(name, value)
             if isinstance(value, PerStep):
@@ -102,8 +103,8 @@ class Pilots:
         """One short step: raises what rollout raises of the arguments."""
         h = SHORTEST * self.duration
         given = self.at_steps(dict(self.given), h, 1, 0.0)
-        with silent(self.model):
-            end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
+        with silence():
+            end = self.execute(self.model, self.x, self.v, VBD(h, 1), steps=1, save="last", **given)
         if self.quantity is None:
             return
         leaves = [t[-1].detach().requires_grad_(self.wrt is not None) for t in (end.x, end.v)]
@@ -122,25 +123,26 @@ class Pilots:
         if all(gradient is None for gradient in found):
             fail("quantity", "a function that torch can differentiate, beside gradient=True", "one without a graph")
 
-    def run(self, settings: Settings, steps: int, quarter: int | None = None, start: Pilot | None = None) -> Pilot:
+    def run(self, settings: VBD, steps: int, quarter: int | None = None, start: Pilot | None = None) -> Pilot:
         """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
-        settings = settings.on(steps, self.duration)
+        settings = on(settings, steps, self.duration)
         part, first = (steps, 0) if quarter is None else (steps // FRAMES, quarter)
         x, v = (self.x, self.v) if start is None or quarter is None else (start.x[quarter], start.v[quarter])  # type: ignore[index]
         began = first * self.duration / FRAMES
         differentiate = self.wrt is not None and quarter is None
-        with silent(self.model):
+        with silence():
             try:
-                model = settings.applied(self.model)
-                self._warm(settings, model, x, v, began)
+                self._warm(settings, x, v, began)
                 clock = time.perf_counter()
-                out = self._rollout(settings, model, x, v, part, began, FRAMES if quarter is None else 1, differentiate)
+                out = self._rollout(settings, x, v, part, began, FRAMES if quarter is None else 1, differentiate)
                 self._wait()
             except (RuntimeError, ValueError, torch.OutOfMemoryError) as error:
                 return Pilot(settings, steps, None, None, math.inf, failure=f"{settings}: {error}")
         seconds = time.perf_counter() - clock
         self.spent += seconds
         self.runs += 1
+        if self.progress:
+            LOGGER.info("trial run %d: %s, %.2g s", self.runs, settings, seconds)
         traj, value, gradient = out
         x, v = traj.x.detach(), traj.v.detach()
         if not bool(torch.isfinite(x[-1]).all()):
@@ -150,9 +152,9 @@ class Pilots:
             return Pilot(settings, steps, None, None, seconds, failure=failure)
         return Pilot(settings, steps, x, v, seconds * steps / part, value, gradient)
 
-    def _rollout(self, settings: Settings, model: Model, x: Tensor, v: Tensor, steps: int, began: float, frames: int,
-                 differentiate: bool) -> tuple[Trajectory, Tensor | None, tuple[Tensor, ...]]:  # fmt: skip
-        given, leaves = dict(self.given), []
+    def _rollout(self, settings: VBD, x: Tensor, v: Tensor, steps: int, began: float, frames: int, differentiate: bool
+                 ) -> tuple[Trajectory, Tensor | None, tuple[Tensor, ...]]:  # fmt: skip
+        model, given, leaves = self.model, dict(self.given), []
         if differentiate:
             # one velocity for all: those of single vertices excite what no time step resolves
             leaves = [torch.zeros(3, dtype=model.dtype, device=model.device, requires_grad=True)]
@@ -165,23 +167,18 @@ class Pilots:
         given = self.at_steps(given, settings.time_step, steps, began)
         self._solves = []
         with torch.set_grad_enabled(differentiate), record_to(self._solves, "solve"):
-            out = self.execute(
-                model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
-                integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
-                checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
-                check_energy=False, check_start=False, **given,
-            )  # fmt: skip
+            out = self.execute(model, x, v, settings, steps=steps, save=max(1, steps // frames), checks=NONE, **given)
             value = None if self.quantity is None else self.quantity(out.x[-1], out.v[-1])
             gradient = torch.autograd.grad(value, leaves) if leaves else ()  # type: ignore[arg-type]
         return out, None if value is None else value.detach(), gradient
 
-    def _warm(self, settings: Settings, model: Model, x: Tensor, v: Tensor, began: float) -> None:
-        """The first step of a Model arranges what later ones find: it is not timed."""
-        key = f"{id(model)} {settings.integrator}"
+    def _warm(self, settings: VBD, x: Tensor, v: Tensor, began: float) -> None:
+        """The first step of a solver arranges what later ones find: it is not timed."""
+        key = f"{settings.key} {settings.integrator}"
         if key not in self._ready:
             self._ready.add(key)
             with torch.no_grad():
-                self._rollout(settings, model, x, v, 1, began, 1, False)
+                self._rollout(settings, x, v, 1, began, 1, False)
             self._wait()
 
     def _wait(self) -> None:
@@ -197,9 +194,6 @@ class Pilots:
             return lambda step, x, v: function(began + (step + share) * h)
 
         out = {name: value for name, value in given.items() if value is not None}
-        if isinstance(given.get("parameters"), dict):
-            out["parameters"] = {name: timed(value, 1.0) if of_time(value) else value
-                                 for name, value in given["parameters"].items()}  # fmt: skip
         for name, value in given.items():
             if not of_time(value):
                 continue
@@ -213,9 +207,7 @@ class Pilots:
 
     def swinging(self, steps: int) -> str:
         """The name of what swings within steps, so that they do not see it; "" if nothing does."""
-        parameters = self.given.get("parameters")
-        named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
-        for name, value in {**self.given, **named}.items():
+        for name, value in self.given.items():
             share = 0.5 if name in LOADS else 1.0
             if not of_time(value):
                 continue
@@ -295,16 +287,15 @@ class Pilots:
         """The material of the scene at a time [s]."""
         given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, time)
         values = {name: value(0, self.x, self.v) if of_time(value) else value for name, value in given.items()}
-        moduli: dict[str, Any] = {name: values.get(name) for name in MODULI}
-        return prepare(self.model, tuple(self.x.shape[:-2]), time_step=1.0, sweeps=1, rest_points=None, density=None,
-                       parameters=None, **moduli)  # fmt: skip
+        system = system_of(self.model, VBD(1.0, 1))
+        return prepare(system, tuple(self.x.shape[:-2]), material_of(**values), time_step=1.0, sweeps=1)
 
     def energy(self, x: Tensor, v: Tensor) -> Tensor:
         """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
         load = self.model.mass.double()[:, None] * torch.as_tensor(self.gravity, device=x.device).double()
         if self.given.get("force") is not None:
             load = load + torch.as_tensor(self.given["force"]).to(load)
-        stored = mechanical_energy(self.model, self.prepared, x, v).reshape(x.shape[:-2])
+        stored = mechanical_energy(system_of(self.model, VBD(1.0, 1)), self.prepared, x, v).reshape(x.shape[:-2])
         return stored - (load * x.double()).sum((-1, -2))
 
     def lost(self, run: Pilot, seconds: float) -> float:
@@ -319,12 +310,12 @@ class Pilots:
 
 
 def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Tensor, duration: float,
-              quantity: Quantity | None, gradient: bool, given: dict[str, Any]) -> Pilots:  # fmt: skip
+              quantity: Quantity | None, gradient: bool, given: dict[str, Any], progress: bool = False
+              ) -> Pilots:  # fmt: skip
     """Pilot runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
     of the arguments."""
-    refuse_transforms('dv.advise, dv.error_budget and settings="auto", which look at values')
-    if unknown := sorted(set(given) - set(GIVEN)):
-        raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(GIVEN)}")
+    refuse_transforms("dv.advise and dv.error_budget, which look at values")
+    sorted_inputs(model, given)
     if not isinstance(gradient, bool):
         raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
     if gradient and torch.is_inference_mode_enabled():
@@ -341,7 +332,7 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
     material = [name for name in MODULI if given.get(name) is not None]
     wrt = [name for name in material if not of_time(given[name])]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
-    pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
+    pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None, progress=progress)
     pilots.check()
     return pilots
 
@@ -363,9 +354,7 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
 
 def changes(given: dict[str, Any]) -> bool:
     """Whether anything that is given changes in time."""
-    parameters = given.get("parameters")
-    values = [*given.values(), *(parameters.values() if isinstance(parameters, dict) else ())]
-    return any(map(of_time, values))
+    return any(map(of_time, given.values()))
 
 
 def _mean_squared_way(start: Tensor) -> Quantity:

@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from ..energies import StableNeoHookean
+from ..mask import ELASTIC
 from ..model.model import Model
+from ..model.solver import VBD
 from ..said import percent
 from ..step.balance import UNBALANCED, left_of_solve, share
-from .settings import Settings
 
 MOST_SWEEPS = 1300
 LOOKS = 64  # at steps of a run, evenly spread
@@ -37,29 +37,27 @@ def is_balanced(left: float) -> bool:
     return left <= UNBALANCED
 
 
-def takes_corrections(model: Model) -> bool:
-    """Whether coarse corrections and acceleration are defined."""
-    elastic = next((e for e in model.energies if isinstance(e, StableNeoHookean)), None)
-    return elastic is not None and elastic.block == "exact" and model.saturation is None
+def takes_corrections(model: Model, solver: VBD) -> bool:
+    """Whether coarse corrections are defined."""
+    return bool(model.energy_mask & ELASTIC) and solver.block == "exact" and solver.saturation is None
 
 
-def with_other_sweeps(model: Model) -> Model:
-    """With plain sweeps in place of corrections, or with corrections, where they are cheap, in place of plain ones."""
-    if model.coarse is None and (model.touches or not takes_corrections(model)):
-        return model
-    coarse = "auto" if model.coarse is None else None
-    return Settings(1.0, 1, coarse=coarse, acceleration=model.acceleration).applied(model)
+def with_other_sweeps(model: Model, solver: VBD) -> VBD:
+    """Plain sweeps in place of coarse corrections, or corrections, where they are cheap, in place of plain ones."""
+    if solver.coarse is None and (model.touches or not takes_corrections(model, solver)):
+        return solver
+    return replace(solver, subspace="coarse" if solver.coarse is None else "rigid")
 
 
-def with_more_sweeps(settings: Settings, left: float, before: float) -> Settings:
+def with_more_sweeps(settings: VBD, left: float, before: float) -> VBD:
     """Those of the next attempt: twice the sweeps, or plain ones where more with corrections have not helped.
 
     left, before: unbalanced() of the last two runs.
     """
     if settings.coarse is not None and not is_balanced(left) and left > STALLED * before:
-        return replace(settings, coarse=None, relaxation=1.0)
+        return replace(settings, subspace="rigid", relaxation=1.0)
     return replace(settings, sweeps=2 * settings.sweeps + 1)
 
 
-def unreached(settings: Settings, left: float) -> str:
+def unreached(settings: VBD, left: float) -> str:
     return f"no reference could be reached: {settings} leaves {percent(left)} of its forces unbalanced"

@@ -22,7 +22,7 @@ HELPS = {"K": "more sweeps", "2 K": "more sweeps", "h": "smaller steps", "h/2": 
 
 
 @dataclass(frozen=True)
-class GradientCheck:
+class GradientTest:
     """How far the gradient with respect to a parameter is from what it should be, see :func:`refine`: shares of the
     gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
 
@@ -61,7 +61,7 @@ class Refinement:
     before: float | None
     tolerance: float
     mesh: float | None = None
-    gradients: tuple[GradientCheck, ...] = ()
+    gradients: tuple[GradientTest, ...] = ()
     left: float = 0.0
     sweeps: int = 2
 
@@ -247,7 +247,7 @@ class _Runs:
             self.sweeps *= 2
             self.others ^= left > STALLED * before
 
-    def check(self, number: int, loss: float) -> GradientCheck:
+    def check(self, number: int, loss: float) -> GradientTest:
         """The gradient with respect to a parameter, in units of its elements."""
         parameter = self.parameters[number]
         kept, own = parameter.detach().clone(), self.gradients["own"][number]
@@ -273,7 +273,7 @@ class _Runs:
                 better = unit * gradients[number]
                 off, size = float((better - scaled).norm()), float(better.norm())
                 finer[name] = share(off, max(size, steepest / float(way.norm())))
-        return GradientCheck(finer, {name: share(abs(slope - along), steepest) for name, slope in slopes.items()})
+        return GradientTest(finer, {name: share(abs(slope - along), steepest) for name, slope in slopes.items()})
 
     def _moved(self, parameter: Tensor, value: Tensor) -> float:
         """The loss with another value of a parameter."""

@@ -19,12 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..model.anderson import Anderson
+from ..model.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
+from ..model.solver import VBD
 from ..model.warnings import is_nearly_incompressible
-from ..step.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
 from .pilots import FRAMES, Pilot, Pilots, changes, relative
+from .prediction import Candidate, Prediction, on
 from .reference import MOST_SWEEPS, is_balanced, takes_corrections, unreached, with_more_sweeps
-from .settings import Candidate, Prediction, Settings
 
 LONGEST = 0.1  # [s] of the first time step of the ladder
 MOST_STEPS = 2**17
@@ -42,45 +42,45 @@ ROUNDING = 1e-3  # of the wanted error: runs of the ladder below that, as of a f
 SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it is held against show less than there is
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
 WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
-ERROR, PATIENCE = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
+ERROR, TIME_BUDGET = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
+PLAIN = VBD(1.0, 1)
 STUCK = 6  # levels of the ladder that do not come closer: there is no limit to find
 
 
-def found(pilots: Pilots, error: float, patience: float) -> Settings:
+def found(pilots: Pilots, error: float, time_budget: float) -> VBD:
     """The settings that take the least time and keep the error, with their Prediction."""
-    return _Search(pilots, error, patience).run()
+    return _Search(pilots, error, time_budget).run()
 
 
-def start_of(pilots: Pilots) -> Settings:
+def start_of(pilots: Pilots) -> VBD:
     """What the ladder runs with: well converged and never far from the fastest."""
     model = pilots.model
-    if not takes_corrections(model):
-        return Settings(1.0, 40, SDIRK2())
-    if model.contact is not None or model.friction is not None:
-        return Settings(1.0, 20, SDIRK2())
-    return Settings(1.0, 8, SDIRK2(), relaxation=1.5 if _may_over_relax(pilots) else 1.0, coarse="auto")
+    if not takes_corrections(model, PLAIN):
+        return VBD(1.0, 40, integrator=SDIRK2())
+    if model.touches:
+        return VBD(1.0, 20, integrator=SDIRK2())
+    relaxation = 1.5 if _may_over_relax(pilots) else 1.0
+    return VBD(1.0, 8, integrator=SDIRK2(), relaxation=relaxation, subspace="coarse")
 
 
-def candidates_of(pilots: Pilots) -> list[Settings]:
+def candidates_of(pilots: Pilots) -> list[VBD]:
     """What might be faster than the ladder's settings, the likeliest first."""
     model, sdirk, bdf, euler = pilots.model, SDIRK2(), BDF2(), ImplicitEuler()
-    touches = model.contact is not None or model.friction is not None
-    free = not touches and takes_corrections(model) and _may_over_relax(pilots)
+    touches, corrects = model.touches, takes_corrections(model, PLAIN)
+    free = not touches and corrects and _may_over_relax(pilots)
     over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
 
-    def plain(scheme: Integrator, *sweeps: int) -> list[Settings]:
-        return [Settings(1.0, k, scheme, relaxation=over) for k in sweeps]
+    def plain(scheme: Integrator, *sweeps: int) -> list[VBD]:
+        return [VBD(1.0, k, integrator=scheme, relaxation=over) for k in sweeps]
 
-    def coarse(scheme: Integrator, *sweeps: int) -> list[Settings]:
-        return [Settings(1.0, k, scheme, relaxation=over_coarse, coarse="auto") for k in sweeps]
+    def coarse(scheme: Integrator, *sweeps: int) -> list[VBD]:
+        return [VBD(1.0, k, integrator=scheme, relaxation=over_coarse, subspace="coarse") for k in sweeps]
 
     out = []
-    if takes_corrections(model) and not touches:
+    if corrects and not touches:
         out += [*coarse(sdirk, 2), *coarse(euler, 2), *coarse(bdf, 2), *coarse(sdirk, 5)]
     out += [*plain(sdirk, 10), *plain(euler, 5), *plain(bdf, 5), *plain(sdirk, 5, 20), *plain(bdf, 10, 20),
             *plain(euler, 10, 20)]  # fmt: skip
-    if takes_corrections(model) and touches:
-        out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
 
 
@@ -93,8 +93,8 @@ def _may_over_relax(pilots: Pilots) -> bool:
 
 
 class _Search:
-    def __init__(self, pilots: Pilots, error: float, patience: float) -> None:
-        self.pilots, self.error, self.patience = pilots, error, patience
+    def __init__(self, pilots: Pilots, error: float, time_budget: float) -> None:
+        self.pilots, self.error, self.time_budget = pilots, error, time_budget
         self.order = 1.0
         # impacts come early or late by up to a step: nothing can be extrapolated until steps resolve them
         self.smooth = not (pilots.model.touches or pilots.model.floor is not None)
@@ -107,7 +107,7 @@ class _Search:
         others = ", quantity and gradient" if pilots.wrt is not None else " and quantity" if pilots.quantity else ""
         self.of = f"(the largest of motion{others})" if others else "of the motion"
 
-    def run(self) -> Settings:
+    def run(self) -> VBD:
         reached, why = self._climb()
         if reached:
             self._rank()
@@ -118,19 +118,19 @@ class _Search:
         else:
             least = (math.inf, self.ladder[-1] if self.ladder else None)
             error, now = min(self.estimates, key=lambda e: e[0], default=least)
-            settings = start_of(self.pilots).on(FRAMES, self.pilots.duration) if now is None else now.settings
+            settings = on(start_of(self.pilots), FRAMES, self.pilots.duration) if now is None else now.settings
             best = Candidate(settings, error, math.inf if now is None else now.seconds, now is not None)
             self.proven = [Candidate(r.settings, e, r.seconds, True) for e, r in self.estimates if r is not now]
-        once = {str(c.settings): c for c in sorted(self.proven, key=lambda c: -c.seconds)}  # of two runs the faster
-        once.pop(str(best.settings), None)
-        tried = {str(best.settings), *once}
-        rest = [*once.values(), *(c for c in self.predicted if str(c.settings) not in tried)]
+        once = {str(c.solver): c for c in sorted(self.proven, key=lambda c: -c.seconds)}  # of two runs the faster
+        once.pop(str(best.solver), None)
+        tried = {str(best.solver), *once}
+        rest = [*once.values(), *(c for c in self.predicted if str(c.solver) not in tried)]
         others = tuple(sorted(rest, key=lambda c: c.seconds))
         p = self.pilots
         told = Prediction(
             self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, self.of
         )
-        return replace(best.settings, dtype=p.model.dtype, predicted=told)
+        return replace(best.solver, prediction=told)
 
     def _reason(self) -> str:
         last, before = (run.settings for run in self.ladder[:-3:-1])
@@ -139,8 +139,8 @@ class _Search:
             f"the fastest of the runs below that keep the error; their errors are distances to {limit}, "
             f"and {self.uncertain:.1g} by which that may be off"
         )
-        if self.pilots.spent > 0.9 * self.patience:
-            why += f"; {self.patience:g} s of pilot runs (patience) ended the search for faster ones"
+        if self.pilots.spent > 0.9 * self.time_budget:
+            why += f"; {self.time_budget:g} s of pilot runs (time_budget) ended the search for faster ones"
         return why
 
     # --- the ladder ---------------------------------------------------------------------------------------------------
@@ -157,8 +157,8 @@ class _Search:
                 return False, f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
             if steps > MOST_STEPS:
                 return False, f"{MOST_STEPS} steps are not enough"
-            if p.spent > self.patience:
-                return False, f"{self.patience:g} s of pilot runs were not enough (patience)"
+            if p.spent > self.time_budget:
+                return False, f"{self.time_budget:g} s of pilot runs were not enough (time_budget)"
             now = p.run(settings, steps)
             if now.x is None and not self.ladder and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
                 steps *= 2
@@ -225,7 +225,7 @@ class _Search:
         now, first = (p.lost(run, 0.5 * p.duration) for run in (last, self.ladder[0]))
         return 0.0 if now < WHOLE * first else now
 
-    def _with_more_sweeps(self, settings: Settings, left: float, before: float) -> Pilot | None:
+    def _with_more_sweeps(self, settings: VBD, left: float, before: float) -> Pilot | None:
         """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the
         error: with the sweeps of the ladder it might come close to a limit of its own. Or if the last run left forces
         over; then with plain sweeps where more of them with corrections have left as much."""
@@ -294,7 +294,7 @@ class _Search:
         predict = self._by_quarter(level, near) if compares else self._by_whole
         if self.smooth and not compares:
             self.order = max(ORDERS)  # that of rounding means nothing
-        self.plans: list[tuple[float, int, Settings]] = []
+        self.plans: list[tuple[float, int, VBD]] = []
         for number, settings in enumerate(candidates_of(p)):
             allowed = self._allowed(self._least(), more=number < LIKELY)
             if p.spent - self.climbed > 0.6 * (allowed - self.climbed):
@@ -303,7 +303,7 @@ class _Search:
             if math.isfinite(error):
                 self._plan(settings, near.steps, error, per_step)
 
-    def _by_quarter(self, level: float, near: Pilot) -> Callable[[Settings, int], tuple[float, float]]:
+    def _by_quarter(self, level: float, near: Pilot) -> Callable[[VBD, int], tuple[float, float]]:
         """The error of settings, and the time of a step, by the quarter of the duration in which steps matter most."""
         p, last, before = self.pilots, self.ladder[-1], self.ladder[-2]
         assert last.x is not None and before.x is not None
@@ -311,13 +311,13 @@ class _Search:
         target = last.x[quarter + 1]
         scale = self._of_quarter(p.run(near.settings, near.steps, quarter, last), target)
 
-        def predict(settings: Settings, steps: int) -> tuple[float, float]:
+        def predict(settings: VBD, steps: int) -> tuple[float, float]:
             run = p.run(settings, steps, quarter, last)
             return level * self._of_quarter(run, target) / max(scale, 1e-300), run.seconds / steps
 
         return predict
 
-    def _by_whole(self, settings: Settings, steps: int) -> tuple[float, float]:
+    def _by_whole(self, settings: VBD, steps: int) -> tuple[float, float]:
         """The same by the whole duration: after an impact that no step resolves a quarter says nothing of the rest."""
         run = self.pilots.run(settings, steps)
         if run.x is None:
@@ -334,16 +334,16 @@ class _Search:
     def _of_quarter(self, run: Pilot, target: Tensor) -> float:
         return math.inf if run.x is None else float((run.x[-1] - target).square().mean().sqrt())
 
-    def _plan(self, settings: Settings, steps: int, error: float, per_step: float) -> None:
+    def _plan(self, settings: VBD, steps: int, error: float, per_step: float) -> None:
         order = self._order_of(settings)
         more = (max(error, 1e-300) / self.aim) ** (1 / order)
         wanted = self._rounded(steps * more)
         if wanted <= MOST_STEPS:
             self.plans.append((wanted * per_step, wanted, settings))
-            planned = settings.on(wanted, self.pilots.duration)
+            planned = on(settings, wanted, self.pilots.duration)
             self.predicted.append(Candidate(planned, self.aim + self.uncertain, wanted * per_step, False))
 
-    def _order_of(self, settings: Settings) -> float:
+    def _order_of(self, settings: VBD) -> float:
         return min(self.order, 1.0) if isinstance(settings.integrator, ImplicitEuler) else self.order
 
     @staticmethod
@@ -356,7 +356,7 @@ class _Search:
 
     def _allowed(self, seconds: float, more: bool) -> float:
         """How long all runs may take [s] for settings that take ``seconds``."""
-        return min(max(COSTS * seconds, FREE, MORE * self.climbed if more else 0.0), self.patience)
+        return min(max(COSTS * seconds, FREE, MORE * self.climbed if more else 0.0), self.time_budget)
 
     def _prove(self) -> None:
         p = self.pilots

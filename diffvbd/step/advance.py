@@ -14,12 +14,10 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import none_taken, run_sweeps
 from ..adjoint.implicit import global_sweep
-from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..adjoint.sweep import fused_step
-from ..model.model import Model
-from ..model.warnings import warn_of_erratic_gradients
+from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep, check_adjoint
+from ..adjoint.sweep import fused_step, sweep
+from ..model.system import System
 from ..scopes import checking, recorders
 from ..tuples import replaced
 from .arguments import (
@@ -37,7 +35,7 @@ from .predict import Begun, begin
 
 
 def advance(
-    model: Model,
+    model: System,
     x: Tensor,
     v: Tensor,
     prepared: Prepared,
@@ -54,7 +52,7 @@ def advance(
     adjoint = check_adjoint(adjoint)
     gravity = acceleration_of(gravity, x)
     where = collider_state(model, x, colliders, colliders_before)
-    if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
+    if isinstance(adjoint, TapedSweep) and x.is_cuda and _fuses(model, force, gravity):
         prescribed = None if prescribed is None else broadcastable("prescribed", prescribed, x)
         return _fused(model, x, v, gravity, prescribed, prepared, adjoint)
     begun = begin(model, x, v, prepared, force, gravity, prescribed)
@@ -73,7 +71,7 @@ def advance(
 
 
 def swept(
-    model: Model,
+    model: System,
     begun: Begun,
     prepared: Prepared,
     given: dict[str, Any],
@@ -88,8 +86,6 @@ def swept(
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())
     policy = _tape_policy(model, (*fields, *more), settings, adjoint)
-    if isinstance(adjoint, ReverseSweep) and not torch.compiler.is_compiling() and _is_differentiated((*fields, *more)):
-        warn_of_erratic_gradients(model, settings.sweeps)
     debug_step = index if checking() else -1
     try:
         if colliders is not None:
@@ -101,19 +97,17 @@ def swept(
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            done = run_sweeps(model, fields, settings, tape_policy=policy, debug_step=debug_step)
-            if done.corrections:
-                for found in recorders("coarse"):
-                    found.append(lengths_of(model, torch.cat(done.corrections, 1)))
-            if model.acceleration is not None and prepared.unrolled is None:
-                for found in recorders("anderson"):
-                    found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
-            return done.x
+            end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                                        debug_step=debug_step)  # fmt: skip
+            if corrections.numel():
+                for found in recorders("subspace"):
+                    found.append(lengths_of(model, corrections))
+            return end
     except ValueError as error:
         raise named(model, error, given) from None  # the frames of operators say nothing to who gave the argument
 
 
-def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
+def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
@@ -121,7 +115,6 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
         simple
         and not model.corrects
         and model.coarse is None
-        and model.acceleration is None
         and model.starts_from == "predictor"
         and not ops.TET_READS_X_PREV
     )
@@ -131,13 +124,13 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
 
 
 def _fused(
-    model: Model,
+    model: System,
     x: Tensor,
     v: Tensor,
     gravity: Tensor,
     prescribed: Tensor | None,
     prepared: Prepared,
-    adjoint: ReverseSweep,
+    adjoint: TapedSweep,
 ) -> tuple[Tensor, Tensor]:
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     prescribed = None if prescribed is None else ops.broadcast(prescribed, shape).reshape(flat)
@@ -154,8 +147,8 @@ def _is_differentiated(tensors: Sequence[Tensor | None]) -> bool:
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
-def _tape_policy(model: Model, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
-    if not (isinstance(adjoint, ReverseSweep) and _is_differentiated(tensors)):
+def _tape_policy(model: System, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
+    if not (isinstance(adjoint, TapedSweep) and _is_differentiated(tensors)):
         return ops.NO_TAPE
     x = tensors[0]
     assert x is not None

@@ -11,7 +11,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.contact_potential import ContactPotential, StepContact
 from ..adjoint.potential import IncrementalPotential
-from ..model.model import Model
+from ..model.system import System
 from .arguments import Prepared, acceleration_of, collider_state
 from .predict import Begun, begin
 
@@ -24,7 +24,7 @@ Norm = Callable[[Tensor], Tensor]  # [B, V, n] -> [B, groups]
 
 
 def contact_of_step(
-    model: Model, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None
+    model: System, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None
 ) -> StepContact | None:
     """Contact of a step that has begun; where: collider points at its start and at its end, None without contact."""
     if where is None:
@@ -35,7 +35,7 @@ def contact_of_step(
 
 
 def potential_of_step(
-    model: Model, x: Tensor, begun: Begun, prepared: Prepared, contact: StepContact | None
+    model: System, x: Tensor, begun: Begun, prepared: Prepared, contact: StepContact | None
 ) -> IncrementalPotential:
     """The potential of a step that has begun, at x [B, V, 3], relative to the step's origin where there is one."""
     fields = begun.fields(model, prepared)
@@ -49,7 +49,7 @@ def of_scenes(values: Tensor) -> Tensor:
     return ops.sum_to(values.square(), (len(values), 1, 1))[..., 0].sqrt()
 
 
-def of_bodies(model: Model) -> Norm:
+def of_bodies(model: System) -> Norm:
     """2-norms over each body, [B, V, n] -> [B, bodies], bodies as in ``model.body``."""
     labels = model.derived("labels", lambda: model.body)
     count = model.derived("labelled", lambda: int(labels.max()) + 1 if labels.numel() else 0)
@@ -68,7 +68,7 @@ def left_over(at: IncrementalPotential, norm: Norm) -> tuple[Tensor, Tensor]:
     return norm(inertia + forces), norm(inertia) + norm(forces)
 
 
-def left_of_solve(model: Model, before: tuple[Tensor, Tensor], end: Tensor, prepared: Prepared, given: dict[str, Any]
+def left_of_solve(model: System, before: tuple[Tensor, Tensor], end: Tensor, prepared: Prepared, given: dict[str, Any]
                   ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """The same of a solve that was executed, 0 left where that is no more than rounding leaves: of each scene, with
     contact of each body.
@@ -117,5 +117,5 @@ def friction_left_over(at: IncrementalPotential) -> Tensor:
     size = normal.norm(dim=-1, keepdim=True)
     along = (left * normal).sum(-1, keepdim=True) / torch.where(size > 0, size.square(), 1.0)
     force = sums.index_add(1, labels, left - along * normal).norm(dim=-1)
-    most = at.step_contact._number("friction.coefficient")[:, None] * (acts * size)[..., 0]
+    most = at.step_contact._number("friction")[:, None] * (acts * size)[..., 0]
     return share(force, torch.zeros_like(force).index_add(1, labels, most))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 
 from .. import ops
-from ..adjoint.anderson import run_sweeps
-from ..model.model import Model
+from ..adjoint.sweep import sweep
+from ..model.system import System
 from ..tuples import replaced
 
 
-def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
+def check_on_cpu(model: System, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
     """The CPU repeats a step and names what is wrong with it."""
     twin = model._on_cpu()
     settings = replaced(settings, sizes=twin._sizes, launch=())
@@ -20,4 +20,4 @@ def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSetti
             plan = twin._coarse_plan  # whose positions are those of the CPU
             settings = replaced(settings, coarse=replaced(plan.sizes, begun=settings.coarse.begun))
             here = replaced(here, coarse_plan=plan.plan, coarse_weights=plan.weights)
-        run_sweeps(twin, here, settings, tape_policy=ops.NO_TAPE, debug_step=index)
+        sweep(here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import COARSE_FIELDS, combinations_of, run_sweeps
 from ..adjoint.sweep import sweep
-from ..model.anderson import moving_vertices
 from ..model.model import Model
+from ..model.moving import moving_vertices
+from ..model.system import System
 from ..ops.detect import segment_sum
 from ..tuples import replaced
 from .arguments import Prepared, acceleration_of
@@ -19,7 +19,7 @@ from .coarse import lengths_of, with_corrections
 from .predict import Begun, begin
 
 LARGEST_RATIO = 0.98  # of two changes: what shrinks more slowly cannot be told from what does not shrink
-OF_ACCELERATED = 0.4  # error over the last change: combinations leave changes that follow no ratio
+COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 
 
 class ErrorEstimate(NamedTuple):
@@ -33,7 +33,7 @@ class ErrorEstimate(NamedTuple):
     Attributes:
         change: d, between the last two iterates [m], shape [..., bodies].
         ratio: rho, d over the change before it, at most 0.98 [-], shape [..., bodies].
-        error: d rho / (1 - rho), in accelerated steps 0.4 d: the estimated distance to the converged step [m], shape
+        error: d rho / (1 - rho): the estimated distance to the converged step [m], shape
             [..., bodies]. Often two thirds too small: take three times as much to be safe. Far too small for
             motions that sweeps hardly change.
         relative: ``error`` over the motion of the body in the step [-], shape [..., bodies].
@@ -56,7 +56,7 @@ def check_estimable(model: Model, name: str) -> None:
         raise NotImplementedError(f"{name}: the error of a step with contact or friction is not estimated")
 
 
-def error_of(model: Model, x: Tensor, v: Tensor, prepared: Prepared, *, force: Any, gravity: Any, prescribed: Any
+def error_of(model: System, x: Tensor, v: Tensor, prepared: Prepared, *, force: Any, gravity: Any, prescribed: Any
              ) -> ErrorEstimate:  # fmt: skip
     """Sweeps the step once more, without gradients. Arguments as of advance()."""
     lead = x.shape[:-2]
@@ -71,10 +71,7 @@ def error_of(model: Model, x: Tensor, v: Tensor, prepared: Prepared, *, force: A
         changes = [bodies.rms(b - a) for a, b in zip(states[:-1], states[1:], strict=True)]
         change = changes[-1] if changes else unknown
         ratio = _quotient(change, changes[-2]).clamp(max=LARGEST_RATIO) if len(changes) > 1 else unknown
-        if combinations_of(model, prepared.settings.sweeps):
-            error = OF_ACCELERATED * change
-        else:
-            error = change * ratio / (1 - ratio)
+        error = change * ratio / (1 - ratio)
         relative = _quotient(error, bodies.rms(states[-1] - begun.x_prev))
         lengths = x.new_empty((shape[0], 0, shape[1]))
         if corrections:
@@ -82,7 +79,7 @@ def error_of(model: Model, x: Tensor, v: Tensor, prepared: Prepared, *, force: A
         return ErrorEstimate(*(t.reshape(*lead, *t.shape[1:]) for t in (change, ratio, error, relative, lengths)))
 
 
-def of_steps(estimates: list[ErrorEstimate], model: Model, x: Tensor, sweeps: int) -> ErrorEstimate:
+def of_steps(estimates: list[ErrorEstimate], model: System, x: Tensor, sweeps: int) -> ErrorEstimate:
     """Those of several steps, [steps, ...]; x: the state [..., V, 3] before the first."""
     if estimates:
         return ErrorEstimate(*(torch.stack(tensors) for tensors in zip(*estimates, strict=True)))
@@ -97,16 +94,12 @@ def _quotient(a: Tensor, b: Tensor) -> Tensor:
     return torch.where((a == 0) & (b == 0), 0, a / b)
 
 
-def _iterates(model: Model, begun: Begun, prepared: Prepared) -> tuple[list[Tensor], list[Tensor]]:
+def _iterates(model: System, begun: Begun, prepared: Prepared) -> tuple[list[Tensor], list[Tensor]]:
     """The last iterates of the step [B, V, 3], at most three, the end of the sweeps last; and what coarse corrections
     did, as sweep() returns it."""
     fields, settings = begun.fields(model, prepared), prepared.settings
     if prepared.coarse is not None:
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
-    if combinations_of(model, settings.sweeps):
-        done = run_sweeps(model, fields, settings, tape_policy=ops.NO_TAPE)
-        return [*done.before, done.x], done.corrections
-
     coarse = settings.coarse if prepared.coarse is not None else ()
     before, parts = _parts(settings.sweeps, coarse.every if coarse else None)
     over = replaced(settings, numbers=replaced(settings.numbers, last_relaxation=settings.numbers.relaxation))
@@ -158,11 +151,11 @@ class _Bodies(NamedTuple):
         return (segment_sum(squares, self.order, self.ptr)[..., 0] / self.size).sqrt()
 
 
-def _bodies_of(model: Model) -> _Bodies:
+def _bodies_of(model: System) -> _Bodies:
     return model.derived("bodies_that_move", lambda: _find_bodies(model))
 
 
-def _find_bodies(model: Model) -> _Bodies:
+def _find_bodies(model: System) -> _Bodies:
     of = moving_vertices(model.tets.cpu(), model._pinned.cpu())
     count = of.ptr.diff()
     corrected = torch.arange(len(count))

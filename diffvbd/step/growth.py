@@ -23,16 +23,17 @@ from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
 from ..mask import EXACT_BLOCK
 from ..mesh import TetMesh
+from ..model.integrators import Integrator
 from ..model.model import Model
-from ..model.replaced import replaced_arguments
+from ..model.system import System, system_of
 from ..model.tet_shapes import height_of_tets
 from ..model.warnings import warn_of_over_relaxation, warn_of_thin_tets, warn_of_units
 from ..said import is_silent, page, silence, warn
 from ..scopes import looks_at, unheard
 from ..tuples import replaced
 from .advance import advance
-from .arguments import Prepared, acceleration_of, prepare
-from .integrators import Integrator, take
+from .arguments import Prepared, acceleration_of, material_of, prepare
+from .integrators import take
 from .predict import begin
 
 GROWS = 1.02  # times in a step: a hundred steps make seven of it
@@ -63,11 +64,11 @@ def proven() -> Iterator[None]:
 class _Part(NamedTuple):
     """What is measured of a Model: another one, elastic and on the CPU in float64, and which tets it has."""
 
-    model: Model
+    model: System
     tets: np.ndarray | None  # rows of the Model's; None: all
 
 
-def warn_of_sweeps(model: Model, prepared: Prepared, integrator: Integrator) -> None:
+def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) -> None:
     """Warns (UserWarning) where the sweeps of steps are too few for a mesh and its material. On CUDA, where moduli
     would be waited for, they are not looked at outside debug_checks()."""
     if not (looks_at(prepared.mu) and looks_at(prepared.lam)) or is_silent():
@@ -83,7 +84,7 @@ def warn_of_sweeps(model: Model, prepared: Prepared, integrator: Integrator) -> 
         warn(message)
 
 
-def growth_message(model: Model, prepared: Prepared, integrator: Integrator) -> str:
+def growth_message(model: System, prepared: Prepared, integrator: Integrator) -> str:
     """What there is to say of steps that amplify vibrations; measured once for such arguments. Moduli are read."""
     h, sweeps = prepared.time_step_and_sweeps
     if not (0 < sweeps <= MOST_SWEEPS and model.num_tets and model.num_active):
@@ -108,7 +109,7 @@ def _mark(modulus: Tensor) -> tuple[float, ...]:
     return tuple(round(ALIKE * math.log2(abs(n))) if 0 < abs(n) < math.inf else 0.0 for n in numbers)
 
 
-def _message(model: Model, mu: Tensor, lam: Tensor, h: float, sweeps: int, integrator: Integrator) -> str:
+def _message(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, integrator: Integrator) -> str:
     if not bool((mu > 0).all() and (mu + lam > 0).all() and torch.isfinite(mu + lam).all()):  # perhaps refused later
         return ""
     crossed = _crossed(model, mu, lam, h)
@@ -133,8 +134,8 @@ def _message(model: Model, mu: Tensor, lam: Tensor, h: float, sweeps: int, integ
     calmer = (r for r in CALMER if r < model.relaxation)
     take_these += [f"relaxation={r:g}" for r in calmer if measure(part.model, sweeps=sweeps, relaxation=r) <= 1][:1]
     corrects = model.coarse is None and model.saturation is None and model.energy_mask & EXACT_BLOCK
-    if corrects and measure(part.model.replace(coarse="auto"), sweeps=sweeps) <= 1:
-        take_these.append('coarse="auto"')
+    if corrects and measure(part.model.with_solver(subspace="coarse"), sweeps=sweeps) <= 1:
+        take_these.append('subspace="coarse"')
     advice = f"{', '.join(take_these)} or a shorter time step" if take_these else "a shorter time step"
     return (
         f"sweeps: {sweeps} with {type(integrator).__name__}(), relaxation={model.relaxation:g} and time_step = {h:.3g} "
@@ -142,13 +143,13 @@ def _message(model: Model, mu: Tensor, lam: Tensor, h: float, sweeps: int, integ
     )
 
 
-def _crossed(model: Model, mu: Tensor, lam: Tensor, h: float) -> Tensor:
+def _crossed(model: System, mu: Tensor, lam: Tensor, h: float) -> Tensor:
     """How many of each tet a pressure wave crosses in a step, where most [T]."""
     speed = ((lam + 2 * mu).amax(0) / model._density.double().cpu()).clamp(min=0).sqrt()
     return h * speed / torch.from_numpy(height_of_tets(model))
 
 
-def _part_of(model: Model, crossed: Tensor) -> _Part:
+def _part_of(model: System, crossed: Tensor) -> _Part:
     plain = model.dtype == torch.float64 and model.device.type == "cpu" and len(model.energies) == 1
     if model.num_tets <= MOST_TETS:
         if plain:
@@ -171,16 +172,14 @@ def _part_of(model: Model, crossed: Tensor) -> _Part:
     return model.derived(f"elastic about {worst}", build)
 
 
-def _elastic(model: Model, mesh: TetMesh, pinned: Tensor, rows: np.ndarray | None) -> Model:
+def _elastic(model: System, mesh: TetMesh, pinned: Tensor, rows: np.ndarray | None) -> System:
     density = model._density.cpu()
-    own = [e for e in model.energies if isinstance(e, StableNeoHookean)]
-    changes = {"energies": own, "colliders": (), "dtype": torch.float64, "device": "cpu", "pinned": pinned,
-               "density": density if rows is None else density[rows]}  # fmt: skip
     with silence():  # nobody has made this one
-        return Model(mesh, **replaced_arguments(model, changes))
+        own = Model(mesh, density if rows is None else density[rows], pinned, (StableNeoHookean(),))
+    return system_of(own, model.solver)
 
 
-def growth(model: Model, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, integrator: Integrator,
+def growth(model: System, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, integrator: Integrator,
            relaxation: float | None = None) -> float:  # fmt: skip
     """How many times noise about the rest shape has grown in a step, after some steps [-], the worst of scenes; 0:
     nothing is left of it.
@@ -188,8 +187,7 @@ def growth(model: Model, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: i
     model: Elastic, in float64 on the CPU.  mu, lam: [1 | B, 1 | T].
     """
     lead = (max(len(mu), len(lam)),)
-    prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=None, density=None,
-                       parameters=None)  # fmt: skip
+    prepared = prepare(model, lead, material_of(mu=mu, lam=lam), time_step=time_step, sweeps=sweeps)
     if relaxation is not None:
         numbers = prepared.settings.numbers
         numbers = replaced(numbers, relaxation=relaxation, last_relaxation=min(numbers.last_relaxation, relaxation))

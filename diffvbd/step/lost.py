@@ -8,23 +8,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..model.model import Model
+from ..model.integrators import Integrator
+from ..model.system import System
 from ..ops import broadcast
 from ..said import is_silent, page, warn
 from ..scopes import looks_at
 from .arguments import Prepared
 from .growth import growth_message
-from .integrators import Integrator
 
 FAR = 1e3  # sizes of the Model at rest
 
 
-def size_of(model: Model) -> float:
+def size_of(model: System) -> float:
     """Diagonal of the Model's box at rest [m]."""
     return model.derived("size", lambda: float((model._rest_points.amax(0) - model._rest_points.amin(0)).norm()))
 
 
-def reach_of(model: Model, start: tuple[Tensor, ...], x: Tensor, gravity: Any, duration: float) -> Tensor:
+def reach_of(model: System, start: tuple[Tensor, ...], x: Tensor, gravity: Any, duration: float) -> Tensor:
     """How far the farthest vertex is from where it began, over the Model's size, beside what its velocity, gravity and
     its pins may have given it [-]."""
     x0, v0 = (t.detach() for t in start)
@@ -36,7 +36,7 @@ def reach_of(model: Model, start: tuple[Tensor, ...], x: Tensor, gravity: Any, d
     return (away - carried) / max(size_of(model), torch.finfo(x.dtype).tiny)
 
 
-def notice_loss(model: Model, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any, end: Tensor) -> None:
+def notice_loss(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any, end: Tensor) -> None:
     """Warns (UserWarning) where a step made one by one ends at positions that are not finite, or spread over more than
     FAR sizes of the Model; on the CPU. v: Before the step.
 
@@ -55,7 +55,7 @@ def notice_loss(model: Model, prepared: Prepared, integrator: Integrator, v: Ten
              f"{fault_of(model, prepared, integrator, v, force)}; " + page("numerics.md"))  # fmt: skip
 
 
-def fault_of(model: Model, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any) -> str:
+def fault_of(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any) -> str:
     """What made a step lose its bounds, and what to do. v: Before it."""
     with torch.no_grad():
         if isinstance(force, Tensor):

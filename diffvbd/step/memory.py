@@ -12,12 +12,12 @@ from .. import ops
 from ..adjoint.sweep import is_out_of_memory
 from ..mask import VERTEX_ENERGIES
 from ..model.coarse_plan import TILE
-from ..model.model import Model
+from ..model.system import System
 from ..ops import regimes
 
 
 @contextlib.contextmanager
-def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
+def out_of_memory_named(model: System, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
     """Says of a step that does not fit the memory how much it wanted, and which tape would fit a CUDA device."""
     try:
         yield
@@ -31,7 +31,7 @@ def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, po
         chosen = next(name for name, code in _POLICIES.items() if code == policy)
         if not x.is_cuda:
             smaller = [f'"{name}" {size} bytes' for name, size in wanted.items() if size < wanted[chosen]]
-            advice = f", or a smaller ReverseSweep(tape=...): {', '.join(smaller)}" if smaller else ""
+            advice = f", or a smaller VBD(tape=...): {', '.join(smaller)}" if smaller else ""
             raise torch.OutOfMemoryError(
                 f'CPU out of memory: a step of {settings.sweeps} sweeps with tape="{chosen}" wanted {wanted[chosen]} '
                 f"bytes; use fewer sweeps or scenes{advice}"
@@ -39,7 +39,7 @@ def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, po
         free, _ = torch.cuda.mem_get_info(x.device)
         free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
         fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
-        advice = f"ReverseSweep(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
+        advice = f"VBD(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
         raise torch.OutOfMemoryError(
             f'CUDA out of memory: a step with tape="{chosen}" wanted {wanted[chosen]} bytes, {free} are free; {advice}'
         ) from error
@@ -49,7 +49,7 @@ _POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": op
 WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/bind/cuda/sweep.h
 
 
-def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
+def cuda_scratch(model: System, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
     """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
     corrects = model.coarse is not None
     launch = regimes.choose(model.num_vertices, model.num_colors, scenes, model.touches, corrects)

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from ..adjoint.contact_potential import ContactPotential
 from ..adjoint.potential import IncrementalPotential
-from ..model.model import Model
 from ..model.rest import shape_gradients
+from ..model.system import System
 from .arguments import Prepared, acceleration_of, collider_state
 from .balance import contact_of_step, of_bodies, potential_of_step, rounding, share
 from .integrators import Solve
@@ -51,7 +51,7 @@ class _Functions(NamedTuple):
     values: np.ndarray  # [n, f], zero where pinned
 
 
-def _functions(model: Model, body: int) -> _Functions:
+def _functions(model: System, body: int) -> _Functions:
     labels = model.body
     vertices = (labels == body).nonzero()[:, 0]
     rest = model._rest_points[vertices].double().cpu().numpy()
@@ -64,7 +64,7 @@ def _functions(model: Model, body: int) -> _Functions:
     return _Functions(vertices, tets, rest, left[:, size > DEPENDENT * size[0]])
 
 
-def _stiffness(model: Model, of: _Functions, mu: Tensor, lam: Tensor) -> np.ndarray:
+def _stiffness(model: System, of: _Functions, mu: Tensor, lam: Tensor) -> np.ndarray:
     """Q^T K Q at rest [N/m], [3 f, 3 f], the component first; mu, lam [1 | t]."""
     count, device = of.values.shape[1], mu.device
     values = torch.zeros(model.num_vertices, count, dtype=torch.float64, device=device)
@@ -84,7 +84,7 @@ def _stiffness(model: Model, of: _Functions, mu: Tensor, lam: Tensor) -> np.ndar
     return out.reshape(3 * count, 3 * count)
 
 
-def unsolved(model: Model, solve: Solve, x: Tensor, known: dict[tuple[int, int], np.ndarray]) -> Unsolved | None:
+def unsolved(model: System, solve: Solve, x: Tensor, known: dict[tuple[int, int], np.ndarray]) -> Unsolved | None:
     """Of the solve that ended a step at x [..., V, 3]; None where no more is left than rounding leaves.
 
     known: Stiffness of bodies, of a Model and material; filled.
@@ -115,7 +115,7 @@ def unsolved(model: Model, solve: Solve, x: Tensor, known: dict[tuple[int, int],
         return found if float(norm(left)[scene, body]) > float(rounding(at, norm)[scene, body]) else None
 
 
-def _of_body(model: Model, at: IncrementalPotential, prepared: Prepared, scene: int, body: int, left: Tensor,
+def _of_body(model: System, at: IncrementalPotential, prepared: Prepared, scene: int, body: int, left: Tensor,
              forced: Tensor, pushed: bool, known: dict[tuple[int, int], np.ndarray]) -> Unsolved:  # fmt: skip
     of = model.derived(f"smooth functions of body {body}", lambda: _functions(model, body))
     rows, q, count = of.vertices, of.values, of.values.shape[1]

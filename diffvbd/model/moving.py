@@ -1,44 +1,16 @@
-"""Anderson acceleration of the sweeps of a step: what a Model is asked for, and its bodies as the checks read them."""
+"""The connected bodies that move, as what decides by their potentials takes them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..checks import check_count
 from ..tuples import replaced
 from .bodies import connected
 from .coarse_plan import ROW, in_blocks
 from .rest import rest_metric
-
-MOST = 10  # differences: more fit the noise of the last ones
-
-
-@dataclass(frozen=True)
-class Anderson:
-    """Anderson acceleration: a step goes on from the combination of its last iterates whose residuals cancel best.
-
-    An iterate is a coarse correction with its sweeps, or without coarse corrections one sweep; its residual is the way
-    that it goes. Each body combines its own. What would raise a body's incremental potential, or leave a vertex less
-    than a tenth of its gap to a plane, is not taken. Bodies that contact joins combine and decide together, and nothing
-    crosses. The first two iterates and the last are left as they are.
-
-    Args:
-        window: Differences of iterates that are combined, 1 to 10: 2 or 3 with coarse corrections, 5 without.
-
-    Raises:
-        ValueError, TypeError: where window is no integer from 1 to 10.
-
-    Source: Anderson (1965); Walker and Ni (2011), type II; docs/method.md, section 16.
-    """
-
-    window: int = 2
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "window", check_count("window", self.window, 1, maximum=MOST))
 
 
 class MovingBodies(NamedTuple):
