@@ -10,26 +10,22 @@ from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .inspect.debug import debug_checks
 from .inspect.diagnose import diagnose
 from .inspect.forces import reactions, stress
 from .inspect.gradcheck import check_gradients
-from .inspect.record import record
+from .inspect.record import debug_checks, record
 from .mesh import TetMesh
 from .model.coarse import CoarseSpace
-from .model.integrators import BDF2, SDIRK2, ImplicitEuler
+from .model.material import lame, young_poisson
 from .model.model import Model
-from .model.moduli import lame, young_poisson
-from .model.solver import VBD
-from .rollout.advise import advise
-from .rollout.budget import error_budget
-from .rollout.checkpoints import BinomialCheckpoints
+from .model.solver import BDF2, SDIRK2, VBD, ImplicitEuler
 from .rollout.checks import Checks
-from .rollout.converge import solve
-from .rollout.memory import memory
+from .rollout.memory import BinomialCheckpoints, memory
 from .rollout.refine import refine
 from .rollout.rollout import rollout
+from .rollout.solve import solve
 from .rollout.trajectory import per_step, step_average
+from .rollout.tune import advise, error_budget
 from .step.step import step, step_backward, step_forward
 
 __all__ = [

@@ -3,13 +3,12 @@
 from .inspect.diagnose import Diagnosis
 from .inspect.forces import Stress
 from .inspect.gradcheck import GradientCheck
-from .rollout.budget import ErrorBudget, Share
-from .rollout.converge import Solution
-from .rollout.prediction import Candidate, Prediction
 from .rollout.refine import GradientTest, Refinement
+from .rollout.solve import Solution
 from .rollout.trajectory import Trajectory
-from .step.estimate import ErrorEstimate
+from .rollout.tune import Candidate, ErrorBudget, Prediction, Share
 from .step.integrators import History
+from .step.residual import ErrorEstimate
 from .step.step import Tape
 
 __all__ = [

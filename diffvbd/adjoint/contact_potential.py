@@ -25,7 +25,7 @@ from ..contact.pair_forces import (
 )
 from ..model.inputs import parameter_of
 from ..model.system import System
-from ..reference.friction import smoothed
+from ..reference.energies import smoothed
 from .potential import IncrementalPotential
 
 

@@ -13,20 +13,22 @@ from torch.linalg import cross
 from ..checks import check_bool, check_broadcast, check_tensor, name_value
 from ..mask import ELASTIC
 from ..model.inputs import LOADS, MODULI, Given
-from ..model.integrators import ImplicitEuler
+from ..model.material import moduli_of
 from ..model.model import Model
-from ..model.moduli import moduli_of
-from ..model.solver import VBD
+from ..model.solver import VBD, ImplicitEuler
 from ..model.system import System, system_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
 from ..said import percent
 from ..said import warn as say
 from ..step.arguments import acceleration_of, check_prescribed, check_state, given_of, prepare, refuse_non_finite
-from ..step.balance import (
+from ..step.predict import begin
+from ..step.residual import (
     UNBALANCED,
     UNBALANCED_FRICTION,
+    ErrorEstimate,
     Norm,
     contact_of_step,
+    error_of,
     friction_left_over,
     left_over,
     of_bodies,
@@ -35,8 +37,6 @@ from ..step.balance import (
     rounding,
     share,
 )
-from ..step.estimate import ErrorEstimate, error_of
-from ..step.predict import begin
 from .wide import check_previous, wide, widen
 
 # Limits with their measurements in docs/numerics.md

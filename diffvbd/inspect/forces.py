@@ -17,8 +17,8 @@ from ..checks import fail, name_value
 from ..contact.pair_forces import NearPairs
 from ..energies import StableNeoHookean
 from ..model.inputs import COLLIDERS, Given
+from ..model.material import shape_gradients
 from ..model.model import Model
-from ..model.rest import shape_gradients
 from ..model.solver import VBD
 from ..scopes import looks_at
 from ..step.arguments import (

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any, Literal
 
+from .. import scopes
 from ..checks import fail, is_word
 from ..scopes import record_to
 
@@ -33,3 +34,18 @@ def record(kind: Literal["subspace", "contact", "integrator"]) -> Iterator[list[
     found: list[Any] = []
     with record_to(found, kind):
         yield found
+
+
+# --- debug_checks() ---------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def debug_checks(enabled: bool = True) -> Iterator[None]:
+    """Inside, a position that is not finite raises RuntimeError naming step, sweep, color, vertex and scene.
+
+    Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot
+    work with raise only here, because looking at them waits for the device. It holds for the thread or task that is
+    inside, and for the backward of what ran there; a step under torch.compile checks while any thread is inside.
+    """
+    with scopes.checks(enabled):
+        yield

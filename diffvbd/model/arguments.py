@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +12,10 @@ from .. import ops
 from ..checks import check_readable, fail, refuse_gradient, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
+from ..mesh import TetMesh
+from ..said import warn
 
+LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
 
 
@@ -83,3 +87,44 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
         wrong = density.reshape(-1)[~(torch.isfinite(density) & (density > 0)).reshape(-1)]
         fail("density", "finite numbers > 0 kg/m^3", float(wrong[0]))
     return density.expand(num_tets).clone()
+
+
+def warn_of(mesh: TetMesh, given: Any, pinned: Tensor, energies: tuple[Energy, ...]) -> None:
+    """Warns (UserWarning) of what is legal and seldom meant. ``given``: pinned as it was given."""
+    if size := _size_message(mesh):
+        warn(size)
+    if given is not None and mesh.num_vertices and not bool(pinned.any()):
+        warn(f"pinned: none of {mesh.num_vertices} vertices is pinned, so all are free, as with pinned=None")
+    if mesh.num_vertices and bool(pinned.all()):
+        warn(f"pinned: all {mesh.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
+    if not any(isinstance(e, StableNeoHookean) for e in energies) and mesh.num_tets:
+        warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
+
+
+def _size_message(mesh: TetMesh) -> str:
+    size = _largest_body(mesh)
+    if size > LARGE_BODY:
+        return (
+            f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs "
+            "mesh.transform(1e-3 * numpy.eye(3)), or --scale 0.001 on the command line"
+        )
+    if 0 < size < SMALL_BODY:
+        return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
+    return ""
+
+
+def _largest_body(mesh: TetMesh) -> float:
+    """Longest side of the bounding box of a body [m]."""
+    if not mesh.num_tets:
+        return 0.0
+    total = float(np.ptp(mesh.points, axis=0).max())
+    if total < SMALL_BODY:
+        return total
+    # a tet is never longer than its body, and most bodies are neither large nor small: no need to know them exactly
+    if total <= LARGE_BODY and float(np.ptp(mesh.points[mesh.tets[:100]], axis=1).max()) >= SMALL_BODY:
+        return total
+    order = np.argsort(mesh.body, kind="stable")
+    first = np.unique(mesh.body[order], return_index=True)[1]
+    points = mesh.points[order]
+    high, low = np.maximum.reduceat(points, first), np.minimum.reduceat(points, first)
+    return float((high - low).max())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -11,9 +11,6 @@ from ..checks import input_name
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES
 from ..mask import ELASTIC
-
-if TYPE_CHECKING:
-    from .model import Model
 
 MODULI = ("mu", "lam", "young", "poisson")
 LOADS = ("force", "gravity", "prescribed")
@@ -49,7 +46,7 @@ class Inputs(dict[str, Input]):
     __repr__ = __str__
 
 
-def inputs_of(model: Model) -> Inputs:
+def inputs_of(model: Any) -> Inputs:
     """The table of a Model's inputs."""
     rows = [
         Input("force", "[..., V, 3]", "N", "0", "Model"),
@@ -73,12 +70,12 @@ def inputs_of(model: Model) -> Inputs:
     return Inputs({row.name: row for row in rows})
 
 
-def parameters_of(model: Model) -> dict[str, tuple[Any, str, int]]:
+def parameters_of(model: Any) -> dict[str, tuple[Any, str, int]]:
     """Inputs that are parameters of energies: the energy, its key and its own dimensions."""
     return {input_name(e, key): (e, key, own) for e in model.parametric_energies for key, own in e.parameters.items()}
 
 
-def parameter_of(model: Model, given: dict[str, Tensor], name: str) -> Tensor | None:
+def parameter_of(model: Any, given: dict[str, Tensor], name: str) -> Tensor | None:
     """An input of an energy [1 | B, ...]: the given one, else the Model's constant; None where its energy is absent."""
     if name in given:
         return given[name]
@@ -94,7 +91,7 @@ class Given(NamedTuple):
     loads: dict[str, Any]  # force, gravity, prescribed, colliders, colliders_before; those not given are None
 
 
-def sorted_inputs(model: Model, inputs: dict[str, Any], gravity: Any = None) -> Given:
+def sorted_inputs(model: Any, inputs: dict[str, Any], gravity: Any = None) -> Given:
     """The keywords of a call by what they are; raises TypeError for one that the Model does not declare."""
     loads: dict[str, Any] = {"force": None, "gravity": gravity, "prescribed": None, "colliders": None,
                              "colliders_before": None}  # fmt: skip
@@ -117,7 +114,7 @@ def sorted_inputs(model: Model, inputs: dict[str, Any], gravity: Any = None) -> 
     return Given(material, parameters, loads)
 
 
-def _meant(model: Model, name: str) -> str:
+def _meant(model: Any, name: str) -> str:
     """The nearest input of any Model, and the energy that would declare it."""
     kinds = {
         input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters

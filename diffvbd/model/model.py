@@ -19,11 +19,10 @@ from ..lasting import lasting, lasting_tensors
 from ..mask import CONTACT
 from ..mesh import TetMesh
 from ..scopes import is_captured
-from .arguments import Energy, check_isolated, checked_device, checked_energies, per_tet_density
+from .arguments import Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
 from .bodies import find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
-from .rest import lumped_mass, rest_metric
-from .warnings import warn_of
+from .material import lumped_mass, rest_metric
 
 
 def _copy(name: str, text: str) -> Any:
@@ -99,7 +98,7 @@ class Model:
         device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
-        warn_of(self, pinned)
+        warn_of(mesh, pinned, mask, self.energies)
         self._place(dtype, device)
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:

@@ -15,10 +15,10 @@ from ..mask import CONTACT, ELASTIC, EXACT_BLOCK, PAPER_BLOCK
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
 from .bodies import find_bodies
-from .coarse_plan import check_coupled, plan_of
+from .coarse import check_coupled, plan_of
+from .material import lumped_mass, rest_metric
 from .model import Model
 from .moving import moving_bodies
-from .rest import lumped_mass, rest_metric
 from .solver import VBD
 
 

@@ -9,11 +9,9 @@ from torch import Tensor
 from ..model.model import Model
 from ..model.system import system_of
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
-from .energies import StableNeoHookean, build_energies
-from .friction import floor_friction
-from .layout import Layout, build_layout, dot, put, solve6, take
+from .energies import StableNeoHookean, build_energies, floor_friction
 from .rigid import Correction
-from .scene import Scene, build_scene
+from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
 
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
 SOFT = 0.02  # h^2 times a tet's stiffness over the mass of its corners, below which it hardly acts within a step
@@ -399,3 +397,53 @@ def _saturation(update: Tensor, limit: float) -> Tensor:
     moves = square > 0
     length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)
     return limit / (length + limit + SATURATION_EPS)
+
+
+def incremental_potential(
+    model: Any,
+    x: Tensor,
+    y: Tensor,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    x_prev: Tensor | None = None,
+    *,
+    rest_points: Tensor | None = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+) -> Tensor:
+    """G(x) = 1/2 sum m |x - y|^2 + h^2 E(x), h^2-scaled [kg m^2], shape x.shape[:-2].
+
+    x, y: positions and predictor [m], [..., V, 3]; mu, lam [Pa] as in `step`. E is elastic energy (zero at rest) plus
+    barriers (inf at a gap <= 0 of an unpinned vertex) and anchors. x_prev: state at the start of the step, for the
+    lagged damping of a floor; None stands for x itself, where the damping vanishes.
+    """
+    scene = build_scene(
+        model,
+        build_layout(model),
+        x,
+        mu=mu,
+        lam=lam,
+        time_step=time_step,
+        rest_points=rest_points,
+        density=density,
+        parameters=parameters,
+    )
+    rows = x.transpose(-1, -2)
+    lagged = rows if x_prev is None else x_prev.transpose(-1, -2)
+    total = (scene.mass / 2 * ((x - y) ** 2).sum(-1)).sum(-1)
+    for energy in build_energies(scene):
+        total = total + energy.energy(rows, lagged)
+    return total
+
+
+def residual(
+    model: Any, x: Tensor, y: Tensor, mu: Any, lam: Any, time_step: float, *args: Any, **options: Any
+) -> Tensor:
+    """dG/dx [kg m], [..., V, 3], by autograd, detached; arguments as in `incremental_potential`. Zero at unpinned
+    vertices of a converged step; at a pinned vertex it is h^2 times the force that holds it (for y = x there)."""
+    with torch.enable_grad():
+        x = x.detach().requires_grad_()
+        total = incremental_potential(model, x, y, mu, lam, time_step, *args, **options)
+        (gradient,) = torch.autograd.grad(total.sum(), x)
+    return gradient

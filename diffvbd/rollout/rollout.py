@@ -32,21 +32,15 @@ from ..step.arguments import (
     step_settings,
     system_for,
 )
-from ..step.estimate import ErrorEstimate, error_of, of_steps
-from ..step.growth import proven, warn_of_sweeps
-from ..step.held_up import cut_share
 from ..step.integrators import History, check_history, check_staged, solves_of, take
 from ..step.intersections import check_start as refuse_start
+from ..step.residual import ErrorEstimate, cut_share, error_of, of_steps
+from ..step.stability import proven, warn_of_sweeps
 from ..tuples import replaced
-from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
-from .checks import Checks, check_checks
-from .contact_check import checks_contact, warn_of_contact
-from .end_check import look_at_end, warn_of_last_end
-from .energy_check import look_at_energy
-from .finer import rollout_finer
-from .reference import LOOKS
-from .repeated import repeated
-from .trajectory import PerStep, StepAverage, Trajectory, refuse_average, stacked
+from .checks import Checks, check_checks, checks_contact, look_at_end, look_at_energy, warn_of_contact, warn_of_last_end
+from .memory import BinomialCheckpoints, Segment, choose_schedule, run_segments
+from .refine import LOOKS, rollout_finer
+from .trajectory import PerStep, StepAverage, Trajectory, refuse_average, repeated, stacked
 
 
 def rollout(

@@ -28,9 +28,8 @@ from ..checks import (
 from ..contact.colliders import MOST_LENGTH, Plane
 from ..mask import ELASTIC
 from ..model.inputs import MODULI, Given, parameters_of, sorted_inputs
+from ..model.material import lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
-from ..model.moduli import moduli_of
-from ..model.rest import lumped_mass, rest_metric
 from ..model.solver import VBD
 from ..model.system import System, system_of
 from ..model.warnings import warn_of_solver

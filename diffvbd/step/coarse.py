@@ -15,7 +15,7 @@ from torch.autograd import Function
 
 from .. import ops
 from ..mask import VERTEX_ENERGIES
-from ..model.rest import shape_gradients
+from ..model.material import shape_gradients
 from ..model.system import System
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one

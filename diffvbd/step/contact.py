@@ -21,7 +21,7 @@ from ..contact.surface import LEAST_CAPACITY
 from ..mask import CONTACT
 from ..model.inputs import parameter_of
 from ..model.system import System
-from ..model.tet_shapes import inside_out
+from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.motion import RoomsOfBodies

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..checks import check_tensor, fail, input_name
-from ..model.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
+from ..model.solver import BDF2, SDIRK2, ImplicitEuler, Integrator
 from ..model.system import System
 from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders, refuse_transforms

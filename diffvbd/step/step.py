@@ -12,15 +12,13 @@ from torch import Tensor
 
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_tensor, fail, to_float
-from ..model.integrators import BDF2
 from ..model.model import Model
-from ..model.solver import VBD
+from ..model.solver import BDF2, VBD
 from ..scopes import refuse_refinement, refuse_transforms
 from .advance import advance
 from .arguments import check_prescribed, check_state, given_of, prepare, system_for
-from .growth import warn_of_sweeps
 from .integrators import check_staged, take
-from .lost import notice_loss
+from .stability import notice_loss, warn_of_sweeps
 
 
 def step(

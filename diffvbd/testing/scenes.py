@@ -203,7 +203,7 @@ class Scene:
 
     def solver(self, sweeps: int, **options: Any) -> Any:
         """A `diffvbd.VBD` of the case; options of it in addition."""
-        from diffvbd.model.solver import VBD
+        from ..model.solver import VBD
 
         names = ("saturation", "regularization", "relaxation", "block")
         return VBD(self.case.time_step, sweeps, **{**{name: getattr(self.case, name) for name in names}, **options})
