@@ -210,7 +210,8 @@ def check_not_zero(found: dict[str, Any]) -> None:
     assert "at [0, 40, 0]" in found["forces"]["error"]
 
 
-@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [2, 3])
 def test_ranks_have_the_bits_of_one(ranks: int, tmp_path: Path) -> None:
     alone = work(tmp_path)
     check_not_zero(alone)

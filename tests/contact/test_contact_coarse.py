@@ -8,26 +8,23 @@ from typing import Any
 import pytest
 import torch
 from conftest import DEVICES
-from helpers.marks import slow
+from helpers.marks import quick_and_slow, slow
 from helpers.spreads import assert_near_contact
 from helpers.touching import pressed, rebuilt, stack
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.testing import relative_error, tolerance
-from diffvbd.testing.contact_scenes import GRAVITY, SCENES, Scene, compiled, noise, unrolled
+from diffvbd.testing.contact_scenes import SCENES, Scene, compiled, noise, unrolled
 
 SPACE = dv.CoarseSpace(functions=6, groups=2, every=2)
 
 
 @functools.cache
-def corrected(name: str) -> Scene:
+def corrected(name: str, window: int | None = None) -> Scene:
     scene = SCENES[name]()
-    return replace(scene, model=rebuilt(scene.model, coarse=SPACE))
-
-
-def lengths_in(detections: list[Any]) -> list[Tensor]:
-    return [d.lengths for d in detections if d.lengths is not None]
+    acceleration = None if window is None else dv.Anderson(window)
+    return replace(scene, model=rebuilt(scene.model, coarse=SPACE, acceleration=acceleration))
 
 
 def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
@@ -43,14 +40,15 @@ def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("steps", "sweeps"), [(1, 7), slow(1, 9), slow(3, 6)])
-@pytest.mark.parametrize("name", list(SCENES))
-def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int,
+@pytest.mark.parametrize(("steps", "sweeps", "window"), [(1, 7, None), slow(1, 9, 2), slow(3, 6, None)])
+@pytest.mark.parametrize("name", quick_and_slow(("obstacles", "batched", "thrown"), SCENES))
+def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, window: int | None,
                                                   device: str) -> None:  # fmt: skip
-    lengths = check(corrected(name), steps, sweeps, device)
+    lengths = check(corrected(name, window), steps, sweeps, device)
     assert (lengths == 1).any() or name in ("fast", "thrown")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_gradients_of_shortened_and_refused_corrections(device: str) -> None:
     scene = corrected("batched")
@@ -84,52 +82,6 @@ def test_nearer_in_as_many_sweeps(build: Any) -> None:
     assert errors[1] < errors[0] / 10, errors
 
 
-@pytest.mark.parametrize("name", ["fast", "crossed", "stacked"])
-def test_nothing_crosses(name: str) -> None:
-    """Every step looks for intersections at its start."""
-    scene = corrected(name)
-    x, v, lengths = scene.x, scene.v, []
-    for _ in range(12):
-        with dv.debug_checks(), dv.contact.record() as found:
-            x, v = dv.step(scene.model, x, v, time_step=scene.time_step, sweeps=9, gravity=GRAVITY, **scene.inputs)
-        lengths += [t.reshape(-1) for t in lengths_in(found)]
-        assert min(dv.contact.status(scene.model).smallest_gap) > 0
-    assert torch.cat(lengths).any()
-
-
-def test_a_stiff_body_in_flight_keeps_its_spin() -> None:
-    """As it does without contact. One rigid correction after the coarse ones let it gain 4 % of its energy."""
-
-    def spin_and_energy(*contact: Any) -> tuple[Tensor, Tensor]:
-        mesh = dv.mesh.box((2, 3, 4), (0.1, 0.2, 0.3))
-        model = dv.Model(mesh, energies=(dv.StableNeoHookean(), *contact), coarse="auto")
-        x, mass = model.rest_points, model.mass[:, None]
-        arm = x - (mass * x).sum(0) / mass.sum()
-        v = torch.linalg.cross(torch.tensor([0.1, 3.0, 0.05], dtype=x.dtype).expand_as(arm), arm)
-        run = dv.rollout(model, x, v, steps=100, time_step=0.02, mu=1e8, lam=1e8, sweeps=12, gravity=(0.0, 0.0, 0.0),
-                         integrator=dv.BDF2())  # fmt: skip
-        return torch.linalg.cross(run.x[-1], mass * run.v[-1]).sum(0), (mass * run.v.square()).sum((-1, -2))
-
-    (free, energy), (beside, other) = spin_and_energy(), spin_and_energy(dv.PairBarrier(1e3, 0.01, self_contact=False))
-    assert relative_error(beside, free) <= tolerance("spin_beside_contact")
-    assert relative_error(other, energy) <= tolerance("spin_beside_contact")
-
-
-def test_records() -> None:
-    scene = corrected("stacked")
-    with dv.coarse.record() as lengths:
-        for sweeps in (0, 1, 2, 6):
-            dv.step(scene.model, scene.x, scene.v, time_step=scene.time_step, sweeps=sweeps, **scene.inputs)
-    assert [t.shape for t in lengths] == [(1, n, 2) for n in (0, 0, 1, 3)] and lengths[-1].any()
-
-
-def test_more_functions_than_can_be_solved_for_together_are_refused() -> None:
-    tets = dv.mesh.box((9, 9, 9), (1.0, 1.0, 1.0))
-    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01))
-    with pytest.raises(ValueError, match="at most 512 functions of all bodies"):
-        dv.Model(tets, energies=energies, coarse=dv.CoarseSpace(functions=600))
-
-
 def test_gradients_of_the_rest_shape() -> None:
     """Against central differences, for which decisions stay as they were."""
     model, given = stack(coarse=SPACE)
@@ -151,7 +103,7 @@ def test_gradients_of_the_rest_shape() -> None:
 
 
 def test_float32_is_near_float64() -> None:
-    model, given = stack(coarse="auto")
+    model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
     ends = []
     for dtype in (torch.float64, torch.float32):
         own = model.to(dtype=dtype)
@@ -183,7 +135,7 @@ def test_scenes_of_a_batch_do_not_mix(device: str) -> None:
 
 
 def test_checkpoints_and_threads_change_no_bit() -> None:
-    model, given = stack(coarse="auto")
+    model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
     x, found, threads = model.rest_points, [], torch.get_num_threads()
     try:
         for every, count in ((None, 1), (2, 2)):
@@ -194,17 +146,3 @@ def test_checkpoints_and_threads_change_no_bit() -> None:
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(*pair) for pair in zip(*found, strict=True)) and found[0][1].abs().max() > 0
-
-
-def test_compiled_from_the_first_call() -> None:
-    """With a gradient, and before anything has been derived from the Model."""
-    found = []
-    for run in (torch.compile(dv.step, backend="eager"), dv.step):
-        torch._dynamo.reset()
-        model, given = stack(coarse="auto")
-        x = model.rest_points
-        v = torch.zeros_like(x).requires_grad_()
-        end, _ = run(model, x, v, sweeps=6, **given)
-        found.append((end.detach(), torch.autograd.grad(end.square().sum(), v)[0]))
-    assert found[1][1].abs().max() > 0
-    assert all(relative_error(*pair) <= tolerance("contact_forward") for pair in zip(*found, strict=True))

@@ -46,22 +46,6 @@ def test_an_impact_gains_no_energy(speed: float, sweeps: int) -> None:
 
 
 @pytest.mark.parametrize("self_contact", (False, True))
-@pytest.mark.parametrize("spin", (10.0, 20.0, 40.0))
-def test_a_body_that_turns_in_the_air_gains_no_energy(spin: float, self_contact: bool) -> None:
-    mesh, modulus = dv.mesh.cube(2, size=0.2), 1e6
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(self_contact=self_contact)))
-    axis = torch.nn.functional.normalize(torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), dim=0)
-    x = model.rest_points
-    v = spin * torch.linalg.cross(axis.expand_as(x), x - x.mean(0))
-    speed = float((model.mass[:, None] * v.square()).sum())
-    for _ in range(12):
-        x, v = dv.step(model, x, v, mu=modulus, lam=modulus, time_step=0.02, sweeps=20, gravity=(0, 0, 0))
-        now = float((model.mass[:, None] * v.square()).sum())
-        assert 0 < now <= speed * (1 + tolerance("energy_gain"))
-        speed = now
-
-
-@pytest.mark.parametrize("self_contact", (False, True))
 @pytest.mark.parametrize("gap", (1.0, 0.03, 0.01))
 @pytest.mark.parametrize("spin", (35.0, 60.0))
 def test_nor_does_one_that_turns_beside_another(spin: float, gap: float, self_contact: bool) -> None:
@@ -153,21 +137,3 @@ def test_a_body_that_bends_in_the_air_moves_as_without_contact() -> None:
         ends[own] = dv.step(model, x, v, mu=mu, lam=lam, time_step=0.01, sweeps=40, gravity=(0, 0, 0))[0]
     moved = (ends[None] - x).norm()
     assert (ends[True] - ends[None]).norm() < tolerance("contact_motion") * moved
-
-
-def test_a_soft_coarse_body_gains_no_energy_from_a_floor() -> None:
-    model = dv.Model(
-        dv.mesh.box(2, 0.1),
-        energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=1e-2)),
-        colliders=dv.colliders.Plane(),
-    )
-    turn = torch.tensor([[-0.1896, 0.1298, 0.9732], [-0.3140, -0.9472, 0.0652], [0.9303, -0.2933, 0.2203]])
-    velocity, spin = torch.tensor([-0.989, -1.111, -0.933]).double(), torch.tensor([9.89, 8.30, -7.39]).double()
-    arm = (model.rest_points - model.rest_points.mean(0)) @ torch.linalg.qr(turn.double().T)[0]
-    x = arm + torch.tensor([0.0, 0.12, 0.0], dtype=torch.float64)
-    v = velocity + torch.linalg.cross(spin.expand_as(arm), arm)
-    start = float((model.mass[:, None] * v.square()).sum())
-    for _ in range(12):
-        x, v = dv.step(model, x, v, mu=3e3, lam=6e3, time_step=0.02, sweeps=20, gravity=(0, 0, 0))
-        assert float((model.mass[:, None] * v.square()).sum()) <= start * (1 + tolerance("energy_gain"))
-    assert x[:, 1].min() < 0.01  # it has met the floor

@@ -32,16 +32,6 @@ def test_a_body_spins_next_to_another_as_alone() -> None:
     assert row["value"] == pytest.approx(row["reference"], rel=tolerance("contact_motion"))
 
 
-def test_a_frictionless_block_rests() -> None:
-    row = piles.rest("Plane", sweeps=5)
-    assert abs(row["value"]) <= tolerance("rest_speed")
-
-
-def test_five_boxes_stand_at_five_sweeps() -> None:
-    row = piles.stack(5, sweeps=5, seconds=0.5)
-    assert row["met"]
-
-
 def test_a_body_that_flies_and_spins_beside_others_lists_no_pairs_of_its_own() -> None:
     """With self-contact, 3 cm above a slab: it goes as far as without contact."""
     tets = join([box(4, 0.2), box(2, (4.0, 0.1, 4.0)).translate((-1.0, -0.13, -1.0))])
@@ -84,12 +74,6 @@ def test_a_block_on_a_soft_block_does_not_sink() -> None:
     row = piles.rest("box", sweeps=5)
     assert row["crossings"] == 0 and row["cut"] == 0.0
     assert abs(row["value"] - row["reference"]) <= tolerance("dented_rest")
-
-
-@pytest.mark.slow
-def test_a_pinned_sheet_swings_as_without_contact() -> None:
-    row = scenes.sheet(sweeps=10)
-    assert row["value"] == pytest.approx(row["reference"], rel=tolerance("contact_motion"))
 
 
 @pytest.mark.parametrize(("speed", "time_step"), [(5.0, 0.01), (5.0, 1 / 60), (7.0, 0.01)])

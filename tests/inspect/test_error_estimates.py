@@ -12,15 +12,14 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.rollout import rollout as rollout_module
-from diffvbd.step.arguments import GRAVITY, acceleration_of, prepare
-from diffvbd.step.estimate import _bodies_of, _iterates, error_of
-from diffvbd.step.predict import begin
+from diffvbd.step.estimate import _bodies_of, error_of
 from diffvbd.testing import relative_error, tolerance
 
 H = 1 / 60
 LOOSE = tolerance("finite_difference")  # of an error of 1e-8 m, positions round at 1e-16
 CORRECTIONS = 4  # of 12 sweeps
 COARSE = {"coarse": "auto", "relaxation": 1.5}
+ACCELERATED = {**COARSE, "acceleration": dv.Anderson(2)}
 FLOOR = {"energies": (dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3, dhat=0.02))}
 
 
@@ -87,6 +86,7 @@ CASES = [
     ("stiff cantilever", COARSE, 5),
     ("stiff cantilever", COARSE, 8),
     ("stiff cantilever", COARSE, 11),
+    ("stiff cantilever", ACCELERATED, 14),
     ("soft bar", {}, 10),
     ("soft bar", {}, 20),
     ("soft bar", COARSE, 8),
@@ -96,12 +96,7 @@ CASES = [
     ("spinning body", COARSE, 8),
     ("body on a floor", {}, 10),
     ("body on a floor", COARSE, 8),
-]
-# where what is left shrinks far more slowly than what the last sweeps moved
-TOO_SMALL = [
-    ("stiff cantilever", {}, 20),
-    ("sheet", COARSE, 8),
-    ("sheet", COARSE, 14),
+    ("body on a floor", ACCELERATED, 11),
 ]
 
 
@@ -121,33 +116,15 @@ def test_estimates_are_near_the_true_error() -> None:
     assert 0.1 < float(ratios.min()) and float(ratios.max()) < 10, ratios
 
 
-@pytest.mark.parametrize(("name", "options", "sweeps"), TOO_SMALL)
-def test_slow_motions_are_underestimated_as_documented(name: str, options: dict[str, Any], sweeps: int) -> None:
-    assert 0.005 < ratio_of(name, options, sweeps) < 0.2
-
-
-@pytest.mark.parametrize(("name", "options"), [("soft bar", {}), ("stiff cantilever", COARSE)])
+@pytest.mark.parametrize(("name", "options"), [("soft bar", {}), ("stiff cantilever", COARSE),
+                                               ("body on a floor", ACCELERATED)])  # fmt: skip
 def test_estimates_fall_with_sweeps(name: str, options: dict[str, Any]) -> None:
     model = case(name).model(**options)
     errors = [float(estimate(case(name), model, sweeps)[1].error) for sweeps in (5, 17, 35)]
     assert errors[0] > 2 * errors[1] > 4 * errors[2] > 0
 
 
-@pytest.mark.parametrize("options", [{}, {"relaxation": 1.6}, COARSE])
-@pytest.mark.parametrize("sweeps", [2, 5, 12])
-def test_iterates_end_where_the_step_ends(options: dict[str, Any], sweeps: int) -> None:
-    """To the bit: the parts are the step."""
-    c = case("body on a floor")
-    model = c.model(**options)
-    prepared = prepare(model, (), **c.material, time_step=H, sweeps=sweeps, rest_points=None, density=None,
-                       parameters=None)  # fmt: skip
-    begun = begin(model, c.x, c.v, prepared, None, acceleration_of(GRAVITY, c.x), None)
-    states, _ = _iterates(model, begun, prepared)
-    end, _ = dv.step(model, c.x, c.v, time_step=H, sweeps=sweeps, **c.material)
-    assert torch.equal(begun.corrected(states[-1], model, prepared)[0], end)
-
-
-@pytest.mark.parametrize("options", [{}, COARSE])
+@pytest.mark.parametrize("options", [{}, COARSE, ACCELERATED])
 @pytest.mark.parametrize("schedule", [None, 2, dv.BinomialCheckpoints(1)])
 def test_states_and_gradients_keep_their_bits(options: dict[str, Any], schedule: Any,
                                               monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
@@ -182,7 +159,7 @@ def two_bodies(**options: Any) -> dv.Model:
     return dv.Model(mesh, pinned=pinned, **options)
 
 
-@pytest.mark.parametrize("options", [{}, COARSE])
+@pytest.mark.parametrize("options", [{}, COARSE, ACCELERATED])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_scenes_and_bodies_have_their_own(options: dict[str, Any], dtype: torch.dtype) -> None:
     model = two_bodies(**options, dtype=dtype)
@@ -214,25 +191,6 @@ def test_each_body_is_named_where_it_stands() -> None:
     assert sorted(errors.lengths.flatten().tolist()) == sorted(found[0].flatten().tolist())
     left = dv.diagnose(model, x, previous=(x, v), time_step=H, sweeps=1, mu=1e7, lam=1e7, warn=False)
     assert left.errors is not None and left.errors.change.isnan().all()
-
-
-@pytest.mark.parametrize(("options", "known"), [({}, 2), (COARSE, 5)])
-def test_few_sweeps_tell_nothing(options: dict[str, Any], known: int) -> None:
-    c = case("soft bar")
-    for sweeps in range(known + 1):
-        errors = estimate(c, c.model(**options), sweeps)[1]
-        nothing = sweeps < known
-        assert all(bool(t.isnan()) == nothing for t in (errors.error, errors.ratio, errors.relative))
-
-
-def test_what_rests_has_no_error() -> None:
-    model = dv.Model(dv.mesh.cube(3), **COARSE)
-    x = model.rest_points
-    given = {"mu": 1e5, "lam": 1e5, "time_step": H, "sweeps": 8, "gravity": (0.0, 0.0, 0.0)}
-    errors = dv.rollout(model, x, torch.zeros_like(x), steps=1, estimate_errors=True, **given).errors
-    assert errors is not None and float(errors.error) < tolerance("sum")
-    result = dv.diagnose(model, x, previous=(x, torch.zeros_like(x)), warn=False, **given)
-    assert result.ok and result.relative_error == 0
 
 
 def test_diagnose_names_the_worst_body() -> None:
@@ -270,23 +228,8 @@ def test_bad_input() -> None:
             dv.diagnose(model, c.x, previous=(c.x, c.v), sweeps=5, **given)
 
 
-@pytest.mark.parametrize("options", [{}, COARSE])
-def test_no_steps_and_no_vertices(options: dict[str, Any]) -> None:
-    model = two_bodies(**options)
-    x = model.rest_points.expand(3, -1, -1)
-    given = {"time_step": H, "sweeps": 12, "mu": 1e5, "lam": 1e5, "estimate_errors": True}
-    none = dv.rollout(model, x, x, steps=0, **given).errors
-    one = dv.rollout(model, x, x, steps=1, **given).errors
-    assert none is not None and one is not None
-    assert all(a.shape == (0, *b.shape[1:]) for a, b in zip(none, one, strict=True))
-    empty = dv.Model(dv.TetMesh([], []), **options)
-    x = torch.zeros(0, 3, dtype=torch.float64)
-    errors = dv.rollout(empty, x, x, steps=1, **given).errors
-    assert errors is not None and errors.error.shape == (1, 0)
-
-
 @pytest.mark.cuda
-@pytest.mark.parametrize("options", [{}, COARSE])
+@pytest.mark.parametrize("options", [{}, COARSE, ACCELERATED])
 def test_cuda_estimates_as_the_cpu_does_and_waits_for_nothing(options: dict[str, Any]) -> None:
     c = case("body on a floor")
 

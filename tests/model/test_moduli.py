@@ -101,22 +101,6 @@ def test_a_step_takes_either_pair(device: str, lead: tuple[int, ...], numbers: b
     assert figures.courant == dv.diagnose(model, x, mu=mu, lam=lam, warn=False, **options).courant
 
 
-def test_each_scene_and_each_tet_may_have_its_own(device: str) -> None:
-    model, x, v = scene(device, (3,))
-    young = torch.tensor([[1e4], [1e5], [1e6]], dtype=torch.float64, device=device, requires_grad=True)
-    poisson = torch.linspace(0.0, 0.4, model.num_tets, dtype=torch.float64, device=device).requires_grad_()
-    end = dv.step(model, x, v, young=young, poisson=poisson, **STEP)[0]
-    loss = end.square().sum()
-    found = torch.autograd.grad(loss, (young, poisson))
-    leaves = [t.detach().clone().requires_grad_() for t in (young, poisson)]
-    mu, lam = dv.lame(*leaves)
-    expected = torch.autograd.grad(dv.step(model, x, v, mu=mu, lam=lam, **STEP)[0].square().sum(), leaves)
-    for a, b in zip(found, expected, strict=True):
-        assert torch.equal(a, b) and a.any()
-    with pytest.raises(ValueError, match=r"young: .*got shape \[3\]: one for each scene has shape \[3, 1\]"):
-        dv.step(model, x, v, young=young[:, 0], poisson=NU, **STEP)
-
-
 def test_rollouts_take_values_per_step_and_functions(device: str) -> None:
     model, x, v = scene(device)
     young = torch.linspace(1e5, 2e5, 3, dtype=torch.float64, device=device).requires_grad_()
@@ -173,24 +157,3 @@ def test_exactly_one_pair(given: dict[str, Any], message: str) -> None:
     ):
         with pytest.raises((ValueError, TypeError), match=message):
             run()
-
-
-BAD_FORWARD: list[tuple[dict[str, Any], str]] = [
-    ({"wrt": "mu", "mu": torch.tensor(3)}, "mu: expected dtype torch.float64 .*got torch.int64"),
-    ({"wrt": "x", "x": torch.ones(27, 3, dtype=torch.int64)}, "x: expected dtype torch.float64 .*got torch.int64"),
-    ({"wrt": "force", "force": torch.ones(27, 3, dtype=torch.int32)}, "force: .*torch.int32"),
-    ({"wrt": "mu", "mu": 10**400}, "mu: .*1329 bits"),
-    ({"wrt": "mu", "mu": torch.ones(48).double().to_sparse()}, "mu: .*to_dense"),
-    ({"wrt": 3}, "wrt: expected names of arguments, got 3"),
-    ({"wrt": ("young",)}, r"wrt: expected names of given tensors \(x, v, mu, lam\), got 'young'"),
-    ({"wrt": ("heat",)}, "wrt: .*'heat'"),
-    ({"parameters": [1]}, "parameters: expected a dict of tensors by name, got list"),
-]
-
-
-@pytest.mark.parametrize(("changes", "message"), BAD_FORWARD, ids=lambda a: a if isinstance(a, str) else "")
-def test_step_forward_refuses_what_it_cannot_differentiate(changes: dict[str, Any], message: str) -> None:
-    model, x, v = scene("cpu")
-    given = {"x": x, "v": v, "mu": MU, "lam": LAM, **STEP, **changes}
-    with pytest.raises((ValueError, TypeError), match=message):
-        dv.step_forward(model, **given)

@@ -1,7 +1,5 @@
 """Claim: regimes, transforms and degenerate scenes may meet on CUDA in any order without a wrong number."""
 
-import io
-
 import numpy as np
 import pytest
 import torch
@@ -89,37 +87,3 @@ def test_no_tets(regime: str, vertices: int, shape: tuple[int, ...]) -> None:
     torch.cuda.synchronize()
     assert torch.equal(end, x) and not speed.any()
     assert gradients[1] is None or torch.equal(gradients[1], torch.zeros_like(mu))
-
-
-def test_one_vertex_of_many_neighbours() -> None:
-    """More threads share each vertex than were chosen; the result is that of the CPU."""
-    count = 120
-    angle = torch.linspace(0, 2 * torch.pi, count + 1, dtype=torch.float64)[:-1]
-    ring = torch.stack([torch.cos(angle), torch.sin(angle), 0 * angle], 1).numpy()
-    points = np.concatenate([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], ring])
-    tets = np.array([[0, 2 + i, 2 + (i + 1) % count, 1] for i in range(count)])
-    model = dv.Model(dv.TetMesh(points, tets), pinned=[2])
-    x = (model.rest_points * 1.05).requires_grad_()
-
-    def gradient(model: dv.Model, x: Tensor) -> tuple[Tensor, Tensor]:
-        end, _ = dv.step(model, x, torch.zeros_like(x), mu=1e4, sweeps=3, **OPTIONS)  # type: ignore[arg-type]
-        return end, torch.autograd.grad((end * end).sum(), x)[0]
-
-    expected = gradient(model, x)
-    for regime in ("block", "grid", "color"):
-        with forced(regime):
-            result = gradient(model.to("cuda"), x.detach().cuda().requires_grad_())
-        for value, other in zip(result, expected, strict=True):
-            assert other.any() and relative_error(value, other) <= tolerance("adjoint")
-
-
-def test_a_saved_model_loads_on_the_cpu() -> None:
-    model, x, v = small(1)
-    buffer = io.BytesIO()
-    torch.save(model, buffer)
-    buffer.seek(0)
-    loaded = torch.load(buffer, map_location="cpu", weights_only=False)
-    assert loaded.device.type == "cpu"
-    end, _ = dv.step(loaded, x.cpu(), v.cpu(), mu=1e4, sweeps=3, **OPTIONS)  # type: ignore[arg-type]
-    expected, _ = dv.step(model, x, v, mu=1e4, sweeps=3, **OPTIONS)  # type: ignore[arg-type]
-    assert relative_error(end, expected) <= tolerance("forward")

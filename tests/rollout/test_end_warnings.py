@@ -2,19 +2,21 @@
 is at fault; so does one whose sweeps leave its motion wrong, and one that bends tets too thin for it."""
 
 import warnings
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from helpers.two_boxes import two_boxes
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.rollout import end_check
+from diffvbd import reference
+from diffvbd.mesh import box
+from diffvbd.rollout import energy_check
 from diffvbd.step.arguments import prepare
-from diffvbd.step.integrators import Solve
+from diffvbd.step.contact_cycles import CUT
+from diffvbd.step.held_up import SEVERAL, cut_share
 from diffvbd.step.lost import FAR
-from diffvbd.step.unsolved import unsolved
 from diffvbd.testing import tolerance
 
 MEASURES_GROWTH = True  # see conftest.py
@@ -59,21 +61,6 @@ def test_an_end_that_is_no_number_is_warned_of() -> None:
     assert messages(lambda: dv.rollout(model, 1e-20 * x, v, steps=1, **SOFT)) == []
 
 
-def test_the_next_rollout_says_it_where_the_device_was_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on CUDA: a copy that is not there yet is asked for again later, whatever ends meanwhile."""
-    model, x, v = bent()
-    monkeypatch.setattr(end_check, "may_copy", lambda x: True)
-    ready = SimpleNamespace(query=lambda: there)
-    model._derived[end_check.ENDED] = [(torch.tensor([good, True]), ready) for good in (True, False, True)]
-    there = False
-    assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
-    there = True
-    with pytest.warns(UserWarning, match="a rollout of this Model before this one ended") as found:
-        dv.rollout(model, x, v, steps=1, **SOFT)
-    assert found[0].filename == __file__
-    assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
-
-
 @pytest.mark.cuda
 def test_the_next_rollout_says_it_on_cuda() -> None:
     model, x, v = lost()
@@ -112,20 +99,6 @@ def test_sweeps_and_time_steps_are_blamed() -> None:
     said = messages(lambda: dv.rollout(model, x, v, steps=16, mu=1e8, lam=4e8, time_step=0.01, sweeps=2,
                                        integrator=dv.SDIRK2(), gravity=(0.0, 0.0, 0.0)))  # fmt: skip
     assert any("more than 1000 body sizes" in text and "sweeps: so few let vibrations grow" in text for text in said)
-
-
-def test_a_loop_of_steps_says_it_too() -> None:
-    model, x, v = bent()
-    said: list[int] = []
-    state = x, 0 * v
-    for k in range(20):
-        after: list[tuple[Tensor, Tensor]] = []
-        texts = messages(lambda s=state: after.append(dv.step(model, *s, force=-50.0 * s[1], **SOFT)))  # noqa: B023
-        assert all("x: this step ended with positions that are spread over" in t and "force:" in t for t in texts)
-        said += [k] * bool(texts)
-        state = after[0]
-    assert len(said) > 2 and said == list(range(said[0], 20))
-    assert messages(lambda: dv.step(model, x + 1e6, v, **SOFT)) == []  # far from the origin
 
 
 def test_a_flight_is_not_lost() -> None:
@@ -169,29 +142,230 @@ def test_what_rests_or_has_no_sweeps_to_judge_is_not_doubted(dtype: torch.dtype)
         assert messages(lambda n=frames: dv.rollout(model, end.x[-1], end.v[-1], steps=n, **SOFT)) == []
 
 
-def test_the_error_is_that_of_newtons_method_among_polynomials() -> None:
-    """Of a body that is moved as a whole from where the step converges, all of it is found."""
-    mesh = dv.mesh.box(3, 0.2)
-    model = dv.Model(mesh)
-    x = model.rest_points
-    converged = dv.solve(model, x, 0 * x, mu=1e4, lam=1e4, time_step=0.01, tolerance=1e-10).x
-    given = {"force": None, "gravity": (0.0, -9.81, 0.0), "prescribed": None, "colliders": None,
-             "colliders_before": None}  # fmt: skip
-    prepared = prepare(model, (), mu=1e4, lam=1e4, time_step=0.01, sweeps=1, rest_points=None, density=None,
-                       parameters=None)  # fmt: skip
-    away = torch.tensor([3e-4, 0.0, -4e-4], dtype=x.dtype)
-    found = unsolved(model, Solve(x, 0 * x, prepared, given), converged + away, {})
-    assert found is not None and abs(found.error / 5e-4 - 1) <= tolerance("closed_form")
+# --- energy from nowhere ----------------------------------------------------------------------------------------------
 
 
-def test_bending_of_thin_tets_is_said_where_it_shows() -> None:
-    mesh = dv.mesh.sheet(10, 10, (0.3, 0.3), 2e-3)
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse="auto", relaxation=1.5)
+STIFF: dict[str, Any] = {"mu": 1e9, "lam": 1e9, "time_step": 0.01, "sweeps": 2}
+
+
+def bent_bar(**options: Any) -> tuple[dv.Model, Tensor, Tensor]:
+    """A bar whose velocities bend it."""
+    mesh = dv.mesh.box((5, 2, 2), (0.4, 0.1, 0.1))
+    model = dv.Model(mesh, **options)
     x = model.rest_points
-    pull = torch.zeros(2, 3, dtype=x.dtype)
-    thin = int((x.amax(0) - x.amin(0)).argmin())
-    pull[0, thin], pull[1, 0] = -9.81, 9.81  # across the sheet, along it
-    for gravity, bends in zip(pull, (True, False), strict=True):
-        said = messages(lambda g=gravity: dv.rollout(model, x, 0 * x, steps=10, young=1e8, poisson=0.3, gravity=g,
-                                                     time_step=0.01, sweeps=10))  # fmt: skip
-        assert any("tets 24 times as wide as thick bend here" in text for text in said) == bends
+    v = torch.zeros_like(x)
+    v[:, 1] = 20 * x[:, 0].square()
+    return model, x, v
+
+
+def said_of_energy(run: Any, of: str = "gained") -> list[str]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        run()
+    return [str(w.message) for w in found if of in str(w.message)]
+
+
+# --- energy -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [3, energy_check.LEAST_CHUNK])  # tets that are looked at together
+def test_energy_is_that_of_the_reference(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    monkeypatch.setattr(energy_check, "LEAST_CHUNK", chunk)
+    model, x, v = bent_bar()
+    x = x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    mu, lam = (torch.linspace(1e4, k, model.num_tets, dtype=x.dtype) for k in (2e4, 5e4))
+    given = {"mu": mu, "lam": lam, "time_step": 1.0, "sweeps": 1, "rest_points": None, "density": None}
+    prepared = prepare(model, (), **given, parameters=None)
+    expected = reference.incremental_potential(model, x, x, mu, lam, 1.0)
+    expected = expected + 0.5 * (model.mass[:, None] * v.square()).sum()
+    found = energy_check.mechanical_energy(model, prepared, x, v)
+    assert found.shape == (1,) and expected > 0
+    assert abs(found - expected) <= tolerance("energy_gain") * expected
+    many = energy_check.mechanical_energy(model, prepared, x.expand(3, -1, -1), v.expand(3, -1, -1))
+    assert torch.allclose(many, found, rtol=tolerance("energy_gain"))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
+    model, x, v = bent_bar(dtype=dtype)
+    with pytest.warns(UserWarning, match=r'has gained .* coarse="auto"') as found:
+        dv.rollout(model, x, v, steps=10, **STIFF)
+    assert {w.filename for w in found} == {__file__}
+    for asked in (None, True):
+        assert (
+            len(said_of_energy(lambda asked=asked: dv.rollout(model, x, v, steps=10, check_energy=asked, **STIFF))) == 1
+        )
+
+
+def test_what_helps_helps() -> None:
+    model, x, v = bent_bar(coarse="auto", relaxation=1.5)
+    assert said_of_energy(lambda: dv.rollout(model, x, v, steps=10, check_energy=True, **STIFF | {"sweeps": 100})) == []
+
+
+def test_nothing_is_said_of_a_scene_that_gains_none_or_is_driven() -> None:
+    model, x, v = bent_bar()
+    assert said_of_energy(lambda: dv.rollout(model, x, v, steps=20, check_energy=True, **SOFT)) == []
+    kinds: list[dict[str, Any]] = [{"force": 0 * x}, {"gravity": lambda k, x, v: 0 * x}, {"check_energy": False}]
+    for driven in kinds:
+        assert said_of_energy(lambda d=driven: dv.rollout(model, x, v, steps=20, **STIFF, **d)) == []
+    assert said_of_energy(lambda: dv.rollout(model, x, v, steps=9, **STIFF)) == []  # too short to be looked at unasked
+
+
+def test_rest_and_fall_are_no_gain_in_single_precision_or_far_away() -> None:
+    for dtype, distance in ((torch.float32, 1.0), (torch.float32, 1e3), (torch.float64, 1e5)):
+        model, x, v = bent_bar(dtype=dtype)
+        given = {**SOFT, "mu": 1e7, "lam": 1e7}
+        end = lambda m=model, x=x + distance, v=0 * v, g=given: dv.rollout(m, x, v, steps=10, check_energy=True, **g)  # noqa: E731
+        assert said_of_energy(end) == []
+
+
+@pytest.mark.parametrize("schedule", [None, 3, dv.BinomialCheckpoints(2)])
+def test_gradients_are_those_without_a_look(schedule: Any) -> None:
+    model, x, v = bent_bar()
+    gradients = []
+    for asked in (True, False):
+        leaf = v.clone().requires_grad_()
+        end = dv.rollout(model, x, leaf, steps=10, checkpoint_every=schedule, check_energy=asked, save="last", **SOFT)
+        gradients.append(torch.autograd.grad(end.x.square().sum(), leaf)[0])
+    assert torch.equal(*gradients) and gradients[0].abs().max() > 0
+
+
+def test_a_wrong_argument_is_named() -> None:
+    model, x, v = bent_bar()
+    with pytest.raises(TypeError, match="check_energy: expected a bool or None, got int"):
+        dv.rollout(model, x, v, steps=1, check_energy=1, **SOFT)  # pyright: ignore[reportArgumentType]
+
+
+# --- pairs that hold up, friction that has not converged --------------------------------------------------------------
+
+
+FAST: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.002, "sweeps": 3}
+
+
+def thrown() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    """Two boxes that meet at speed."""
+    model = two_boxes(detections=1)
+    v = torch.zeros_like(model.rest_points)
+    v[8:, 1] = -60.0
+    return model, model.rest_points, v
+
+
+def sliding(**friction: float) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    floor = dv.FloorBarrier(height=-0.01, kappa=2e3)
+    model = dv.Model(box(3, 0.2, split="kuhn"), energies=(dv.StableNeoHookean(), floor, dv.Friction(**friction)))
+    v = torch.zeros_like(model.rest_points)
+    v[:, 0] = 1e-3
+    return model, model.rest_points, v
+
+
+def test_motion_that_pairs_held_up_is_warned_of() -> None:
+    model, x, v = thrown()
+    with pytest.warns(UserWarning, match=r"pair_barrier: pairs held up .* larger reach") as found:
+        dv.rollout(model, x, v, steps=1, check_contact=True, **FAST)
+    assert found[0].filename == __file__
+    assert sum("pairs held up" in str(w.message) for w in found) == 1
+    assert cut_share(model) > CUT
+
+
+def test_friction_that_has_not_converged_is_warned_of() -> None:
+    model, x, v = sliding(coefficient=0.5, velocity=1e-4)
+    stiff: dict[str, Any] = {"mu": 1e5, "lam": 2e5, "time_step": 0.01}
+    with pytest.warns(UserWarning, match=r"friction: .* not balanced .*more sweeps .*a smaller time_step") as found:
+        dv.rollout(model, x, v, steps=10, sweeps=1, **stiff)
+    said = [str(w.message) for w in found]  # of the friction, and of the motion
+    assert len(said) == 2 and said[1].startswith("sweeps:") and found[0].filename == __file__
+    assert messages(lambda: dv.rollout(model, x, v, steps=10, sweeps=1, **stiff)) == said  # each time
+    soft, x, v = sliding(coefficient=0.5, velocity=0.1)
+    assert not messages(lambda: dv.rollout(soft, x, v, steps=10, sweeps=400, **stiff))
+
+
+def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
+    model, x, v = thrown()
+    ends = []
+    for every in (None, 3, dv.BinomialCheckpoints(2)):
+        for check in (True, False):
+            start = v.clone().requires_grad_()
+
+            def run(start: torch.Tensor = start, every: Any = every, check: bool = check) -> None:
+                end = dv.rollout(model, x, start, steps=3, checkpoint_every=every, check_contact=check, **FAST)
+                ends.append((end.x[-1].detach(), torch.autograd.grad(end.x[-1].square().sum(), start)[0]))
+
+            assert sum("pairs held up" in text for text in messages(run)) == int(check)
+    for end, slope in ends[1:]:
+        assert torch.equal(end, ends[0][0]) and torch.equal(slope, ends[0][1]) and slope.any()
+
+
+def test_bad_input() -> None:
+    model, x, v = thrown()
+    with pytest.raises(TypeError, match="check_contact: expected a bool or None, got str"):
+        dv.rollout(model, x, v, steps=1, check_contact="yes", **FAST)  # pyright: ignore[reportArgumentType]
+
+
+def test_steps_made_one_by_one_are_warned_of_once_pairs_have_held_up_several() -> None:
+    """Prescribed motion of 6 mm a step, where a body may go 2 mm beside another."""
+    lower, upper = box(2, 0.1), box(2, 0.1).translate((0.0, 0.103, 0.0))
+    barrier = dv.PairBarrier(kappa=1e3, dhat=2e-3, detections=1, reach=6e-3)
+    mesh = dv.mesh.join([lower, upper])
+    held = torch.from_numpy(mesh.points[:, 1] < 0.05)
+    model = dv.Model(mesh, pinned=held, energies=(dv.StableNeoHookean(), barrier))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    shares, said = [], []
+    for k in range(SEVERAL + 6):
+        goal = torch.where(held[:, None], model.rest_points + torch.tensor([0.0, 6e-3 * (k + 1), 0.0]), torch.nan)
+        after: list[tuple[torch.Tensor, torch.Tensor]] = []
+        said.append(messages(lambda: after.append(dv.step(model, x, v, prescribed=goal, **FAST))))  # noqa: B023
+        x, v = after[0]
+        shares.append(float(cut_share(model)) > CUT)
+    assert sum(shares) >= SEVERAL
+    late = next(k for k in range(len(shares)) if k + 1 >= SEVERAL and all(shares[k + 1 - SEVERAL : k + 1]))  # first
+    assert [bool(texts) for texts in said] == [k == late for k in range(len(said))]
+    assert f"more than 1 % in each of the last {SEVERAL}" in said[late][0] and "larger reach" in said[late][0]
+
+
+# --- bodies that start inside out -------------------------------------------------------------------------------------
+
+
+CUBE = dv.mesh.cube(3)
+GIVEN: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2, "gravity": (0.0, 0.0, 0.0)}
+
+
+def said(model: dv.Model, x: Tensor, **more: Any) -> list[str]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        dv.rollout(model, x, torch.zeros_like(x), steps=1, **GIVEN, **more)
+    return [str(w.message) for w in found if "inverted" in str(w.message)]
+
+
+def two_cubes(**options: Any) -> tuple[dv.Model, Tensor]:
+    model = dv.Model(dv.mesh.join([CUBE, CUBE.translate((3.0, 0.0, 0.0))]), **options)
+    return model, model.rest_points.clone()
+
+
+def mirrored(model: dv.Model, x: Tensor, body: int) -> Tensor:
+    out, own = x.clone(), model.body == body
+    out[..., own, 1] = -out[..., own, 1]
+    return out
+
+
+@pytest.mark.parametrize("body", (0, 1))
+def test_a_mirrored_body_is_named(body: int) -> None:
+    model, x = two_cubes()
+    (message,) = said(model, mirrored(model, x, body))
+    assert f"body {body} in scene 0 are inverted" in message and "mirrored" in message
+
+
+def test_some_inverted_tets_are_no_mistake() -> None:
+    model, x = two_cubes()
+    pushed = x.clone()
+    pushed[0] = x[model.body == 0].mean(0) + (x[model.body == 0].mean(0) - x[0])  # one corner through its body
+    assert dv.diagnose(model, pushed, mu=1e4, lam=1e4).inverted.any()
+    assert said(model, pushed) == [] and said(model, x) == []
+
+
+def test_nothing_is_said_where_nobody_asks() -> None:
+    model, x = two_cubes()
+    other = mirrored(model, x, 0)
+    assert said(model, other, check_start=False) == []
+    with pytest.warns(UserWarning, match="no StableNeoHookean"):
+        loose, x = two_cubes(energies=())
+    assert said(loose, mirrored(loose, x, 0)) == []

@@ -6,7 +6,6 @@ from typing import Any, cast
 
 import pytest
 import torch
-from helpers.tilted_box import SOFT, tilted_box
 from torch import Tensor
 
 import diffvbd as dv
@@ -71,16 +70,6 @@ def test_a_rollout_continues_another() -> None:
         dv.refine(lambda: dv.rollout(model, outer.x[-1], outer.v[-1], **given, history=outer.history).x.sum())
 
 
-@pytest.mark.parametrize(("save", "steps"), [("last", [6]), (4, [0, 4, 6]), ("all", list(range(7)))])
-def test_frames_are_those_of_the_same_times(save: Any, steps: list[int]) -> None:
-    def loss(seen: list[Any]) -> Tensor:
-        seen.append(dv.rollout(*beam(), **LOADS, save=save))
-        return seen[-1].x.sum()
-
-    for got in results_of(loss)[1]:
-        assert got.steps == steps and len(got.x) == len(steps)
-
-
 def test_loads_and_materials_are_held_and_policies_asked_at_the_same_steps() -> None:
     generator = torch.Generator().manual_seed(0)
     force = torch.randn(STEPS, 3, dtype=torch.float64, generator=generator) * 1e-2
@@ -139,28 +128,6 @@ def test_prescribed_vertices_go_straight(kind: str) -> None:
         assert torch.allclose(found, (ways[1] / H).expand_as(found), rtol=tolerance("travel"))
 
 
-def test_colliders_go_straight() -> None:
-    mesh = dv.mesh.box(2, 0.1)
-    plane = dv.colliders.Plane((0, 0, -0.008), (0, 0, 1))
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(dhat=5e-3)), colliders=[plane])
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    first = model.collider_points
-    still: dict[str, Any] = {**LOADS, "gravity": (0, 0, 0)}
-    lift = torch.tensor([0.0, 0.0, 0.012], dtype=torch.float64)
-    ends = torch.stack([first + lift * (k + 1) / STEPS for k in range(STEPS)])
-
-    def loss(seen: list[Any]) -> Tensor:
-        seen.append(dv.rollout(model, x, v, **still, colliders=dv.per_step(ends)))
-        return seen[-1].x[-1].mean()
-
-    _, seen = results_of(loss)
-    halves = torch.stack([first + lift * (k + 1) / (2 * STEPS) for k in range(2 * STEPS)])
-    finer = still | {"time_step": H / 2, "steps": 2 * STEPS, "sweeps": 2 * K}
-    want = dv.rollout(model, x, v, **finer, colliders=dv.per_step(halves))
-    assert torch.allclose(seen[3].x, want.x[::2], rtol=0, atol=tolerance("through_a_bounce"))
-    assert float((seen[3].x[-1] - x)[:, 2].min()) > 0.004  # it was lifted
-
-
 def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
     """A stiff beam hardly sags in a few sweeps: a loss that wants it straight is met by the solver, not by the beam."""
     mesh = dv.mesh.box((9, 2, 2), (0.8, 0.1, 0.1))
@@ -187,43 +154,6 @@ def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
     assert larger.survives and str(larger).endswith("too coarse to say how much it is")
     strict = tolerance("minimum")
     assert not dv.refine(loss_with(60, 1e7), before=0.2, tolerance=strict).survives
-
-
-def test_the_finest_run_has_converged() -> None:
-    model, x, v = tilted_box("auto")
-
-    def bounce(sweeps: int = 20, **given: Any) -> Any:
-        given = SOFT | {"steps": 8, "time_step": 4e-3, "save": "last"} | given
-        return lambda: dv.rollout(model, x, v, sweeps=sweeps, **given).v[-1, :, 1].mean()
-
-    found, plain = dv.refine(bounce()), tilted_box()
-    want = dv.rollout(*plain, steps=16, time_step=2e-3, sweeps=200, **SOFT).v[-1, :, 1].mean()
-    assert found.both == pytest.approx(float(want), rel=tolerance("cause_of_error"))
-
-
-def fit(cells: Any, target: Tensor | None, nu: Tensor) -> Tensor:
-    """How far the end of a soft bar hangs, or by how much from a target."""
-    body = dv.mesh.box((4, 2, 2), (0.2, 0.1, 0.1))
-    body = dv.mesh.subdivide(body) if cells == "fine" else body
-    model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9), coarse="auto")
-    x = model.rest_points
-    end = dv.rollout(model, x, 0 * x, steps=10, time_step=0.3, sweeps=10, save="last", young=3e4, poisson=nu).x[-1, :16]
-    return end if target is None else (end - target).square().sum()
-
-
-def test_a_fit_that_locking_bends_does_not_survive_the_mesh() -> None:
-    """A coarse mesh is too stiff: it is fitted by a small Poisson's ratio, where the finer mesh has no minimum."""
-    ratio = torch.tensor(0.42, dtype=torch.float64)
-    target = fit("fine", None, ratio)
-    losses = {nu: float(fit("coarse", target, ratio * 0 + nu)) for nu in torch.linspace(0.02, 0.45, 44).tolist()}
-    best = min(losses, key=lambda nu: losses[nu])
-    assert best < 0.3
-    nu = torch.tensor(best, dtype=torch.float64, requires_grad=True)
-    blind = dv.refine(lambda: fit("coarse", target, nu), before=losses[max(losses)])
-    assert blind.survives and blind.tested == "K, h: stable; mesh, gradient: not tested"
-    found = dv.refine(lambda: fit("coarse", target, nu), before=losses[max(losses)], mesh=True, gradient=nu)
-    assert not found.survives and found.tested == "K, h: stable; mesh, gradient: not stable"
-    assert "a finer mesh" in str(found) and found.gradients[0].finer["mesh"] > 0.5 > found.gradients[0].finer["both"]
 
 
 def test_the_finer_mesh_is_that_of_a_subdivided_model() -> None:
@@ -296,41 +226,6 @@ def test_differences_show_what_a_derivative_does_not_follow(
         assert dv.refine(loss, before=10.0).survives  # the loss alone does not tell
 
 
-def test_a_gradient_of_long_steps_does_not_survive() -> None:
-    """Implicit Euler damps a swing; the loss hardly shows it, its derivative does. Checkpoints change nothing."""
-    model, x, v = beam()
-    mu = torch.tensor(3e4, dtype=torch.float64, requires_grad=True)
-    push = torch.zeros_like(x)
-
-    def loss(every: Any) -> Callable[[], Tensor]:
-        given = LOADS | {"mu": mu, "steps": 10, "sweeps": 40, "checkpoint_every": every}
-        return lambda: dv.rollout(model, x, v, **given, force=lambda k, x, v: push - 0.01 * v).x[-1, -1, 2]
-
-    found, kept = (dv.refine(loss(every), gradient=[mu]) for every in (3, None))
-    assert not found.survives and found.tested == "K, h: stable; gradient: not stable; mesh: not tested"
-    assert found.gradients[0].finer["2 K"] < 0.02 and str(found).endswith("optimise on with smaller steps")
-    assert found.gradients[0].finer["h/2"] == pytest.approx(kept.gradients[0].finer["h/2"], rel=tolerance("sum"))
-
-
-def test_a_compiled_loss_is_refined_and_stays_compiled() -> None:
-    def loss() -> Tensor:
-        return dv.rollout(*start, **LOADS, save="last").x[-1].square().sum()
-
-    start = beam()
-    compiled = torch.compile(loss, backend="eager")
-    value = float(compiled())
-    assert dv.refine(compiled) == dv.refine(loss)
-    assert float(compiled()) == value == dv.refine(loss).loss
-
-
-def test_nothing_is_refined_afterwards() -> None:
-    want = dv.rollout(*beam(), **LOADS).x
-    dv.refine(lambda: dv.rollout(*beam(), **LOADS).x.sum())
-    with pytest.raises(ZeroDivisionError):
-        dv.refine(lambda: dv.rollout(*beam(), **LOADS).x.sum() / (1 // 0))
-    assert torch.equal(dv.rollout(*beam(), **LOADS).x, want)
-
-
 def loss_of(**given: Any) -> Any:
     return lambda: dv.rollout(*beam(), **LOADS | given).x.sum()
 
@@ -369,9 +264,3 @@ def loss_of(**given: Any) -> Any:
 def test_bad_input(call: Any, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         call()
-
-
-def test_a_loss_that_is_not_finite_is_called_that() -> None:
-    loss = loss_of()
-    told = dv.refine(lambda: float("nan") * loss())
-    assert not told.survives and str(told).endswith("the loss itself is not finite")

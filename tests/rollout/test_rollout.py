@@ -1,7 +1,9 @@
 """Rollouts: the same numbers as a loop of steps, under every checkpoint schedule, tape and save mode."""
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -260,31 +262,6 @@ def test_zero_steps_return_the_initial_state(device: str) -> None:
             assert torch.equal(slope, torch.ones_like(slope))
 
 
-def test_progress_goes_to_stderr_and_counts_each_step_once(capsys: pytest.CaptureFixture[str]) -> None:
-    scene = build_scene("plain")
-    call, leaves = leaves_of(scene.inputs())
-    trajectory = dv.rollout(
-        scene.model(), **call, steps=3, sweeps=1, progress=True, checkpoint_every=dv.BinomialCheckpoints(1)
-    )
-    torch.autograd.grad(trajectory.x.sum(), leaves, allow_unused=True)
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert [line for line in shown.err.replace("\n", "\r").split("\r") if line] == ["step 1/3", "step 2/3", "step 3/3"]
-    dv.rollout(scene.model(), **scene.inputs(), steps=3, sweeps=1)
-    assert capsys.readouterr().err == ""
-
-
-def test_inputs_are_untouched(device: str) -> None:
-    scene = build_scene("anchored")
-    model, inputs = scene.model(device), scene.inputs(device=device)
-    before = {k: t.clone() for k, t in inputs.items() if isinstance(t, Tensor)}
-    for _ in range(2):
-        trajectory = dv.rollout(model, **inputs, steps=3, sweeps=2)
-    assert torch.equal(trajectory.x[0], inputs["x"])
-    trajectory.x.zero_()
-    assert all(torch.equal(inputs[k].nan_to_num(), before[k].nan_to_num()) for k in before)  # NaN: not read
-
-
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [("steps", -1, ValueError), ("steps", 2.5, TypeError), ("steps", True, TypeError), ("save", "every", ValueError),
@@ -299,16 +276,10 @@ def test_bad_options_raise(name: str, value: Any, error: type[Exception]) -> Non
         dv.rollout(scene.model(), **options)
 
 
-@pytest.mark.parametrize(("value", "error"), [(0, ValueError), (-2, ValueError), (1.0, TypeError), (True, TypeError)])
-def test_binomial_wants_a_positive_count(value: Any, error: type[Exception]) -> None:
-    with pytest.raises(error, match="snapshots: expected .*got"):
-        dv.BinomialCheckpoints(value)
-
-
 # --- cost of a schedule -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("steps", "snapshots"), [(10, 1), (12, 2), (20, 3), (40, 4), (35, 3)])
+@pytest.mark.parametrize(("steps", "snapshots"), [(10, 1), (12, 2), (20, 3)])
 def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -> None:
     """No step runs forward more than 1 + t times, t the least number with C(snapshots + t, t) >= steps."""
     from math import comb
@@ -347,31 +318,175 @@ def test_changing_an_argument_before_a_checkpointed_backward_raises(device: str,
         end.sum().backward()
 
 
-def test_a_force_on_a_pinned_vertex_reaches_nothing(device: str) -> None:
-    mesh = dv.mesh.cube(2)
-    model = dv.Model(mesh, pinned=[0], device=device)
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    force = torch.zeros_like(x)
-    force[0] = float("nan")
-    density = torch.tensor(1e3, dtype=x.dtype, device=device, requires_grad=True)
-    rest = model.rest_points.clone().requires_grad_()
-    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2, "density": density, "rest_points": rest}
-    end = dv.step(model, x, v, force=force, **options)[0]
-    grads = torch.autograd.grad(end.square().sum(), (density, rest))
-    clean = dv.step(model, x, v, force=torch.zeros_like(x), **options)[0]
-    for grad, expected in zip(grads, torch.autograd.grad(clean.square().sum(), (density, rest)), strict=True):
-        assert torch.equal(grad, expected) and bool(expected.any())
+# --- values of steps --------------------------------------------------------------------------------------------------
 
 
-def test_what_is_not_differentiated_raises() -> None:
-    model = dv.Model(dv.mesh.cube(2))
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    with pytest.raises(TypeError, match="time_step: .*not differentiable"):
-        dv.step(model, x, v, mu=1.0, lam=1.0, time_step=torch.tensor(0.01, requires_grad=True), sweeps=1)
+FEW, TWO_SWEEPS = 6, 3
 
 
-def test_the_old_name_of_binomial_checkpoints_works() -> None:
-    with pytest.warns(DeprecationWarning, match="BinomialCheckpoints"):
-        assert dv.Binomial is dv.BinomialCheckpoints  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(AttributeError, match="Trinomial"):
-        _ = dv.Trinomial  # pyright: ignore[reportAttributeAccessIssue]
+@pytest.mark.parametrize("name", ["mu", "force", "prescribed"])
+def test_values_of_all_steps_without_per_step_say_what_takes_them(name: str) -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+    whole = inputs[name].expand(*inputs["x"].shape[:-2], *inputs[name].shape[-1 if name == "mu" else -2 :])
+    with pytest.raises(ValueError, match=rf"{name}: .*in a rollout, per_step\({name}\) takes one for each step"):
+        dv.rollout(
+            model,
+            **(inputs | {name: torch.stack([whole] * FEW)}),
+            steps=FEW,
+            sweeps=TWO_SWEEPS,
+        )
+
+
+@pytest.mark.parametrize("name", ["mu", "gravity", "prescribed", "rest_points"])
+def test_a_function_that_returns_nothing_raises(name: str) -> None:
+    """A forgotten return would otherwise be a grip that stays. Of forces, None says that a step has none."""
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+    with pytest.raises(TypeError, match=f"{name}: expected a function that returns the value.*got None .in step 0"):
+        dv.rollout(model, **(inputs | {name: lambda k, x, v: None}), steps=FEW, sweeps=TWO_SWEEPS)
+
+
+def test_a_trajectory_prints_in_one_line() -> None:
+    scene = build_scene("anchored")
+    found = dv.rollout(scene.model(), **scene.inputs(), steps=4, sweeps=1, save=2)
+    expected = f"Trajectory(3 frames of steps 0 to 4, x and v of shape {list(found.x.shape)})"
+    assert repr(found) == expected
+
+
+def test_a_force_of_none_is_no_force() -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), {k: value for k, value in scene.inputs().items() if k != "force"}
+    without = dv.rollout(model, **inputs, steps=FEW, sweeps=TWO_SWEEPS)
+    none = dv.rollout(model, **inputs, force=lambda k, x, v: None, steps=FEW, sweeps=TWO_SWEEPS)
+    assert torch.equal(none.x, without.x)
+
+
+def test_an_error_of_a_step_says_which_step_it_was() -> None:
+    """A muscle that turns a body inside out does so at some moment."""
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+    rest = inputs["rest_points"] if inputs.get("rest_points") is not None else model.rest_points
+    turned = inputs | {"rest_points": lambda k, x, v: rest if k < 2 else -rest}
+    with pytest.raises(ValueError, match=r"rest_points: .*at tet \d+ of scene 0 .in step 2.$"):
+        dv.rollout(model, **turned, steps=FEW, sweeps=TWO_SWEEPS)
+
+
+@pytest.mark.parametrize(
+    ("name", "function"), [("mu", lambda k: 1e4), ("force", lambda x, v: 0.0), ("parameters", lambda: 1e3)]
+)
+def test_a_function_of_other_arguments_raises(name: str, function: Callable[..., Any]) -> None:
+    scene = build_scene("anchored")
+    value = {"anchor.stiffness": function} if name == "parameters" else function
+    with pytest.raises(TypeError, match=rf"{name}.*: expected a function of step, x, v: too many positional"):
+        dv.rollout(scene.model(), **(scene.inputs() | {name: value}), steps=FEW, sweeps=TWO_SWEEPS)
+
+
+@pytest.mark.parametrize(
+    ("observe", "says"),
+    [
+        (lambda x, v: x, "expected a function of x, v, step: too many positional"),
+        (lambda step, x, v: x, "expected a function of x, v, step in this order, got step, x, v"),
+        (lambda step, *rest, x=None: step, "expected a function of x, v, step in this order, got step"),
+        (3, "expected a function of x, v, step, got int"),
+        (lambda x, v, k: {str(k): x}, r"with the keys \['1'\] after each .* keys \['2'\] after step 2"),
+        (lambda x, v, k: (x,) * (5 - k), "expected a tuple of 4 after each .* got a tuple of 3 after step 2"),
+        (lambda x, v, k: (x,) * k, "expected a tuple of 1 after each .* got a tuple of 2 after step 2"),
+        (lambda x, v, k: {"a": x} if k == 1 else x, r"with the keys \['a'\] after each .* got a tensor of shape"),
+        (lambda x, v, k: None if k == 1 else x, "expected None after each .* got a tensor of shape"),
+        (lambda x, v, k: {"a": x[:k]}, r"a tensor of shape \[1, .* after each .* \[2, .* after step 2"),
+    ],
+)
+def test_what_observe_returns_is_alike_after_each_step(observe: Any, says: str) -> None:
+    scene = build_scene("anchored")
+    with pytest.raises((TypeError, ValueError), match=f"observe: .*{says}"):
+        dv.rollout(scene.model(), **scene.inputs(), steps=3, sweeps=1, observe=observe)
+
+
+def test_save_takes_words_and_integers() -> None:
+    scene = build_scene("anchored")
+    given = {**scene.inputs(), "steps": 5, "sweeps": 1}
+    assert dv.rollout(scene.model(), **given, save=np.int64(2)).steps == [0, 2, 4, 5]
+    for bad in (np.arange(2), torch.arange(2), 2.0, True, 0, "some"):
+        with pytest.raises(ValueError, match='save: expected "all", "last" or an integer > 0, got'):
+            dv.rollout(scene.model(), **given, save=bad)
+    with pytest.raises(TypeError, match="checkpoint_every: expected an integer, got ndarray"):
+        dv.rollout(scene.model(), **given, checkpoint_every=np.arange(2))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("name", ["force", "prescribed"])
+def test_a_function_that_returns_no_finite_number_is_named(name: str) -> None:
+    model = dv.Model(dv.mesh.cube(), pinned=[0])
+    x, given = model.rest_points, {"mu": 1e4, "lam": 1e4, "time_step": 0.01, name: lambda k, x, v: float("inf")}
+    with pytest.raises(ValueError, match=f"^{name}: expected finite values, got inf"):
+        dv.rollout(model, x, 0 * x, **given, steps=FEW, sweeps=TWO_SWEEPS)
+    with pytest.raises(ValueError, match=f"^{name}: expected finite values, got inf"):
+        dv.solve(model, x, 0 * x, **(given | {name: float("inf")}))
+
+
+# --- functions that return something else under checkpoints -----------------------------------------------------------
+
+
+MESH = dv.mesh.beam(3, 2, 2, size=(0.3, 0.1, 0.1))
+REPEATED = (None, 3, dv.BinomialCheckpoints(2))
+
+
+def end(model: dv.Model, force: Callable[[int, Tensor, Tensor], Any], schedule: Any) -> Tensor:
+    x = model.rest_points
+    motion = dv.rollout(model, x, torch.zeros_like(x), steps=7, mu=1e5, lam=1e5, time_step=0.01, sweeps=3, force=force,
+                        checkpoint_every=schedule, save="last")  # fmt: skip
+    return motion.x[-1, :, 1].sum()
+
+
+def beam(device: str) -> dv.Model:
+    return dv.Model(MESH, pinned=MESH.points[:, 0] == 0, device=device)
+
+
+def assert_refused(loss: Tensor, weight: Tensor) -> None:
+    if weight.is_cuda:
+        assert torch.autograd.grad(loss, weight)[0].isnan().all()
+    else:
+        with pytest.raises(RuntimeError, match="force: expected the same value for step"):
+            torch.autograd.grad(loss, weight)
+
+
+def test_weights_that_change_in_place(device: str) -> None:
+    model = beam(device)
+    p = model.rest_points.new_tensor(0.3).requires_grad_()
+    loss = end(model, lambda k, x, v: -10.0 * p * v, 3)
+    with torch.no_grad():
+        p.mul_(2)
+    assert_refused(loss, p)
+
+
+@pytest.mark.parametrize("schedule", REPEATED[1:], ids=str)
+@pytest.mark.parametrize("kind", ["integral", "noise"])
+def test_state_of_its_own(kind: str, schedule: Any, device: str) -> None:
+    model, rng = beam(device), np.random.default_rng(0)
+    p, rest = model.rest_points.new_tensor(5.0).requires_grad_(), model.rest_points
+    kept = torch.zeros_like(rest)
+
+    def force(k: int, x: Tensor, v: Tensor) -> Tensor:
+        nonlocal kept
+        kept = kept + 0.01 * (rest - x.detach()) if kind == "integral" else rest.new_tensor(rng.normal(size=x.shape))
+        return p * kept
+
+    assert torch.autograd.grad(end(model, force, None), p)[0].abs() > 0  # called once
+    assert_refused(end(model, force, schedule), p)
+
+
+@pytest.mark.parametrize("schedule", REPEATED, ids=str)
+def test_what_repeats_itself_passes(schedule: Any, device: str) -> None:
+    """Dropout, whose random numbers torch keeps; None; infinite values are named as ever."""
+    model = beam(device)
+    p = model.rest_points.new_tensor(5.0).requires_grad_()
+
+    def gradient(schedule: Any) -> Tensor:
+        torch.manual_seed(0)
+        force = lambda k, x, v: None if k == 2 else torch.nn.functional.dropout(p * v + 1.0, 0.5)  # noqa: E731
+        return torch.autograd.grad(end(model, force, schedule), p)[0]
+
+    assert gradient(None).abs() > 0 and torch.equal(gradient(schedule), gradient(None))
+    if device == "cpu":
+        with pytest.raises(ValueError, match="force: expected finite values"):
+            end(model, lambda k, x, v: p * torch.full_like(x, torch.inf), schedule)

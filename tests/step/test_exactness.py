@@ -11,7 +11,6 @@ import pytest
 import torch
 from helpers.exactness import BATCHED, MEASURED, check, check_shapes, measure
 from helpers.marks import slow
-from helpers.spreads import beyond
 from torch import Tensor
 
 import diffvbd as dv
@@ -50,7 +49,7 @@ def table(request: pytest.FixtureRequest):
 
 def pairwise() -> tuple[list[tuple], list[tuple]]:
     """Quick rows and slow ones: each case with every sweep count; mesh kinds and steps rotate, so that all their pairs
-    occur. One sweep is always quick; longer runs and larger meshes are so for every third case."""
+    occur. One sweep is always quick; longer runs and larger meshes are so for every sixth case."""
     rows, quick = [], []
     for i, case in enumerate(CASES):
         for j, sweeps in enumerate(SWEEPS):
@@ -60,7 +59,7 @@ def pairwise() -> tuple[list[tuple], list[tuple]]:
         rows.append((case, KINDS[(i + 1) % 3], "medium", 5, 1))
     for case, kind, size, sweeps, steps in rows:
         short = size == "small" and (sweeps == 1 or (sweeps < 20 and steps == 1))
-        if short or list(CASES).index(case) % 3 == 0:
+        if short or list(CASES).index(case) % 6 == 0:
             quick.append((case, kind, size, sweeps, steps))
     rows += [("plain", "delaunay", "large", 2, 1), ("paper", "random", "large", 1, 4)]
     rows += [("floor_filtered", "structured", "large", 5, 1), ("inverted", "delaunay", "large", 1, 1)]
@@ -93,34 +92,20 @@ def test_full_product_large(device: str, case: str, kind: str, sweeps: int) -> N
     check(device, case, kind, "large", sweeps, 1)
 
 
-@pytest.mark.parametrize(("rows", "least"), [(QUICK[1::4], 20), slow([*QUICK, *SLOW], 100)], ids=("quick", "all"))
-def test_headline(device: str, rows: list[tuple], least: int) -> None:
+@pytest.mark.slow
+def test_headline(device: str) -> None:
     """Scenes that rounding leaves alone (spread <= 1e-13): the worst gradient of each, and the typical one."""
     errors = {}
-    for row in rows:
+    for row in [*QUICK, *SLOW]:
         m = measure(device, *row)
         if row[3] > 0 and m.spread <= tolerance("headline_spread"):
             errors[row] = max(m.errors[name] for name in m.gradients)
     ordered = sorted(errors.values())
     worst = max(errors, key=lambda row: errors[row])
     print(f"{len(errors)} scenes, median {ordered[len(errors) // 2]:.1e}, worst {ordered[-1]:.1e} in {worst}")
-    assert len(errors) >= least
+    assert len(errors) >= 100
     assert ordered[len(errors) // 2] <= tolerance("headline_median")
     assert ordered[-1] <= tolerance("headline_worst")
-
-
-def test_bars_are_raised_where_an_error_asks_for_it_and_no_further() -> None:
-    asked = []
-
-    def sample() -> dict[str, float]:
-        asked.append(None)
-        return {"x": 0.5 / tolerance("spread_factor"), "v": 0.0}
-
-    floors = {"x": 0.25, "v": 0.25}
-    assert not beyond({"x": 0.25, "v": 0.125}, floors, [sample]) and not asked
-    assert not beyond({"x": 0.5, "v": 0.125}, floors, [sample, sample]) and len(asked) == 1
-    assert set(beyond({"x": 0.75, "v": 0.5}, floors, [sample, sample])) == {"x", "v"} and len(asked) == 3
-    assert set(beyond({"x": float("nan"), "v": 0.0}, floors, [sample])) == {"x"}
 
 
 @pytest.mark.parametrize("sweeps", (1, 3))

@@ -61,20 +61,13 @@ def least_gap(density: float = DENSITY) -> float:
     return (1 - FILTER_ETA) * bearing_gap(density * 0.2**3 * GRAVITY, KAPPA, DHAT)
 
 
-CASES = [(k, omega) for k in range(6) for omega in (0.5, 1.0, 1.6) if k != 1 or omega <= 1]
+CASES = [(0, 1.0), (1, 0.5), (1, 1.0), (2, 1.6), (3, 1.0), (5, 0.5), (5, 1.6)]
 
 
 @pytest.mark.parametrize(("sweeps", "relaxation"), CASES)
 def test_a_cube_at_rest(sweeps: int, relaxation: float) -> None:
     model, x, options = scenes(relaxation=relaxation)
     check_rest(model, x, options, 300, sweeps, min(START, least_gap()) * (1 - 1e-9))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sweeps", "relaxation"), CASES)
-def test_a_cube_at_rest_for_long(sweeps: int, relaxation: float) -> None:
-    model, x, options = scenes(relaxation=relaxation)
-    check_rest(model, x, options, 1500, sweeps, min(START, least_gap()) * (1 - 1e-9))
 
 
 PARTS = [(*run, friction) for run in ((0, 2), (1, 2), (1, 4), (2, 1), (4, 2)) for friction in (None, 0.3)]
@@ -88,13 +81,6 @@ def test_a_cube_at_rest_in_parts(sweeps: int, detections: int, friction: float |
     more = () if friction is None else (dv.Friction(friction),)
     model, x, options = scenes(pairs, *more)
     check_rest(model, x, options, 240, sweeps, min(START, least_gap()) * (1 - 1e-9))
-
-
-@pytest.mark.parametrize(("sweeps", "detections"), ((1, None), slow(4, 2), (1, 2)))
-def test_a_heavy_cube(sweeps: int, detections: int | None) -> None:
-    more = () if detections is None else (dv.PairBarrier(dhat=DHAT, detections=detections, self_contact=False),)
-    model, x, options = scenes(*more, density=2e4)
-    check_rest(model, x, options, 240, sweeps, least_gap(2e4))
 
 
 def test_without_sweeps_a_body_sinks_to_dhat_and_no_deeper() -> None:

@@ -8,8 +8,6 @@ from helpers.small_step import (
     ARGUMENTS,
     STEP,
     Arguments,
-    assert_same,
-    gradients,
     loss,
     run_step,
     scalar,
@@ -45,19 +43,6 @@ def test_gradcheck_of_every_argument(device: str, name: str) -> None:
     assert gradcheck(run, (value,))
 
 
-def test_gradcheck_of_material_and_state_together_without_vertex_energies(device: str) -> None:
-    model = small_model(
-        device, energies=(dv.StableNeoHookean("paper"),), saturation=0.2, regularization=0.1, relaxation=1.3
-    )
-    fixed = small_inputs(model)
-    values = tuple(fixed[k].clone().requires_grad_() for k in ("x", "v", "mu", "lam"))
-
-    def run(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-        return dv.step(model, x, v, mu=mu, lam=lam, **STEP)
-
-    assert gradcheck(run, values)
-
-
 # --- torch.func -------------------------------------------------------------------------------------------------------
 
 
@@ -66,12 +51,6 @@ def members(inputs: Arguments, name: str, count: int = 3) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     shape = (count, *inputs[name].shape)
     return inputs[name] + 0.1 * torch.rand(shape, dtype=inputs[name].dtype, generator=generator).to(inputs[name])
-
-
-def test_func_grad_equals_autograd(device: str) -> None:
-    model = small_model(device)
-    inputs = small_inputs(model)
-    assert_same(torch.func.grad(lambda a: loss(model, a))(inputs), gradients(model, inputs), 0.0)
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
@@ -118,38 +97,6 @@ def test_vmap_over_several_arguments_and_gradient_of_a_shared_one(device: str) -
     each = torch.func.vmap(torch.func.grad(one, argnums=2), in_dims=(0, 0, None, None))(x, mu, *shared)
     single = torch.stack([torch.func.grad(one, argnums=2)(a, b, *shared) for a, b in zip(x, mu, strict=True)])
     assert relative_error(each, single) <= tolerance("sum")
-
-
-def test_vmap_over_a_batch_of_scenes_and_other_dimensions(device: str, one_regime: None) -> None:
-    model = small_model(device)
-    inputs = small_inputs(model)
-    x = torch.stack([members(inputs, "x", 2), members(inputs, "x", 2) + 0.05, members(inputs, "x", 2) - 0.05], 1)
-    v = inputs["v"].expand(2, -1, -1)
-    plain = {k: t for k, t in inputs.items() if k not in ("x", "v")}
-
-    def run(x: Tensor) -> tuple[Tensor, Tensor]:
-        return run_step(model, plain | {"x": x, "v": v})
-
-    actual = torch.func.vmap(run, in_dims=1, out_dims=1)(x)  # members in dimension 1, scenes in dimension 0
-    for k in range(2):
-        assert torch.equal(actual[k], torch.stack([run(x[:, n])[k] for n in range(3)], 1))
-    slope = torch.func.vmap(torch.func.grad(lambda x: scalar(*run(x))), in_dims=1, out_dims=1)(x)
-    expected = torch.stack([torch.func.grad(lambda x: scalar(*run(x)))(x[:, n]) for n in range(3)], 1)
-    assert relative_error(slope, expected) <= tolerance("sum")
-
-
-def test_nested_vmap(device: str) -> None:
-    model = small_model(device)
-    inputs = small_inputs(model)
-    x, mu = members(inputs, "x", 2), members(inputs, "mu", 3)
-
-    def one(x: Tensor, mu: Tensor) -> Tensor:
-        return torch.func.grad(lambda m: loss(model, inputs | {"x": x, "mu": m}))(mu)
-
-    inner = torch.func.vmap(one, in_dims=(None, 0))
-    actual = torch.func.vmap(inner, in_dims=(0, None))(x, mu)
-    expected = torch.stack([torch.stack([one(a, b) for b in mu]) for a in x])
-    assert relative_error(actual, expected) <= tolerance("sum")
 
 
 @pytest.mark.parametrize("pinned", [[0, 1], []], ids=["pinned", "free"])

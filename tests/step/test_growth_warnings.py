@@ -40,13 +40,6 @@ def end(integrator: Any, sweeps: int, relaxation: float, modulus: float = 1e8, r
     return speed, [str(w.message) for w in said if "not finite" not in str(w.message)]
 
 
-def messages(run: Any) -> list[str]:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        run()
-    return [str(w.message) for w in said]
-
-
 EULER, BDF2, SDIRK2 = dv.ImplicitEuler(), dv.BDF2(), dv.SDIRK2()
 
 
@@ -96,41 +89,6 @@ def test_the_stiffest_tets_and_scenes_count() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         dv.step(model, x, 0 * x, mu=soft, lam=soft, time_step=0.01, sweeps=2, integrator=BDF2)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_slivers_ask_for_the_sweeps_that_they_need(dtype: torch.dtype) -> None:
-    """Of a regular mesh eight sweeps of a step are enough; of one with a flat tet they are not, each time."""
-    said = []
-    for height in (1.0, 0.01):
-        mesh = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1), split="kuhn")
-        points = mesh.points.copy()
-        corners = mesh.tets[31]
-        base = points[corners[:3]].mean(0)
-        points[corners[3]] = base + height * (points[corners[3]] - base)
-        mesh = dv.TetMesh(points, mesh.tets)
-        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=1.5, coarse="auto", dtype=dtype)
-        x = model.rest_points
-        given: dict[str, Any] = {"young": 1e7, "poisson": 0.38, "time_step": 0.03, "integrator": SDIRK2}
-        said.append([messages(lambda m=model, x=x, g=given: dv.step(m, x, 0 * x, sweeps=8, **g)) for _ in range(2)])
-    assert said[0] == [[], []] and said[1][0] == said[1][1]
-    (text,) = said[1][0]
-    found = re.search(r"grow (\S+) times in every step; take (\d+) sweeps", text)
-    assert found is not None and float(found[1]) > growth.GROWS
-    assert messages(lambda: dv.step(model, x, 0 * x, sweeps=int(found[2]), **given)) == []
-
-
-def test_what_is_not_elastic_and_how_large_a_mesh_is_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A floor and its friction are left out of the measurement, and of a large mesh a part is measured."""
-    floor = (dv.StableNeoHookean(), dv.FloorBarrier(height=0.02), dv.Friction(0.5))
-    given: dict[str, Any] = {"mu": 1e8, "lam": 1e8, "time_step": 0.01, "sweeps": 2, "integrator": BDF2}
-    for energies, most in ((floor, growth.MOST_TETS), (floor[:1], 30)):
-        monkeypatch.setattr(growth, "MOST_TETS", most)
-        model = dv.Model(BODY, pinned=BODY.points[:, 0] < 1e-9, relaxation=1.5, energies=energies)
-        x = model.rest_points + 1.0
-        mu = torch.full((model.num_tets,), 1e8, dtype=x.dtype)
-        said = messages(lambda m=model, x=x, g=given | {"mu": mu}: dv.step(m, x, 0 * x, **g))
-        assert any("with BDF2()" in text for text in said)
 
 
 def test_a_measurement_is_made_once_for_alike_moduli(monkeypatch: pytest.MonkeyPatch) -> None:

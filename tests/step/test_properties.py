@@ -188,13 +188,3 @@ def test_meshes_without_tets(vertices: int, lead: tuple) -> None:
     gradients = torch.autograd.grad(end.sum() + v.sum(), (x, held, mu), allow_unused=True, materialize_grads=True)
     assert torch.allclose(gradients[0], torch.full_like(x, -10.0)) and gradients[2].shape == (0,)
     assert torch.allclose(gradients[1], torch.full_like(x, 11.0))
-
-
-def test_everything_pinned_is_kinematic() -> None:
-    scene = testing.build_scene("plain", "random", "small")
-    model = dv.Model(dv.TetMesh(scene.points, scene.tets), pinned=torch.ones(len(scene.points), dtype=torch.bool))
-    inputs = scene.inputs()
-    inputs["prescribed"] = 1.1 * inputs["x"]
-    end, v = dv.step(model, sweeps=5, **inputs)
-    assert model.num_colors == 0 and torch.equal(end, inputs["prescribed"])
-    assert torch.equal(v, (inputs["prescribed"] - inputs["x"]) / inputs["time_step"])

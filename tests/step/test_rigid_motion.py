@@ -10,8 +10,6 @@ import diffvbd as dv
 from diffvbd.testing import relative_error
 from diffvbd.testing.tolerances import tolerance
 
-SWEEPS = (0, 1, 2, 5, 20)
-
 
 def momenta(model: dv.Model, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     """Linear momentum, and angular momentum about the center of mass."""
@@ -66,33 +64,6 @@ def test_spin_of_a_stiff_body_by_each_integrator() -> None:
     assert bdf[0] / bdf[1] > 4 and abs(bdf[0]) < 0.01 * euler[0]
     # a soft body's vibrations are resolved
     assert lost(1e4, dv.SDIRK2(), 30) < 0.05 * lost(1e4, dv.ImplicitEuler(), 30)
-
-
-@pytest.mark.parametrize("mu", (1e3, 1e9))
-def test_free_fall_is_exact(device: str, mu: float) -> None:
-    """x_n = x_0 + g h^2 n (n + 1) / 2, of a stiff body too, which few sweeps from x + h v hardly move."""
-    model = dv.Model(dv.mesh.cube(3, split="kuhn"), device=device)
-    n, h = 20, 0.01
-    for sweeps in SWEEPS:
-        x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
-        for _ in range(n):
-            x, v = dv.step(model, x, v, mu=mu, lam=mu, time_step=h, sweeps=sweeps)
-        fallen = torch.tensor([0.0, -9.81 * h * h * n * (n + 1) / 2, 0.0], dtype=x.dtype, device=device)
-        assert relative_error(x - model.rest_points, fallen.expand_as(x)) <= tolerance("rigid_fall")
-
-
-def test_each_body_falls_by_itself(device: str) -> None:
-    """Bodies are the connected sets of tets, whatever their labels; one with a pinned vertex is left to the sweeps."""
-    mesh = dv.mesh.replicate(dv.mesh.cube(2, split="kuhn"), [[0, 0, 0], [3, 0, 0], [6, 0, 0]])
-    mesh = dv.TetMesh(mesh.points, mesh.tets)  # one label
-    model = dv.Model(mesh, pinned=[0], device=device)
-    x = model.rest_points.clone()
-    v = torch.zeros_like(x)
-    v[8:16, 0], v[16:, 1] = 1.0, 2.0
-    x1, v1 = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=1)
-    fallen = torch.tensor([0.0, -9.81 * 0.01, 0.0], dtype=x.dtype, device=device)
-    assert relative_error(v1[8:], v[8:] + fallen) <= tolerance("rigid_fall")
-    assert bool((x1[0] == x[0]).all()) and relative_error(v1[1:8], fallen.expand(7, 3)) > 1e-3
 
 
 def test_a_body_of_thousands_among_small_ones(device: str) -> None:

@@ -88,22 +88,6 @@ def test_a_body_rests(device: str, relaxation: float, sweeps: int) -> None:
         assert float(gaps(model, x).min()) >= 0.5 * least
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sweeps", (0, 1, 2, 3, 4, 5))
-@pytest.mark.parametrize("relaxation", (0.5, 1.0, 1.6))
-@pytest.mark.parametrize("normal", NORMALS)
-def test_a_body_rests_for_long(device: str, normal: str, relaxation: float, sweeps: int) -> None:
-    mu = torch.tensor([[2e4], [2e5], [2e7]], dtype=torch.float64, device=device)
-    model = resting(device, normal, relaxation=relaxation)
-    n = torch.tensor(NORMALS[normal], dtype=torch.float64, device=device)
-    x = model.rest_points.expand(3, -1, -1).clone()
-    x, v, lowest = run(model, x, torch.zeros_like(x), 1500, sweeps, tuple((-9.81 * n).tolist()), mu)
-    assert lowest >= 0.1 * equilibrium_gap(DENSITY * EDGE**3 * 9.81 / 4)
-    assert float(v.norm(dim=-1).max()) <= tolerance("rest_speed")
-    moved = (x - model.rest_points).mean(-2)
-    assert float((moved - (moved @ n)[:, None] * n).norm(dim=-1).max()) <= tolerance("rest_drift")
-
-
 def energy(model: dv.Model, x: torch.Tensor, v: torch.Tensor, mu: float) -> torch.Tensor:
     """Kinetic, gravitational, elastic and barrier energy of each scene [J]."""
     tets = x[:, model.tets]

@@ -105,41 +105,6 @@ def test_gradients_are_those_of_the_start_that_was_taken(device: str, mu: float,
             assert auto[name] is None or not auto[name].any(), name
 
 
-def test_gradients_of_bodies_that_choose_differently(device: str) -> None:
-    """Each body's rows are those of the start that it took."""
-    mesh, half = two_beams(), MESH.num_vertices
-    mu, bars = by_tet(SOFT, STIFF, device=device), {}
-    for start in ("auto", *STARTS):
-        model = model_of(start, device, mesh)
-        x, v = moving(model)
-        leaves = [x.clone().requires_grad_(), v.clone().requires_grad_(), torch.zeros_like(x).requires_grad_()]
-        end = dv.step(model, *leaves[:2], mu=mu, lam=1.5 * mu, force=leaves[2], time_step=STEP, sweeps=2)[0]
-        bars[start] = torch.autograd.grad((torch.cos(3 * end) * end).sum(), leaves)
-    for auto, y, coasting in zip(*bars.values(), strict=True):
-        assert relative_error(auto[:half], y[:half]) <= tolerance("formula")
-        assert relative_error(auto[half:], coasting[half:]) <= tolerance("formula")
-        assert auto[:half].any() and auto[half:].any()
-        assert relative_error(y[half:], coasting[half:]) > 1e-6
-
-
-def test_a_stiff_cantilever_under_few_sweeps(device: str) -> None:
-    """Off converged steps, after half a second and in units of how far these have moved."""
-    mesh, steps = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2)), 30
-    options = {"mu": 1e7, "lam": 1.5e7, "time_step": STEP, "steps": steps, "save": "last"}
-
-    def end(start: Any, sweeps: int, relaxation: float = 1.0) -> Tensor:
-        model = model_of(start, device, mesh, relaxation=relaxation)
-        x = model.rest_points
-        return dv.rollout(model, x, torch.zeros_like(x), sweeps=sweeps, **options).x[-1]
-
-    goal = end("inertia", 1500, 1.6)
-    moved = float((goal - model_of("auto", device, mesh).rest_points).norm(dim=-1).max())
-    off = {start: float((end(start, 20) - goal).norm(dim=-1).max()) / moved for start in ("auto", "predictor")}
-    assert moved > 1e-3
-    assert off["auto"] < 1
-    assert off["predictor"] > 10 * off["auto"]
-
-
 def test_what_is_executed(device: str) -> None:
     """`starts_from`: there is nothing to choose where every body is corrected; beside pairs a step chooses itself."""
     free, floor = dv.Model(MESH, device=device), dv.FloorBarrier(height=-1.0)
