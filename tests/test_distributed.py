@@ -61,8 +61,8 @@ class Throw:
         down = torch.tensor([0.0, -3.0, 0.0], dtype=torch.float64)  # which some parts detect more often
         v = (self.network(self.goals[part]) + self.goals[part, :1] * down)[:, None]
         v = v.expand(-1, self.model.num_vertices, -1)
-        end = dv.rollout(self.model, self.model.rest_points.expand_as(v), v, steps=3, mu=1e4, lam=1e4, time_step=0.02,
-                         sweeps=5, save="last")  # fmt: skip
+        end = dv.rollout(self.model, self.model.rest_points.expand_as(v), v, dv.VBD(0.02, 5), steps=3, mu=1e4, lam=1e4,
+                         save="last")  # fmt: skip
         return (end.x[-1].mean(-2) - self.goals[part]).square().sum() / SCENES
 
 

@@ -55,7 +55,7 @@ def check_gradient(names: dict[str, Any]) -> None:
     """The gradient of the first example is that of differences, and of the sign that it says."""
 
     def height(mu: torch.Tensor) -> torch.Tensor:
-        options = {"steps": 20, "mu": mu, "lam": 2e5, "time_step": 0.01, "sweeps": 40}
+        options = {"steps": 20, "mu": mu, "lam": 2e5, "solver": dv.VBD(0.01, 40)}
         return dv.rollout(names["model"], names["x"], names["v"], **options).x[-1, :, 1].mean()
 
     mu = names["mu"].detach()

@@ -11,7 +11,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import scopes
 
-OPTIONS: dict[str, Any] = {"mu": 1e4, "lam": 2e4, "time_step": 0.01, "sweeps": 2}
+OPTIONS: dict[str, Any] = {"mu": 1e4, "lam": 2e4, "solver": dv.VBD(0.01, 2)}
 
 
 def overflowing(run: Callable[..., Any] = dv.step) -> None:
@@ -55,10 +55,10 @@ def test_another_thread_is_not_checked() -> None:
 
 def test_another_thread_is_not_recorded() -> None:
     model, x = touching()
-    with dv.contact.record() as mine:
+    with dv.record("contact") as mine:
         assert not in_thread(lambda: dv.step(model, x, torch.zeros_like(x), **OPTIONS))
         assert mine == []
-        with dv.contact.record() as inner:
+        with dv.record("contact") as inner:
             dv.step(model, x, torch.zeros_like(x), **OPTIONS)
         dv.step(model, x, torch.zeros_like(x), **OPTIONS)
     dv.step(model, x, torch.zeros_like(x), **OPTIONS)
@@ -69,7 +69,7 @@ def test_a_checkpointed_backward_in_another_thread_is_recorded() -> None:
     """As torch does it on CUDA, whose backward has threads of its own."""
     model, x = touching()
     v = torch.zeros_like(x, requires_grad=True)
-    with dv.contact.record() as found:
+    with dv.record("contact") as found:
         end = dv.rollout(model, x, v, steps=4, checkpoint_every=2, save="last", **OPTIONS)
         assert len(found) == 8
         assert not in_thread(end.x[-1].sum().backward)

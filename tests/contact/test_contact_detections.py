@@ -43,8 +43,8 @@ def test_only_fast_motion_beside_others_takes_more_than_one(dtype: torch.dtype, 
             v[:, 1] = -speed
         out = []
         for _ in range(3):
-            with dv.contact.record() as found:
-                x, v = dv.step(model, x, v, time_step=1 / 60, sweeps=4, **MATERIAL)
+            with dv.record("contact") as found:
+                x, v = dv.step(model, x, v, dv.VBD(1 / 60, 4), **MATERIAL)
             out.append(len(found))
             assert len(dv.contact.intersections(model, x)) == 0
         return out
@@ -63,7 +63,7 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
         mass = model.mass[:, None]
         first = (mass * v).sum(0)
         for _ in range(STEPS):
-            x, v = dv.step(model, x, v, time_step=1 / 60, sweeps=sweeps, **MATERIAL)
+            x, v = dv.step(model, x, v, dv.VBD(1 / 60, sweeps), **MATERIAL)
         assert float((mass * v)[: len(v) - 64].sum(0).norm()) > 0.2 * float(first.norm())  # they did collide
         return float(((mass * v).sum(0) - first).norm() / first.norm())
 
@@ -93,8 +93,8 @@ def test_a_row_that_is_struck_keeps_its_momentum(count: int, gap: float, speed: 
     mass = model.mass[:, None]
     first, shares = (mass * v).sum(0), []
     for _ in range(math.ceil((count - 1) * gap / speed / 0.01) + count):
-        with dv.contact.record() as found:
-            x, v = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))
+        with dv.record("contact") as found:
+            x, v = dv.step(model, x, v, dv.VBD(0.01, 10), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
         assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
         shares += [part.corrections for part in found]
     assert float(v[-1, 0]) > 0.05 * speed
@@ -107,8 +107,8 @@ def test_a_step_goes_on_for_the_scenes_of_which_pairs_hold_something_up(device: 
     scenes = torch.stack([v, 0.1 * v])
 
     def ends(v: torch.Tensor) -> tuple[torch.Tensor, list[Any]]:
-        with dv.contact.record() as found:
-            _, v = dv.step(model, x.expand_as(v), v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10,
+        with dv.record("contact") as found:
+            _, v = dv.step(model, x.expand_as(v), v, dv.VBD(0.01, 10), mu=4e5, lam=4e5,
                            gravity=(0.0, 0.0, 0.0))  # fmt: skip
         return v, found
 
@@ -127,7 +127,7 @@ def test_no_body_passes_through_one_that_could_turn_inside_out(device: str) -> N
     """In free flight they would have passed each other within the step, with the least potential of all."""
     model, x, v = meeting(40.0, device)
     v[:64, 1] = 40.0
-    end, _ = dv.step(model, x, v, time_step=1 / 60, sweeps=20, **MATERIAL)
+    end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 20), **MATERIAL)
     assert dv.contact.status(model).cut[0] > 0
     assert float((end - (x + v / 60)).abs().max()) > 0.1
 
@@ -139,12 +139,12 @@ def test_corrections_of_a_row_that_is_struck_are_differentiated(device: str) -> 
     aside = torch.linspace(1.0, -0.5, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape).sin()
 
     def end(v: torch.Tensor) -> torch.Tensor:
-        _, after = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=3, gravity=(0.0, 0.0, 0.0))
+        _, after = dv.step(model, x, v, dv.VBD(0.01, 3), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
         return (weights * after).sum()
 
     v = v + 1e-3 * aside.flip(0)  # alike velocities are a tie, where a step may jump
     start = v.clone().requires_grad_()
-    with dv.contact.record() as found:
+    with dv.record("contact") as found:
         (slope,) = torch.autograd.grad(end(start), start)
     assert len(found[-1].corrections) > 2
     eps = 1e-6

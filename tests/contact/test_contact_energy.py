@@ -38,7 +38,7 @@ def test_an_impact_gains_no_energy(speed: float, sweeps: int) -> None:
     start = energy(model, body, x, v)
     course = []
     for _ in range(12):
-        x, v = dv.step(model, x, v, mu=MODULUS, lam=MODULUS, time_step=TIME_STEP, sweeps=sweeps, gravity=(0, 0, 0))
+        x, v = dv.step(model, x, v, dv.VBD(TIME_STEP, sweeps), mu=MODULUS, lam=MODULUS, gravity=(0, 0, 0))
         course.append(energy(model, body, x, v))
     assert max(course) <= start * (1 + tolerance("energy_gain")), (start, course)
     assert course[-1] < 0.9 * start  # they have met
@@ -58,7 +58,7 @@ def test_nor_does_one_that_turns_beside_another(spin: float, gap: float, self_co
     v[:n] = spin * torch.linalg.cross(axis.expand(n, 3), x[:n] - x[:n].mean(0))
     start = float((model.mass[:, None] * v.square()).sum())
     for _ in range(10):
-        x, v = dv.step(model, x, v, mu=modulus, lam=modulus, time_step=1 / 60, sweeps=10, gravity=(0, 0, 0))
+        x, v = dv.step(model, x, v, dv.VBD(1 / 60, 10), mu=modulus, lam=modulus, gravity=(0, 0, 0))
         assert 0 < float((model.mass[:, None] * v.square()).sum()) <= start * (1 + tolerance("energy_gain"))
         assert len(dv.contact.intersections(model, x)) == 0
 
@@ -86,7 +86,7 @@ def test_impacts_on_a_plane_gain_no_energy(points: int, count: int, seed: int, c
 
     start = energies_now()
     for _ in range(8):
-        x, v = dv.step(model, x, v, mu=MODULUS, lam=MODULUS, time_step=0.02, sweeps=15)
+        x, v = dv.step(model, x, v, dv.VBD(0.02, 15), mu=MODULUS, lam=MODULUS)
         assert (energies_now() <= start * (1 + tolerance("energy_gain"))).all()
     assert (energies_now() < 0.9 * start).all()  # they have met the plane
 
@@ -120,7 +120,7 @@ def test_impacts_on_a_floor_gain_no_energy(young: float, time_step: float, sweep
 
         start, fastest = energy_of(x, v), 0.0
         for _ in range(round(0.12 / time_step)):
-            x, v = dv.step(model, x, v, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps)
+            x, v = dv.step(model, x, v, dv.VBD(time_step, sweeps), mu=mu, lam=lam)
             assert energy_of(x, v) <= start * (1 + tolerance("energy_gain"))
             fastest = max(fastest, float((model.mass * v[:, 1]).sum() / model.mass.sum()))
         assert energy_of(x, v) < 0.9 * start and fastest < 1.5  # it has met the floor
@@ -134,6 +134,6 @@ def test_a_body_that_bends_in_the_air_moves_as_without_contact() -> None:
         model = dv.Model(mesh, energies=(dv.StableNeoHookean(), *pairs))
         x, v = model.rest_points, torch.zeros_like(model.rest_points)
         v[:, 1] = (x[:, 0] - 0.3).abs() / 0.15 - 1
-        ends[own] = dv.step(model, x, v, mu=mu, lam=lam, time_step=0.01, sweeps=40, gravity=(0, 0, 0))[0]
+        ends[own] = dv.step(model, x, v, dv.VBD(0.01, 40), mu=mu, lam=lam, gravity=(0, 0, 0))[0]
     moved = (ends[None] - x).norm()
     assert (ends[True] - ends[None]).norm() < tolerance("contact_motion") * moved

@@ -95,8 +95,8 @@ def test_the_scenes_meet_every_kind_of_contact() -> None:
     for name in SCENES:
         scene = scene_of(name)
         options = {k: v for k, v in scene.inputs.items()}
-        with dv.contact.record() as found:
-            dv.step(scene.model, scene.x, scene.v, time_step=scene.time_step, sweeps=2, gravity=GRAVITY, **options)
+        with dv.record("contact") as found:
+            dv.step(scene.model, scene.x, scene.v, dv.VBD(scene.time_step, 2), gravity=GRAVITY, **options)
         held = dv.contact.status(scene.model).cut
         cut, free = cut + sum(held), free + scene.x[..., 0].numel() - sum(held)
         for detection in found:
@@ -127,7 +127,7 @@ def test_central_differences_over_fifty_steps(name: str) -> None:
     def run(size: Any) -> torch.Tensor:
         x, v = start, velocity + size * direction
         for _ in range(50):
-            x, v = dv.step(scene.model, x, v, time_step=1 / 200, sweeps=4, **static)
+            x, v = dv.step(scene.model, x, v, dv.VBD(1 / 200, 4), **static)
         return (weights * x).sum()
 
     size = torch.zeros((), dtype=torch.float64, requires_grad=True)

@@ -38,9 +38,9 @@ def test_gradients_of_a_landing(beside: str, floor: str) -> None:
     weights, height = random(1.0), torch.tensor(model.floor.height, dtype=x.dtype) if model.floor else x
 
     def loss(x: torch.Tensor, v: torch.Tensor, height: torch.Tensor) -> torch.Tensor:
-        given: dict[str, Any] = {"mu": 1e5, "lam": 2e5, "time_step": 0.01, "sweeps": 3}
+        given: dict[str, Any] = {"mu": 1e5, "lam": 2e5, "solver": dv.VBD(0.01, 3)}
         for _ in range(2):
-            x, v = dv.step(model, x, v, parameters={"floor_barrier.height": height}, **given)
+            x, v = dv.step(model, x, v, floor_height=height, **given)
         return (weights * x).sum() + 1e-2 * (weights * v).sum()
 
     leaves = [t.clone().requires_grad_() for t in (x, v, height)]

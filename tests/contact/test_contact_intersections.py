@@ -122,7 +122,7 @@ def overlapping(device: str = "cpu", dtype: torch.dtype = torch.float64, shift: 
                     dtype=dtype)  # fmt: skip
 
 
-def run(model: dv.Model, x: Any = None, steps: int = 1, **options: Any) -> dv.Trajectory:
+def run(model: dv.Model, x: Any = None, steps: int = 1, **options: Any) -> dv.results.Trajectory:
     x = model.rest_points if x is None else x
     return dv.rollout(model, x, torch.zeros_like(x), steps=steps, **STEP, **options)
 

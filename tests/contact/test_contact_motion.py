@@ -43,8 +43,8 @@ def test_a_body_that_flies_and_spins_beside_others_lists_no_pairs_of_its_own() -
         turning = torch.linalg.cross(arm.new_tensor([0.0, 10.0, 0.0]).expand_as(arm), arm)
         v = torch.where(model.pinned[:, None], 0.0, turning + arm.new_tensor([5.0, 0.0, 0.0]))
         for _ in range(3):
-            with dv.contact.record() as found:
-                x, v = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=0.01, sweeps=40)
+            with dv.record("contact") as found:
+                x, v = dv.step(model, x, v, dv.VBD(0.01, 40), mu=1e5, lam=1e5)
             for detection in found:
                 bodies = model.body[detection.listed.pairs[:, :4].long()]
                 assert len(bodies) > 0 and (bodies[:, 0] != bodies[:, 3]).all()
@@ -62,7 +62,7 @@ def test_a_soft_body_that_stands_does_not_creep() -> None:
                          energies=(dv.StableNeoHookean(), *barrier))  # fmt: skip
         x = model.rest_points
         for _ in range(20):
-            x, _ = dv.step(model, x, 0 * x, mu=2e4, lam=4e4, time_step=0.05, sweeps=300)
+            x, _ = dv.step(model, x, 0 * x, dv.VBD(0.05, 300), mu=2e4, lam=4e4)
         ends.append(x - model.rest_points)
     for end in ends[:2]:
         assert relative_error(end, ends[2]) <= tolerance("contact_motion")
@@ -88,7 +88,7 @@ def test_an_impact_of_more_than_an_edge_a_step_keeps_its_momentum(speed: float, 
     mu, lam = dv.lame(2e4, 0.3)
     start, cut = (model.mass[:, None] * v).sum(0), 0
     for _ in range(8):
-        x, v = dv.step(model, x, v, mu=mu, lam=lam, time_step=time_step, sweeps=10, gravity=(0.0, 0.0, 0.0))
+        x, v = dv.step(model, x, v, dv.VBD(time_step, 10), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
         cut += sum(dv.contact.status(model).cut)
     end = (model.mass[:, None] * v).sum(0)
     assert float((end - start).norm()) <= tolerance("closed_form") * float(start.norm())

@@ -29,11 +29,13 @@ def thrown(speed: float) -> tuple[dv.Model, Tensor, Tensor]:
     return model, model.rest_points, v
 
 
+# TODO62: give the solver of model: start="predictor"
 def folding() -> tuple[dv.Model, Tensor, Tensor]:
     """A pinned sheet whose pairs are its own."""
     body = sheet(9, 9, (0.4, 0.4), 0.005)
-    model = dv.Model(body, pinned=torch.from_numpy(body.points[:, 0] < 1e-9), start="predictor",
-                     energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=0.02)))  # fmt: skip
+    model = dv.Model(body, pinned=torch.from_numpy(body.points[:, 0] < 1e-9), energies=(dv.StableNeoHookean(),
+                                                                                        dv.PairBarrier(kappa=1e4,
+                                                                                                       dhat=0.02)))  # fmt: skip
     v = torch.zeros_like(model.rest_points)
     v[:, 1] = -30.0 * model.rest_points[:, 0] ** 2  # fast enough for its pairs to push within three steps
     return model, model.rest_points, torch.where(model.pinned[:, None], 0.0, v)
@@ -60,7 +62,7 @@ def test_what_is_left_out_changes_nothing(monkeypatch: pytest.MonkeyPatch, scene
 
     monkeypatch.setattr(step, "sweep", noted)
     for _ in range(3):
-        x, v = dv.step(model, x, v, mu=1e5, lam=2e5, time_step=1 / 60, sweeps=6)
+        x, v = dv.step(model, x, v, dv.VBD(1 / 60, 6), mu=1e5, lam=2e5)
     active = moved = 0
     for fields, rest, plan, settings in calls:
         constants = fields.constants.clone()
@@ -93,8 +95,8 @@ def test_a_step_and_its_gradients_are_those_without_it(monkeypatch: pytest.Monke
         if not finds:
             monkeypatch.setattr(step.ContactStep, "_pushing", lambda self, listed: listed)
         x, speed = start.clone().requires_grad_(), v.clone().requires_grad_()
-        with dv.contact.record() as parts:
-            end, _ = dv.step(model, x, speed, mu=1e5, lam=2e5, time_step=0.01, sweeps=3)
+        with dv.record("contact") as parts:
+            end, _ = dv.step(model, x, speed, dv.VBD(0.01, 3), mu=1e5, lam=2e5)
         assert len(parts[0].listed.pairs) > 0
         return [end, *torch.autograd.grad(end.square().sum(), (x, speed))]
 
@@ -119,7 +121,7 @@ def test_a_scene_without_pairs_has_the_same_bits_beside_one_with_pairs(bodies: i
         ends = []
         for x, speed in ((apart, v), (torch.stack([apart, near]), torch.stack([v, torch.zeros_like(v)]))):
             leaves = [t.clone().requires_grad_() for t in (x, speed)]
-            end = dv.step(model, *leaves, mu=1e5, lam=1e5, time_step=0.01, sweeps=2)[0]
+            end = dv.step(model, *leaves, solver=dv.VBD(0.01, 2), mu=1e5, lam=1e5)[0]
             bars = torch.autograd.grad(end.square().sum(), leaves)
             ends.append([t.reshape(-1, *apart.shape)[0] for t in (end, *bars)])
         for alone, beside in zip(*ends, strict=True):

@@ -45,7 +45,7 @@ def test_a_tower_keeps_its_gaps(sweeps: int, detections: int, bodies: int) -> No
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     smallest = []
     for _ in range(120):
-        x, v = dv.step(model, x, v, mu=2e5, lam=4e5, time_step=0.01, sweeps=sweeps)
+        x, v = dv.step(model, x, v, dv.VBD(0.01, sweeps), mu=2e5, lam=4e5)
         smallest.append(dv.contact.status(model).smallest_gap[0])
     assert min(smallest) >= least * (1 - 1e-9), (min(smallest), least)
     assert min(smallest) < first and bool(torch.isfinite(v).all())
@@ -73,7 +73,7 @@ def cube_on_table(device: str) -> tuple[dv.Model, Tensor]:
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_cube_weighs_on_it_what_it_weighs_and_slides_as_far_as_it_should(device: str, modulus: float) -> None:
     model, cube = cube_on_table(device)
-    material = {"mu": modulus, "lam": modulus, "time_step": H, "sweeps": 5, "save": "last"}
+    material = {"mu": modulus, "lam": modulus, "save": "last", "solver": dv.VBD(H, 5)}
     x = model.rest_points
     for _ in range(6):  # until it rests
         x = dv.rollout(model, x, torch.zeros_like(x), steps=20, **material).x[-1]
@@ -94,14 +94,14 @@ def test_one_that_falls_begins_with_its_fall(device: str) -> None:
     model = dv.Model(sheet, density=500.0, pinned=sheet.points[:, 0] < 1e-9, device=device,
                      energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3, dhat=0.005)))  # fmt: skip
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    given = {"mu": 1e4, "lam": 1e4, "time_step": H}
-    with dv.contact.record() as found:
-        dv.step(model, x, v, sweeps=5, **given)
+    given = {"mu": 1e4, "lam": 1e4}
+    with dv.record("contact") as found:
+        dv.step(model, x, v, dv.VBD(H, 5), **given)
     assert not bool(found[0].resting.any())
     speed = v
     for _ in range(150):  # it swings, and slower and slower
-        x, speed = dv.step(model, x, 0.8 * speed, sweeps=20, **given)
-    with dv.contact.record() as found:
-        x1, _ = dv.step(model, x, v, sweeps=1, **given)
+        x, speed = dv.step(model, x, 0.8 * speed, dv.VBD(H, 20), **given)
+    with dv.record("contact") as found:
+        x1, _ = dv.step(model, x, v, dv.VBD(H, 1), **given)
     assert found[0].resting[0, ~model.pinned].all()
     assert float((x1 - x).norm(dim=-1).max()) < 0.1 * H**2 * WEIGHT

@@ -34,7 +34,7 @@ def end_of(size: float, dtype: torch.dtype, own: bool) -> tuple[torch.Tensor, to
     x = model.rest_points + (1e-3 * size * jitter).to(dtype)  # lest it is at a kink
     v = 5.0 * torch.linalg.cross(torch.tensor([0.3, 0.1, 1.0], dtype=dtype).expand_as(x), x - x.mean(0))
     v.requires_grad_()
-    given: dict[str, Any] = {"mu": 1e5 * size**2, "lam": 2e5 * size**2, "time_step": 0.01, "sweeps": 5}
+    given: dict[str, Any] = {"mu": 1e5 * size**2, "lam": 2e5 * size**2, "solver": dv.VBD(0.01, 5)}
     end = dv.rollout(model, x, v, steps=8, gravity=(0.0, -9.81 * size, 0.0), save="last", **given).x[-1] / size
     weights = torch.linspace(-1, 1, end.numel(), dtype=dtype).reshape(end.shape)
     (slope,) = torch.autograd.grad((weights * end).sum(), v)
@@ -77,9 +77,10 @@ def test_a_turned_scene_moves_as_it_did(kappa: float, sweeps: int, dtype: torch.
         model = dv.Model(dv.TetMesh(cube.points @ turn.T, cube.tets), density=500.0, device=device, dtype=dtype,
                          energies=(dv.StableNeoHookean(), barrier), colliders=[plane])  # fmt: skip
         x = model.rest_points
-        motion = dv.rollout(model, x, torch.zeros_like(x), mu=1e5, lam=1e5, steps=20, time_step=0.005, sweeps=sweeps,
-                            gravity=tuple(turn @ [3.0, -9.81, 0.0]), save="last", check_contact=False,
-                            check_energy=False)  # fmt: skip
+        motion = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(0.005, sweeps), mu=1e5, lam=1e5, steps=20,
+                            gravity=tuple(turn @ [3.0, -9.81,
+                                                  0.0]), save="last", checks=dv.Checks(contact=False,
+                                                                                       energy=False))  # fmt: skip
         return (motion.x[-1] - x).cpu().double() @ torch.from_numpy(turn)
 
     still, rng = way(np.eye(3)), generator("turned")
@@ -108,7 +109,7 @@ def test_a_body_goes_as_in_float64(v: tuple[float, float, float], device: str) -
                          colliders=[dv.colliders.Plane(tuple(OFFSET))])  # fmt: skip
         x = model.rest_points
         velocity = x.new_tensor(v).expand_as(x).contiguous()
-        motion = dv.rollout(model, x, velocity, mu=1e5, lam=1e5, steps=20, time_step=0.005, sweeps=20, save="last")
+        motion = dv.rollout(model, x, velocity, dv.VBD(0.005, 20), mu=1e5, lam=1e5, steps=20, save="last")
         assert len(dv.contact.intersections(model, motion.x[-1])) == 0
         return (motion.x[-1] - x).double().cpu()
 
@@ -140,7 +141,7 @@ def test_a_plane_that_turns_away_rubs_as_where_its_points_are(device: str) -> No
         model = dv.Model(mesh, energies=energies, colliders=[dv.colliders.Plane((of_points, 0.0, 0.0))], device=device)
         x, at = model.rest_points, model.collider_points
         v = x.new_tensor((0.3, -0.05, 0.1)).expand_as(x)
-        end, _ = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=TIME_STEP, sweeps=150, gravity=(0.0, 0.0, 0.0),
+        end, _ = dv.step(model, x, v, dv.VBD(TIME_STEP, 150), mu=1e5, lam=1e5, gravity=(0.0, 0.0, 0.0),
                          colliders=turned(at, -0.02), colliders_before=at)  # fmt: skip
         return end - x - TIME_STEP * v
 
@@ -155,7 +156,7 @@ def test_a_plane_that_leaves_no_way_raises(device: str) -> None:
                      colliders=[dv.colliders.Plane()], device=device)  # fmt: skip
     x, at = model.rest_points, model.collider_points
     up = at.new_tensor((0.0, 2 * DHAT, 0.0))
-    given = {"mu": 1e5, "lam": 1e5, "time_step": TIME_STEP, "sweeps": 5}
+    given = {"mu": 1e5, "lam": 1e5, "solver": dv.VBD(TIME_STEP, 5)}
     with pytest.raises(ValueError, match=r"colliders: expected motion that leaves bodies a way"):
         dv.step(model, x, torch.zeros_like(x), colliders=at + up, colliders_before=at, **given)
     for end in (at, at + up, at - up):
@@ -190,9 +191,9 @@ def test_friction_and_damping_do_not_depend_on_the_frame(part: str, shape: str, 
         """Where the body is in the frame, and the gradient of a sum of that by its velocity."""
         times = TIME_STEP * torch.arange(1, steps + 1, dtype=x.dtype, device=device)
         v = (own + frame).expand_as(x).clone().requires_grad_()
-        motion = dv.rollout(model, x, v, steps=steps, mu=1e5, lam=1e5, time_step=TIME_STEP, sweeps=150,
-                            colliders=dv.per_step(at + times[:, None, None] * frame), colliders_before=at,
-                            save="last")  # fmt: skip
+        motion = dv.rollout(model, x, v, dv.VBD(TIME_STEP, 150), steps=steps, mu=1e5, lam=1e5,
+                            colliders=dv.per_step(at + times[:, None,
+                                                             None] * frame), colliders_before=at, save="last")  # fmt: skip
         found = motion.x[-1] - times[-1] * frame
         weights = torch.linspace(-1, 1, found.numel(), dtype=x.dtype, device=device).view_as(found)
         return found.detach(), torch.autograd.grad((weights * found).sum(), v)[0]
@@ -223,8 +224,8 @@ def test_nobody_is_held_up_in_flight(device: str, dtype: torch.dtype, spin: floa
     v = torch.linalg.cross(arm.new_tensor([0.3, spin, 0.1]).expand_as(arm), arm) + arm.new_tensor([0.4, -0.2, 0.1])
     made = []
     for _ in range(12):
-        with dv.contact.record() as found:
-            x, v = dv.step(model, x, v, mu=2e4, lam=2e4, time_step=1 / 150, sweeps=2)
+        with dv.record("contact") as found:
+            x, v = dv.step(model, x, v, dv.VBD(1 / 150, 2), mu=2e4, lam=2e4)
         made.extend(len(d.corrections) for d in found if d.corrections is not None)
         assert dv.contact.status(model).cut == [0]
     assert made == [2] * 12

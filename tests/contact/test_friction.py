@@ -72,14 +72,14 @@ def settle(block: Block, angle: float, shear: float) -> None:
     normal = GRAVITY * math.cos(angle)
     options: dict[str, Any] = {"gravity": (shear * normal, -normal, 0.0)}
     if model.friction is not None:
-        options["parameters"] = {"friction.coefficient": 0.0}
+        options["parameters"] = {"friction": 0.0}
     for _ in range(80):
         kappa, dhat = torch.full_like(x[:, 1], KAPPA), torch.full_like(x[:, 1], DHAT)
         load = torch.where(free, -_barrier_slope(x[:, 1] + GAP, kappa, dhat), 0.0)
         weight = normal * (model.mass * free).sum()
         load = load * (weight / load.sum().clamp(min=1e-3 * weight))
         force = torch.stack([-shear * load, 0 * load, 0 * load], -1)
-        x, v = dv.step(model, x, still, mu=LAME, lam=LAME, time_step=0.05, sweeps=100, force=force, **options)
+        x, v = dv.step(model, x, still, dv.VBD(0.05, 100), mu=LAME, lam=LAME, force=force, **options)
     assert float(v.abs().max()) < tolerance("settled_speed")
     block.x = x
 
@@ -90,10 +90,9 @@ def slide(block: Block, angle: float, h: float, duration: float, speed: float = 
     model, x, v = block.model, block.x, torch.zeros_like(block.x)
     v[block.free, 0] = speed
     gravity = (GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle), 0.0)
-    parameters = {} if coefficient is None else {"friction.coefficient": coefficient}
+    parameters = {} if coefficient is None else {"friction": coefficient}
     for _ in range(round(duration / h)):
-        x, v = dv.step(model, x, v, mu=LAME, lam=LAME, time_step=h, sweeps=SWEEPS, gravity=gravity,
-                       parameters=parameters)  # fmt: skip
+        x, v = dv.step(model, x, v, dv.VBD(h, SWEEPS), mu=LAME, lam=LAME, gravity=gravity, **parameters)  # fmt: skip
         assert model.contact is None or dv.contact.status(model).cut == [0]
     return x, v
 
@@ -190,8 +189,8 @@ def test_friction_at_rest_has_finite_gradients(support: str) -> None:
     coefficient = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
 
     def end(coefficient: Tensor) -> Tensor:
-        return dv.step(block.model, x, v, mu=0.0, lam=0.0, time_step=0.01, sweeps=3, gravity=(0.0, 0.0, 0.0),
-                       parameters={"friction.coefficient": coefficient})[0][:, 0].sum()  # fmt: skip
+        return dv.step(block.model, x, v, dv.VBD(0.01, 3), mu=0.0, lam=0.0, gravity=(0.0, 0.0, 0.0),
+                       friction=coefficient)[0][:, 0].sum()  # fmt: skip
 
     gradients = torch.autograd.grad(end(coefficient), (x, v, coefficient))
     assert all(torch.isfinite(g).all() for g in gradients)
@@ -207,9 +206,9 @@ def test_gradient_without_slip_is_that_of_the_reference() -> None:
     tets = join([box(2, 0.2), box(2, 0.2).translate((0.02, 0.208, 0.03))])
     energies = (dv.StableNeoHookean(), dv.PairBarrier(dhat=0.02, detections=1), dv.Friction(0.4, 0.05))
     model = dv.Model(tets, energies=energies)
-    step: dict[str, Any] = {"mu": LAME, "lam": LAME, "time_step": 0.01, "sweeps": 2}
+    step: dict[str, Any] = {"mu": LAME, "lam": LAME, "solver": dv.VBD(0.01, 2)}
     gradients = []
-    with dv.contact.record() as found:
+    with dv.record("contact") as found:
         for run in (dv.step, reference.contact_step):
             v = torch.full_like(model.rest_points, 0.01).requires_grad_()
             more = {} if run is dv.step else {"parts": [part_of(found[0])]}
@@ -230,7 +229,7 @@ def test_a_moving_support_drags(support: str) -> None:
         moved: dict[str, Any] = {"prescribed": x + shift * block.model.pinned[:, None]}
         if support == "plane":
             moved = {"colliders_before": points + n * shift, "colliders": points + (n + 1) * shift}
-        x, v = dv.step(block.model, x, v, mu=LAME, lam=LAME, time_step=h, sweeps=SWEEPS, **moved)
+        x, v = dv.step(block.model, x, v, dv.VBD(h, SWEEPS), mu=LAME, lam=LAME, **moved)
     feet = block.free & (block.x[:, 1] < 0.05)
     assert int(feet.sum()) == 4
     assert float((v[feet, 0] - speed).abs().max()) < CREEP
@@ -269,7 +268,7 @@ def test_gradients_of_rubbing_bodies_are_those_of_differences(device: str, veloc
     direction = torch.randn(v.shape, generator=draw, dtype=torch.float64).to(device)
 
     def end(share: float | torch.Tensor) -> torch.Tensor:
-        given = {"mu": 1e5, "lam": 1e5, "time_step": 0.005, "sweeps": sweeps}
+        given = {"mu": 1e5, "lam": 1e5, "solver": dv.VBD(0.005, sweeps)}
         return dv.step(model, x, v + share * direction, **given)[0][:, 0].mean()
 
     share = torch.zeros((), dtype=torch.float64, device=device, requires_grad=True)
@@ -300,7 +299,7 @@ def test_where_a_body_comes_to_rest_within_a_small_part_of_its_way(device: str, 
     direction = torch.cos(torch.arange(12).double()).reshape(4, 3).to(device)
 
     def loss(v: torch.Tensor) -> torch.Tensor:
-        return (weights * dv.step(model, x, v, mu=2e4, lam=3.5e4, time_step=0.02, sweeps=sweeps)[0]).sum()
+        return (weights * dv.step(model, x, v, dv.VBD(0.02, sweeps), mu=2e4, lam=3.5e4)[0]).sum()
 
     own = v.clone().requires_grad_()
     (grad,) = torch.autograd.grad(loss(own), own)
@@ -331,11 +330,13 @@ def block(support: str, bodies: int = 1) -> dv.Model:
     return dv.Model(mesh, energies=(dv.StableNeoHookean(), pairs, friction), colliders=[plane])
 
 
-def pushed(model: dv.Model, share: float | Tensor, sweeps: int, stiffness: float, steps: int = STEPS) -> dv.Trajectory:
+def pushed(
+    model: dv.Model, share: float | Tensor, sweeps: int, stiffness: float, steps: int = STEPS
+) -> dv.results.Trajectory:
     """By a share of what friction holds."""
     x = model.rest_points
     force = model.mass[:, None] * 9.81 * COEFFICIENT * share * torch.tensor([1.0, 0.0, 0.0], dtype=x.dtype)
-    given: dict[str, Any] = {"mu": stiffness, "lam": stiffness, "time_step": TIME_STEP, "sweeps": sweeps}
+    given: dict[str, Any] = {"mu": stiffness, "lam": stiffness, "solver": dv.VBD(TIME_STEP, sweeps)}
     return dv.rollout(model, x, torch.zeros_like(x), steps=steps, force=force, **given)
 
 
@@ -372,8 +373,7 @@ def test_stacks_of_many_bodies_stand() -> None:
     model = dv.Model(
         dv.mesh.join([cube.translate(place) for place in places]),
         energies=(dv.StableNeoHookean(), dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3),
-                  dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(COEFFICIENT, CREEP_ALLOWED)),
-    )  # fmt: skip
+                  dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(COEFFICIENT, CREEP_ALLOWED)))  # fmt: skip
     speed = pushed(model, 0.5, 5, 1e6).v[-1, :, 0].reshape(2, 35, -1).mean(-1)
     assert float(speed.abs().max()) < 3 * CREEP_ALLOWED
     assert float(speed.mean()) > 0.1 * CREEP_ALLOWED

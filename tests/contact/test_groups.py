@@ -44,7 +44,7 @@ def wall(wide: int, high: int, device: str) -> dv.Model:
 
 def run(model: dv.Model, steps: int, sweeps: int, **options: Any) -> tuple[Tensor, Tensor]:
     x = model.rest_points
-    out = dv.rollout(model, x, torch.zeros_like(x), steps=steps, mu=1e6, lam=1e6, time_step=0.01, sweeps=sweeps,
+    out = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(0.01, sweeps), steps=steps, mu=1e6, lam=1e6,
                      **options)  # fmt: skip
     return out.x[-1], out.v[-1]
 
@@ -130,8 +130,8 @@ def test_a_coefficient_of_zero_is_differentiated_as_one_next_to_it(device: str) 
     slopes = []
     for value in (0.0, 1e-9):
         coefficient = x.new_tensor(value).requires_grad_()
-        _, end = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=0, gravity=(0.0, 0.0, 0.0),
-                         parameters={"friction.coefficient": coefficient})  # fmt: skip
+        _, end = dv.step(model, x, v, dv.VBD(0.01, 0), mu=1e6, lam=1e6, gravity=(0.0, 0.0, 0.0),
+                         friction=coefficient)  # fmt: skip
         (slope,) = torch.autograd.grad((weights * end).sum(), coefficient)
         slopes.append(slope)
     assert float(slopes[0].abs()) > 0
@@ -166,7 +166,7 @@ def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypa
         shares.clear()
         v = torch.zeros_like(x)
         v[own:] = speed * thrown.reshape(-1, 3)
-        end, after = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=3)
+        end, after = dv.step(model, x, v, dv.VBD(0.01, 3), mu=1e6, lam=1e6)
         ends.append(torch.cat([end[:own], after[:own]]))
         taken.append(torch.stack(shares))
     assert bool((taken[1][:2, 4:] < 1).any())

@@ -161,7 +161,7 @@ def test_contact_time_of_a_linear_spring(device: str) -> None:
         overlaps = [0.0]
         for _ in range(2 * steps):
             force = center_of_mass_penalty(x, model, gap, stiffness)
-            x, v = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=h, sweeps=2, gravity=(0.0, 0.0, 0.0), force=force)
+            x, v = dv.step(model, x, v, dv.VBD(h, 2), mu=1e5, lam=1e5, gravity=(0.0, 0.0, 0.0), force=force)
             apart = (x[~first] - x[first]).mean(0)
             overlaps.append(gap - float(apart.norm()))
             if overlaps[-1] < 0:

@@ -53,7 +53,7 @@ def settled(model: dv.Model) -> Tensor:
     """Where bodies rest: steps from rest, until nothing moves but by rounding."""
     x = model.rest_points
     for _ in range(60):
-        x, _ = dv.step(model, x, 0 * x, time_step=0.05, sweeps=500, **SOFT)
+        x, _ = dv.step(model, x, 0 * x, dv.VBD(0.05, 500), **SOFT)
     return x
 
 
@@ -94,8 +94,8 @@ def run(scene: contact_scenes.Scene, sweeps: int, model: dv.Model | None = None)
     given = {k: v.to(model.device, model.dtype) for k, v in {**scene.inputs, "x": scene.x, "v": scene.v}.items()}
     parameters = {k: v.to(model.device, model.dtype) for k, v in scene.parameters.items()}
     x, v = given.pop("x"), given.pop("v")
-    end, speed = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=contact_scenes.GRAVITY,
-                         parameters=parameters, **given)  # fmt: skip
+    end, speed = dv.step(model, x, v, dv.VBD(scene.time_step, sweeps), gravity=contact_scenes.GRAVITY, **parameters,
+                         **given)  # fmt: skip
     places = {k: given[k] for k in ("colliders", "colliders_before") if k in given}
     return model, {"x": end, "speed": speed, "previous": (x, v), "time_step": scene.time_step,
                    "parameters": parameters, **places}  # fmt: skip
@@ -125,8 +125,8 @@ def test_a_converged_step_is_newtons_second_law(device: str, scene: str) -> None
     x, h = model.rest_points, 0.005
     v = torch.zeros_like(x)
     v[:8, 0], v[8:, 2] = 0.2, 0.1
-    parameters = {"pair_barrier.damping": torch.tensor(5.0, dtype=x.dtype, device=device)}
-    done = dv.solve(model, x, v, time_step=h, tolerance=1e-12, parameters=parameters, **SOFT)
+    parameters = {"pair_damping": torch.tensor(5.0, dtype=x.dtype, device=device)}
+    done = dv.solve(model, x, v, dv.VBD(h, 1), tolerance=1e-12, **parameters, **SOFT)
     assert dv.contact.status(model).cut == [0]
     found = dv.contact.forces(model, done.x, previous=(x, v), time_step=h, parameters=parameters)
     mass = model.mass[:, None]
@@ -145,7 +145,7 @@ def test_gradients_agree_with_differences(name: str) -> None:
     options.pop("speed")
     x, (before, v), parameters = options.pop("x"), options.pop("previous"), options.pop("parameters")
     h = options.pop("time_step")
-    known = [k for k in parameters if k != "floor_barrier.height"]
+    known = [k for k in parameters if k != "floor_height"]
     arguments = {"x": x, "before": before, **options, **{k: parameters[k] for k in known}}
 
     def loss(**given: Any) -> Tensor:
@@ -163,7 +163,7 @@ def test_gradients_agree_with_differences(name: str) -> None:
     assert check.ok, str(check)
     damped = name in ("stacked", "obstacles")  # in the others no pair that was near at the start comes closer
     zero = [argument for argument, size, *_ in check.rows if size == 0]
-    assert zero == ([] if damped else ["pair_barrier.damping"]), str(check)
+    assert zero == ([] if damped else ["pair_damping"]), str(check)
 
 
 def test_scenes_of_a_batch_are_as_if_alone(device: str) -> None:
@@ -198,8 +198,8 @@ def test_scenes_of_a_batch_are_as_if_alone(device: str) -> None:
         ({"previous": (torch.zeros(16, 3).double(),) * 2}, "time_step: expected a number in .s. where previous"),
         ({"time_step": -1.0}, "time_step: expected"),
         ({"colliders": torch.zeros(1, 3).double()}, "colliders: expected a Model with colliders"),
-        ({"parameters": {"pair_barrier.kapa": 1.0}}, "parameters: expected names among"),
-        ({"parameters": {"pair_barrier.kappa": torch.tensor(-1.0).double()}}, "pair_barrier.kappa: expected finite"),
+        ({"parameters": {"pair_kapa": 1.0}}, "parameters: expected names among"),
+        ({"parameters": {"pair_kappa": torch.tensor(-1.0).double()}}, "pair_barrier.kappa: expected finite"),
         ({"x": torch.full((16, 3), torch.nan).double()}, "x: expected finite values, got nan"),
         ({"previous": (torch.full((16, 3), torch.nan).double(),) * 2, "time_step": 0.1}, "previous: x: .* finite"),
         (

@@ -71,7 +71,8 @@ def test_settings_that_do_not_promise_descent() -> None:
         model = cube(**options)
         return diagnose(model, model.rest_points, mu=1e5, lam=lam, warn=False).messages
 
-    paper = (dv.StableNeoHookean("paper"),)
+    # TODO62: block="paper" of the solver
+    paper = (dv.StableNeoHookean(),)
     only(messages(lam=5e4, energies=paper), "lam < mu")
     only(messages(energies=paper, relaxation=1.6), "relaxation")
     only(messages(relaxation=1.9), "relaxation")
@@ -79,24 +80,25 @@ def test_settings_that_do_not_promise_descent() -> None:
     assert messages(lam=5e4) == []
 
 
+# TODO62: give the solver of over: relaxation=1.6
 def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
     mesh = dv.mesh.cube(3, split="kuhn")
     floor = dv.FloorBarrier(height=-0.01, kappa=1e4)
     model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor, dv.Anchor(100.0)))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     force = torch.full_like(x, 3.0)
-    options = {"time_step": 1 / 60, "force": force, **MATERIAL}
+    options = {"force": force, **MATERIAL}
     left = []
     for sweeps in (1, 10, 1000):
-        end, _ = dv.step(model, x, v, sweeps=sweeps, **options)
+        end, _ = dv.step(model, x, v, dv.VBD(1 / 60, sweeps), **options)
         left.append(diagnose(model, end, previous=(x, v), warn=False, **options).unbalanced)
     assert left[0] > left[1] > left[2]
     assert left[2] < tolerance("closed_form")
-    stiff = {"time_step": 1 / 60, "mu": 1e8, "lam": 1e8}
-    end, _ = dv.step(model, x, v, sweeps=1, **stiff)
+    stiff = {"mu": 1e8, "lam": 1e8}
+    end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 1), **stiff)
     with pytest.warns(UserWarning, match="sweeps or a smaller time step, or relaxation between"):
         diagnose(model, end, previous=(x, v), **stiff)
-    over = dv.Model(mesh, energies=model.energies, relaxation=1.6)
+    over = dv.Model(mesh, energies=model.energies)
     with pytest.warns(UserWarning, match="sweeps or a smaller time step$"):
         diagnose(over, end, previous=(x, v), **stiff)
 
@@ -104,10 +106,12 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_free_fall_leaves_no_force(dtype: torch.dtype) -> None:
     model = dv.Model(dv.mesh.cube(3, size=0.1, split="kuhn"), dtype=dtype)
-    given = {"mu": 1e5, "lam": 1e5, "time_step": 0.01}
+    given = {"mu": 1e5, "lam": 1e5}
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    motion = dv.rollout(model, x, v, steps=20, sweeps=10, **given)
-    found = dv.diagnose(model, motion.x[-1], previous=(motion.x[-2], motion.v[-2]), warn=False, **given)
+    motion = dv.rollout(model, x, v, dv.VBD(0.01, 10), steps=20, **given)
+    found = dv.diagnose(
+        model, motion.x[-1], dv.VBD(0.01, 1), previous=(motion.x[-2], motion.v[-2]), warn=False, **given
+    )
     assert (motion.x[-1] - x)[:, 1].max() < -0.1 and found.unbalanced == 0.0 and found.ok
 
 
@@ -115,7 +119,7 @@ def test_pinned_reactions_are_no_residual() -> None:
     model = cube()
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     prescribed = torch.where(model.pinned[:, None], x + 0.01, torch.nan)
-    end, _ = dv.step(model, x, v, time_step=1 / 60, sweeps=2000, prescribed=prescribed, **MATERIAL)
+    end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 2000), prescribed=prescribed, **MATERIAL)
     result = diagnose(model, end, time_step=1 / 60, previous=(x, v), prescribed=prescribed, warn=False, **MATERIAL)
     assert result.unbalanced is not None and result.unbalanced < tolerance("closed_form")
 
@@ -143,6 +147,7 @@ def test_bad_arguments() -> None:
 # --- `diagnose(previous=)` tells, body by body, what a step with contact left unbalanced, and of friction apart ---
 
 
+# TODO62: part of a solver in these options
 SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.005}
 
 
@@ -153,12 +158,12 @@ def test_more_sweeps_leave_less(device: str) -> None:
     density = given.pop("density")
     parameters = {k: v.to(device) for k, v in scene.parameters.items()}
     x, v = scene.x.to(device), scene.v.to(device)
-    options: dict[str, Any] = {**given, "time_step": 0.01, "gravity": contact_scenes.GRAVITY, "parameters": parameters}
+    options: dict[str, Any] = {**given, "gravity": contact_scenes.GRAVITY, "parameters": parameters}
     assert density.shape == (3, model.num_tets)
     found = []
     for sweeps in (2, 20, 500):
-        end, _ = dv.step(model, x, v, sweeps=sweeps, **options)
-        found.append(dv.diagnose(model, end, previous=(x, v), warn=False, **options))
+        end, _ = dv.step(model, x, v, dv.VBD(0.01, sweeps), **options)
+        found.append(dv.diagnose(model, end, dv.VBD(0.01, 1), previous=(x, v), warn=False, **options))
     for less, more in zip(found[:-1], found[1:], strict=True):
         assert (more.residuals < less.residuals).all() and more.unbalanced < less.unbalanced
         assert (more.friction_residuals < less.friction_residuals).all()
@@ -180,7 +185,8 @@ def grip() -> tuple[dv.Model, dict[str, Any], torch.Tensor, torch.Tensor]:
 
 def test_friction_that_has_not_converged_is_named() -> None:
     model, options, x, v = grip()
-    few, _ = dv.step(model, x, v, sweeps=1, **options)
+    # TODO62: the solver of this call
+    few, _ = dv.step(model, x, v, **options, sweeps=1)
     few[:8, 1] -= 1e-3  # it slips
     with pytest.warns(UserWarning) as warned:
         bad = dv.diagnose(model, few, previous=(x, v), **options)
@@ -192,6 +198,7 @@ def test_friction_that_has_not_converged_is_named() -> None:
     assert "left-over share of friction" in str(bad)
 
     goal = tolerance("closed_form")
+    # TODO62: the solver of this call
     done = dv.solve(model, x, v, tolerance=goal, **options)
     good = dv.diagnose(model, done.x, previous=(x, v), **options)
     assert float(good.residuals.max()) <= goal and not any("unbalanced" in m or "friction" in m for m in good.messages)
@@ -201,7 +208,8 @@ def test_friction_that_has_not_converged_is_named() -> None:
 def test_bodies_without_contact_have_residuals_too() -> None:
     model = dv.Model(join([box(2, 0.2), box(2, 0.2).translate((1.0, 0, 0))]), pinned=[0, 1, 8, 9])
     x = model.rest_points
-    end, _ = dv.step(model, x, 0 * x, sweeps=2, **SOFT)
+    # TODO62: the solver of this call
+    end, _ = dv.step(model, x, 0 * x, **SOFT, sweeps=2)
     told = dv.diagnose(model, end, previous=(x, 0 * x), warn=False, **SOFT)
     assert told.residuals.shape == (2,) and (told.residuals > 0).all() and told.friction_residuals is None
 
@@ -219,6 +227,7 @@ def test_the_estimate_of_an_error_raises_with_contact() -> None:
     model = two_boxes()
     x = model.rest_points
     with pytest.raises(NotImplementedError, match="sweeps: the error of a step with contact"):
-        dv.diagnose(model, x, previous=(x, 0 * x), sweeps=5, warn=False, **SOFT)
+        # TODO62: the solver of this call
+        dv.diagnose(model, x, previous=(x, 0 * x), warn=False, **SOFT, sweeps=5)
     with pytest.raises(ValueError, match="colliders: expected a Model with colliders"):
         dv.diagnose(model, x, previous=(x, 0 * x), colliders=x[:1], warn=False, **SOFT)

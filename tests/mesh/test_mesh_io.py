@@ -290,9 +290,7 @@ def test_moduli_of_a_file_drive_a_step(tmp_path: Path) -> None:
     mesh, _, cells = dm.load_fields(tmp_path / "part.vtu")
     model = dv.Model(mesh, pinned=mesh.points[:, 0] == mesh.points[:, 0].min())
     mu, lam = (torch.as_tensor(cells[name]).requires_grad_() for name in ("mu", "lam"))
-    x, _ = dv.step(
-        model, model.rest_points, torch.ones_like(model.rest_points), mu=mu, lam=lam, time_step=0.01, sweeps=4
-    )
+    x, _ = dv.step(model, model.rest_points, torch.ones_like(model.rest_points), dv.VBD(0.01, 4), mu=mu, lam=lam)
     x.square().sum().backward()
     assert mu.grad is not None and mu.grad.shape == (mesh.num_tets,) and (mu.grad != 0).all()
 

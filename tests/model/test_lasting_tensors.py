@@ -13,7 +13,7 @@ import diffvbd as dv
 
 NAMES = ("rest_points", "density", "mass", "pinned", "tets", "surface", "color_ptr", "color_vertices", "body",
          "collider_points", "plane_points", "collider_radius")  # fmt: skip
-GIVEN: dict[str, Any] = {"lam": 1e4, "time_step": 0.01, "sweeps": 3}
+GIVEN: dict[str, Any] = {"lam": 1e4, "solver": dv.VBD(0.01, 3)}
 
 
 def two_cubes() -> dv.TetMesh:

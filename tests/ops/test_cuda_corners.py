@@ -11,11 +11,13 @@ from diffvbd.testing import relative_error, tolerance
 
 pytestmark = pytest.mark.cuda
 
+# TODO62: part of a solver in these options
 OPTIONS = {"lam": 2e4, "time_step": 0.01}
 
 
+# TODO62: give the solver of model: start=start
 def small(scenes: int = 5, start: str = "auto") -> tuple[dv.Model, Tensor, Tensor]:
-    model = dv.Model(dv.mesh.cube(), pinned=[0], start=start, device="cuda")
+    model = dv.Model(dv.mesh.cube(), pinned=[0], device="cuda")
     noise = torch.randn((scenes, 8, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return model, model.rest_points + 0.05 * noise.to("cuda"), 0.3 * noise.to("cuda")
 
@@ -27,7 +29,8 @@ def test_a_checkpoint_runs_again_as_it_ran(first: str | None, second: str | None
     mu = torch.linspace(1e4, 2e4, 4, dtype=torch.float64, device="cuda").requires_grad_()
 
     def loss() -> Tensor:
-        return dv.rollout(model, x, v, steps=4, sweeps=3, mu=dv.per_step(mu), checkpoint_every=2, **OPTIONS).x[-1].sum()  # type: ignore[arg-type]
+        # TODO62: the solver of this call
+        return dv.rollout(model, x, v, steps=4, mu=dv.per_step(mu), checkpoint_every=2, **OPTIONS, sweeps=3).x[-1].sum()  # type: ignore[arg-type]
 
     (expected,) = torch.autograd.grad(loss(), mu)
     with forced(first):
@@ -42,7 +45,8 @@ def test_jacobians_in_every_regime(regime: str) -> None:
     model, x, v = small(2)
 
     def end(mu: Tensor) -> Tensor:
-        return dv.step(model, x, v, mu=mu, sweeps=3, **OPTIONS)[0].sum((1, 2))  # type: ignore[arg-type]
+        # TODO62: the solver of this call
+        return dv.step(model, x, v, mu=mu, **OPTIONS, sweeps=3)[0].sum((1, 2))  # type: ignore[arg-type]
 
     mu = torch.tensor([[1e4], [3e4]], dtype=torch.float64, device="cuda")
     rows = []
@@ -59,7 +63,8 @@ def test_jacobians_in_every_regime(regime: str) -> None:
 def test_several_adjoints_of_one_step(start: str) -> None:
     model, x, v = small(2, start)
     leaf = x.clone().requires_grad_()
-    end, _ = dv.step(model, leaf, v, mu=1e4, sweeps=3, **OPTIONS)  # type: ignore[arg-type]
+    # TODO62: the solver of this call
+    end, _ = dv.step(model, leaf, v, mu=1e4, **OPTIONS, sweeps=3)  # type: ignore[arg-type]
     weights = torch.randn((3, *end.shape), dtype=torch.float64, device="cuda")
 
     def one(w: Tensor) -> Tensor:
@@ -82,7 +87,8 @@ def test_no_tets(regime: str, vertices: int, shape: tuple[int, ...]) -> None:
     mu = torch.full(shape, 1e4, dtype=torch.float64, device="cuda").requires_grad_()
     torch.full((1 << 20,), float("nan"), dtype=torch.float64, device="cuda")  # what memory is reused does not matter
     with forced(regime):
-        end, speed = dv.step(model, x, torch.ones_like(x), mu=mu, sweeps=2, **OPTIONS)  # type: ignore[arg-type]
+        # TODO62: the solver of this call
+        end, speed = dv.step(model, x, torch.ones_like(x), mu=mu, **OPTIONS, sweeps=2)  # type: ignore[arg-type]
         gradients = torch.autograd.grad(end.sum() + speed.sum(), (x, mu), allow_unused=True)
     torch.cuda.synchronize()
     assert torch.equal(end, x) and not speed.any()

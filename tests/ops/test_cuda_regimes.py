@@ -17,6 +17,7 @@ from torch.profiler import ProfilerActivity, profile
 import diffvbd as dv
 from diffvbd import testing
 from diffvbd.ops import regimes
+from diffvbd.ops.regimes import regime
 from diffvbd.testing import (
     CASES,
     KINDS,
@@ -135,10 +136,9 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
         "prescribed": torch.where(model.pinned[:, None].cpu(), x + noise(*full, size=0.01), torch.nan),
         "rest_points": model.rest_points + noise(model.num_vertices, 3, size=0.01),
         "density": torch.tensor(90.0, dtype=torch.float64),
-        "time_step": 0.02,
     }
     if model.floor is not None:
-        inputs["parameters"] = {"floor_barrier.kappa": torch.tensor(3e4, dtype=torch.float64)}
+        inputs["parameters"] = {"floor_kappa": torch.tensor(3e4, dtype=torch.float64)}
     return model, inputs
 
 
@@ -189,8 +189,7 @@ def test_any_number_of_threads_per_vertex(
 
     x = model.rest_points + noise(3, model.num_vertices, 3, size=0.02)
     inputs = {"x": x, "v": noise(*x.shape, size=1.0), "mu": 1e4 * (1 + noise(*material, size=0.5)),
-              "lam": (1e8 if what == "uneven" else 2e4) * (1 + noise(*material, size=0.5)),
-              "time_step": 0.02}  # fmt: skip
+              "lam": (1e8 if what == "uneven" else 2e4) * (1 + noise(*material, size=0.5))}  # fmt: skip
     assert_equal_to_the_cpu(model, inputs, 6, "color")
 
 
@@ -199,7 +198,7 @@ def test_no_scenes(regime: str | None) -> None:
     model = dv.Model(dv.mesh.cube(), device="cuda")
     x = model.rest_points.expand(0, -1, -1).clone().requires_grad_()
     with forced(regime):
-        end, v = dv.step(model, x, torch.zeros_like(x), mu=1e4, lam=1e4, time_step=0.01, sweeps=2)
+        end, v = dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 2), mu=1e4, lam=1e4)
         assert end.shape == v.shape == (0, 8, 3)
         (slope,) = torch.autograd.grad(end.sum() + v.sum(), x)
     assert slope.shape == x.shape
@@ -247,7 +246,8 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
     def run(i: Any) -> tuple[Tensor, ...]:
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
         options = {**dict(zip(names, leaves, strict=True)), **shared}
-        x, v = dv.step(model, sweeps=3, adjoint=dv.ReverseSweep(tape), **options)
+        # TODO62: the solver of this call
+        x, v = dv.step(model, **options, sweeps=3, adjoint=dv.ReverseSweep(tape))
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     batches = [range(130), range(20, 130), range(60, 101), range(62, 66), *(range(i, i + 1) for i in (0, 31, 64, 129))]
@@ -320,7 +320,8 @@ def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: 
     """A step of an inference run equals the step of a training run to the bit, whatever the tape."""
     model, inputs = large_inputs(cells, *lead)
     inputs.pop("rest_points")
-    bare = dv.step(model, sweeps=3, **inputs)
+    # TODO62: the solver of this call
+    bare = dv.step(model, **inputs, sweeps=3)
     for tape in TAPES:
         taped = evaluated(model, inputs, 3, tape)
         assert torch.equal(taped["x"], bare[0]) and torch.equal(taped["v"], bare[1]), tape
@@ -329,13 +330,15 @@ def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: 
 def test_a_regime_that_cannot_run_a_scene_raises() -> None:
     model, inputs = large_inputs(10)
     with forced("thread"), pytest.raises(ValueError, match="regime"):
-        dv.step(model, sweeps=1, **inputs)
-    dv.step(model, sweeps=1, **inputs)  # outside, the choice is free again
+        # TODO62: the solver of this call
+        dv.step(model, **inputs, sweeps=1)
+    # TODO62: the solver of this call
+    dv.step(model, **inputs, sweeps=1)  # outside, the choice is free again
 
 
 @pytest.mark.parametrize("name", ("warp", "", "Thread", 3))
 def test_an_unknown_regime_raises(name: Any) -> None:
-    with pytest.raises((ValueError, TypeError), match="regime"), dv.regime(name):
+    with pytest.raises((ValueError, TypeError), match="regime"), regime(name):
         pass
 
 
@@ -356,13 +359,14 @@ def test_one_launch_and_a_launch_for_each_color_give_the_same_bits(name: str, sw
     assert all(found[0][key].any() for key in ("x", "v", "grad_x", "grad_v"))
 
 
+# TODO62: give the solver of model: subspace=dv.CoarseSpace(every=3)
 def cubes(scenes: int) -> tuple[dv.Model, dict[str, Tensor]]:
     """A cube that falls on another one, with friction, over a floor, in scenes that differ."""
     cube = dv.mesh.cube(3, size=0.2)
     mesh = dv.mesh.join([cube, cube.translate((0.03, 0.205, 0.02))])
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.005, kappa=1e4, dhat=0.01),
                 dv.PairBarrier(1e4, 0.01, damping=1.0, detections=1), dv.Friction(0.3, 0.05))  # fmt: skip
-    model = dv.Model(mesh, energies=energies, coarse=dv.CoarseSpace(every=3)).to("cuda")
+    model = dv.Model(mesh, energies=energies).to("cuda")
     shares = torch.linspace(0.5, 1.5, scenes + 1, dtype=torch.float64, device="cuda")[:scenes, None]
     x = model.rest_points.expand(scenes, -1, -1).clone()
     v = torch.zeros_like(x)
@@ -375,7 +379,7 @@ def run_of_contact(
 ) -> dict[str, Tensor]:
     """The state after a step of the first scenes, and gradients of a fixed sum of it for each scene."""
     leaves = {key: value[:scenes].clone().requires_grad_() for key, value in given.items()}
-    x, v = dv.step(model, **leaves, lam=1e5, time_step=0.01, sweeps=5, adjoint=dv.ReverseSweep(tape))
+    x, v = dv.step(model, solver=dv.VBD(0.01, 5, tape=tape), **leaves, lam=1e5)
     weights = torch.linspace(-1, 1, x[0].numel(), dtype=x.dtype, device=x.device).view_as(x[0])
     grads = torch.autograd.grad((weights * (x + 0.01 * v)).sum(), list(leaves.values()))
     return {"x": x.detach(), "v": v.detach(), **{f"grad_{k}": g for k, g in zip(leaves, grads, strict=True)}}

@@ -17,8 +17,7 @@ import diffvbd as dv
 from diffvbd import reference
 from diffvbd.model.coarse import CoarseSpace, build_coarse
 from diffvbd.reference import coarse, sweep
-from diffvbd.reference.layout import build_layout
-from diffvbd.reference.scene import build_scene
+from diffvbd.reference.scene import build_layout, build_scene
 from diffvbd.testing import generator, relative_error, structured, tolerance
 
 NAMES = ("tets", "rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation")
@@ -64,14 +63,14 @@ def inputs_of(model: Any, jitter: float = 0.02) -> dict[str, Any]:
         "gravity": torch.tensor([0.3, -9.81, 0.1]).double(),
         "prescribed": x + 0.01 * normal(SCENES, POINTS, 3),
         "rest_points": rest + 5e-3 * normal(SCENES, POINTS, 3),
-        "parameters": {"anchor.stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2))},
+        "parameters": {"anchor_stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2))},
         "time_step": 0.02,
     }
 
 
 def coarse_of(model: Any, x: Tensor, energies: Any = None, **changes: Any) -> tuple[coarse.Coarse, Any]:
     """The correction of a run from x, and its scene."""
-    options = {"mu": 8e3, "lam": 2e4, "time_step": 0.02, "rest_points": None, "density": None, "parameters": None}
+    options = {"mu": 8e3, "lam": 2e4, "rest_points": None, "density": None, "parameters": None}
     scene = build_scene(model, build_layout(model), x, **(options | changes))
     return coarse.Coarse(scene, sweep.build_energies(scene) if energies is None else energies), scene
 

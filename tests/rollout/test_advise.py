@@ -7,12 +7,12 @@ from typing import Any, cast
 
 import pytest
 import torch
+from diffvbd.rollout.pilots import Pilots
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import mesh
-from diffvbd.rollout.between import SWINGS, unseen
-from diffvbd.rollout.pilots import Pilots
+from diffvbd.rollout.tune import SWINGS, unseen
 from diffvbd.testing.tolerances import tolerance
 
 DURATION = 0.3
@@ -28,7 +28,7 @@ def off(model: dv.Model, settings: dv.Settings, material: dict[str, float], dura
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     runs = Pilots(dv.rollout, model, x, v, duration, {**material, **options})
     given = runs.run(settings, settings.steps(duration))
-    exact = runs.run(dv.Settings(1.0, 40, dv.SDIRK2()), 4 * max(256, settings.steps(duration)))
+    exact = runs.run(dv.VBD(1.0, 40, integrator=dv.SDIRK2()), 4 * max(256, settings.steps(duration)))
     assert given.x is not None and exact.x is not None
     return runs.apart(given.x, exact.x)
 
@@ -64,10 +64,10 @@ def test_gradients_are_kept_too() -> None:
 
     def gradient(settings: dv.Settings, duration: float = 0.2) -> torch.Tensor:
         mu = torch.tensor(material["mu"], dtype=torch.float64, requires_grad=True)
-        end = dv.rollout(model, x, v, duration=duration, settings=settings, mu=mu, lam=material["lam"], save="last")
+        end = dv.rollout(model, x, v, settings, duration=duration, mu=mu, lam=material["lam"], save="last")
         return torch.autograd.grad((end.x[-1] - x).square().sum(-1).mean(), mu)[0]
 
-    exact = gradient(dv.Settings(0.2 / 512, 40, dv.SDIRK2()))
+    exact = gradient(dv.VBD(0.2 / 512, 40, integrator=dv.SDIRK2()))
     assert exact != 0
     assert abs(gradient(settings) - exact) <= 0.05 * abs(exact)
 
@@ -87,7 +87,7 @@ def test_loads_may_be_functions_of_time() -> None:
 def test_an_error_that_cannot_be_had_is_said() -> None:
     model, material = cantilever(1e8)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    settings = dv.advise(model, x, v, duration=1.0, error=1e-3, patience=0.2, **material)
+    settings = dv.advise(model, x, v, duration=1.0, error=1e-3, time_budget=0.2, **material)
     told = settings.predicted
     assert told is not None and not told.reached and told.error > 1e-3
     assert "patience" in told.why and "cannot be had" in str(settings)
@@ -138,7 +138,7 @@ def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
     v = torch.zeros_like(model.rest_points)
     v[: one.num_vertices, 0] = 1.0
     given = {"mu": 2e5, "lam": 2e5, "gravity": (0.0, 0.0, 0.0)}
-    settings = dv.advise(model, model.rest_points, v, duration=0.04, error=0.2, patience=20.0, **given)
+    settings = dv.advise(model, model.rest_points, v, duration=0.04, error=0.2, time_budget=20.0, **given)
     assert settings.predicted is not None and settings.predicted.reached
     runs = Pilots(dv.rollout, model, model.rest_points, v, 0.04, given)
     a = runs.run(settings, settings.steps(0.04))
@@ -159,7 +159,7 @@ def test_a_bounce_that_steps_resolve() -> None:
     runs = Pilots(dv.rollout, model, x, v, duration, dict(material))
     steps = settings.steps(duration)
     given, exact = (
-        runs.run(settings if n == steps else dv.Settings(1.0, 20, dv.SDIRK2()), n) for n in (steps, 6 * steps)
+        runs.run(settings if n == steps else dv.VBD(1.0, 20, integrator=dv.SDIRK2()), n) for n in (steps, 6 * steps)
     )
     assert given.x is not None and exact.x is not None and given.v is not None
     error = runs.apart(given.x, exact.x)
@@ -189,7 +189,7 @@ def test_a_quantity_that_cannot_be_judged_is_named(quantity, gradient: bool, got
         if judge == "advise":
             dv.advise(model, x, v, **given)
         else:
-            dv.error_budget(model, x, v, time_step=0.01, sweeps=2, **given)
+            dv.error_budget(model, x, v, dv.VBD(0.01, 2), **given)
 
 
 @pytest.mark.parametrize("device", [None, "cpu"])
@@ -219,15 +219,15 @@ def beam() -> tuple[dv.Model, Tensor, Callable[[float], Tensor]]:
 def test_advice_looks_between_the_steps() -> None:
     model, x, force = beam()
     given = {"mu": 1e5, "lam": 1e5, "gravity": (0.0, 0.0, 0.0), "force": force}
-    settings = dv.advise(model, x, 0 * x, duration=SHORT, error=0.1, patience=20.0, **given)
+    settings = dv.advise(model, x, 0 * x, duration=SHORT, error=0.1, time_budget=20.0, **given)
     told = settings.predicted
     assert told is not None and told.reached and settings.steps(SHORT) > 3 * FREQUENCY * SHORT
 
     def end(steps: int) -> Tensor:
         h = SHORT / steps
-        return dv.rollout(model, x, 0 * x, steps=steps, time_step=h, sweeps=20, integrator=dv.SDIRK2(), save="last",
-                          mu=1e5, lam=1e5, gravity=(0.0, 0.0, 0.0),
-                          force=lambda k, x, v: force((k + 0.5) * h)).x[-1] - x  # fmt: skip
+        return dv.rollout(model, x, 0 * x, dv.VBD(h, 20, integrator=dv.SDIRK2()), steps=steps, save="last", mu=1e5,
+                          lam=1e5, gravity=(0.0, 0.0,
+                                            0.0), force=lambda k, x, v: force((k + 0.5) * h)).x[-1] - x  # fmt: skip
 
     exact, few = end(1024), end(16)
     assert float(few.norm()) < 0.01 * float(exact.norm())  # which sixteen steps do not see at all
@@ -253,6 +253,7 @@ def test_what_samples_see(function: Callable[[float], Tensor], steps: int, moves
 
 
 RELEASED, EDGE = 0.103, 5e-4  # [s]: after it the push fades within some 2 ms
+# TODO62: part of a solver in these options
 LONG: dict[str, Any] = {"mu": 1e5, "lam": 1e5, "gravity": (0.0, 0.0, 0.0), "sweeps": 5, "save": "last"}
 
 
@@ -262,8 +263,14 @@ def released(push: Callable[[Tensor, Tensor], Any], steps: int = 20, **given: An
     x = model.rest_points
     time = torch.tensor(RELEASED, dtype=torch.float64, requires_grad=True)
     force = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64).expand_as(x)
-    options = {**LONG, "steps": steps, "time_step": 0.4 / steps, "integrator": dv.SDIRK2(), **given}
-    way = (dv.rollout(model, x, 0 * x, force=push(time, force), **options).x[-1] - x)[:, 0].mean()
+    options = {**LONG, "steps": steps, **given}
+    # TODO62: the solver of this call
+    way = (
+        dv.rollout(
+            model, x, 0 * x, force=push(time, force), **options, time_step=0.4 / steps, integrator=dv.SDIRK2()
+        ).x[-1]
+        - x
+    )[:, 0].mean()
     (slope,) = torch.autograd.grad(way, time)
     whole = 8 * 0.1 / float(model.mass.sum())
     return way.detach() / (whole * RELEASED * (0.4 - RELEASED / 2)), slope / (whole * (0.4 - RELEASED))
@@ -295,10 +302,8 @@ def test_an_integral_does_the_same_for_an_edge_of_no_length() -> None:
     [
         (lambda: dv.step_average(cast(Any, 1.0)), TypeError, "function: expected a function of the time"),
         (lambda: dv.step_average(lambda t: t, samples=0), ValueError, "samples: expected"),
-        (lambda: dv.rollout(*beam()[:2], 0 * beam()[1], steps=1, time_step=0.01, sweeps=1, mu=1.0, lam=1.0,
-                            prescribed=dv.step_average(lambda t: t)), TypeError, "prescribed: expected positions"),
-        (lambda: dv.error_budget(*beam()[:2], 0 * beam()[1], duration=0.1, time_step=0.01, sweeps=1, mu=1.0, lam=1.0,
-                                 colliders=dv.step_average(lambda t: t)), TypeError, "colliders: expected positions"),
+        (lambda: dv.rollout(*beam()[:2], 0 * beam()[1], solver=dv.VBD(0.01, 1), steps=1, mu=1.0, lam=1.0, prescribed=dv.step_average(lambda t: t)), TypeError, "prescribed: expected positions"),
+        (lambda: dv.error_budget(*beam()[:2], 0 * beam()[1], solver=dv.VBD(0.01, 1), duration=0.1, mu=1.0, lam=1.0, colliders=dv.step_average(lambda t: t)), TypeError, "colliders: expected positions"),
     ],
 )  # fmt: skip
 def test_bad_input_of_a_mean(call: Callable[[], object], error: type[Exception], words: str) -> None:

@@ -1,5 +1,6 @@
 """`model.memory` against bytes that torch's allocator and autograd report, within the tolerance "memory"."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -67,11 +68,11 @@ def test_bytes_of_one_step(tape: str, floor: bool, scenes: int, wanted: str) -> 
     arguments[wanted].requires_grad_()
     if wanted != "rest_points":
         del arguments["rest_points"]
-    options = {"lam": 1e4, "time_step": 0.01, "sweeps": SWEEPS, "adjoint": dv.ReverseSweep(tape)}
+    options = {"lam": 1e4, "solver": dv.VBD(0.01, SWEEPS, tape=tape)}
     given = [x, *arguments.values(), *own_tensors(model)]
     measured = saved_bytes(lambda: dv.step(model, x, **arguments, **options), given)
-    predicted = model.memory(sweeps=SWEEPS, scenes=scenes, tape=tape, rest=wanted == "rest_points")
-    graph = model.memory(sweeps=SWEEPS, rest=True)["kept"] - model.memory(sweeps=SWEEPS)["kept"]
+    predicted = model.memory(dv.VBD(0.01, SWEEPS, tape=tape), scenes=scenes, rest=wanted == "rest_points")
+    graph = model.memory(dv.VBD(0.01, SWEEPS), rest=True)["kept"] - model.memory(dv.VBD(0.01, SWEEPS))["kept"]
     assert_near(predicted["step"] + (graph if wanted == "rest_points" else 0), measured)
 
 
@@ -80,14 +81,19 @@ def test_bytes_of_one_step(tape: str, floor: bool, scenes: int, wanted: str) -> 
 def test_bytes_of_one_step_with_coarse_corrections(floor: bool, wanted: str) -> None:
     energies = (dv.StableNeoHookean(), *((dv.FloorBarrier(-1.0),) if floor else ()))
     mesh = dv.mesh.beam()
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=energies, coarse="auto")
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=energies)
     x = model.rest_points[None]
     arguments = {"x": x, "v": torch.zeros_like(x), "mu": torch.full((model.num_tets,), 1e4, dtype=x.dtype)}
     arguments[wanted].requires_grad_()
-    options = {"lam": 1e4, "time_step": 0.01, "sweeps": 8, "adjoint": dv.ReverseSweep("compact")}
+    options = {"lam": 1e4, "solver": dv.VBD(0.01, 8, tape="compact")}
     given = [*arguments.values(), *own_tensors(model)]
-    measured = saved_bytes(lambda: dv.step(model, **arguments, **options), given)
-    predicted = model.memory(sweeps=8, tape="compact", material=wanted == "mu")
+    measured = saved_bytes(
+        lambda: dv.step(
+            model, **arguments, **(options | {"solver": dataclasses.replace(options["solver"], subspace="coarse")})
+        ),
+        given,
+    )
+    predicted = model.memory(dv.VBD(0.01, 8, tape="compact"), material=wanted == "mu")
     frame = 2 * x.numel() * x.element_size()  # which a rollout returns
     assert_near(predicted["kept"] - frame, measured)
 
@@ -99,13 +105,17 @@ def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype:
     for floor, extra in ((False, 0), (True, {"full": 4, "compact": 1, "recompute": 0}[tape])):
         model = beam_model(floor, dtype)
         item = model.mass.element_size()
-        tape_bytes = model.memory(sweeps=SWEEPS, scenes=2, tape=tape)["tape"]
+        tape_bytes = model.memory(
+            dv.VBD(0.01, SWEEPS, tape=tape),
+            scenes=2,
+        )["tape"]
         assert tape_bytes == 2 * SWEEPS * model.num_active * (scalars + extra) * item
         x = model.rest_points.repeat(2, 1, 1)
         sizes = []
         for sweeps in (SWEEPS, 2 * SWEEPS):
             v = torch.zeros_like(x).requires_grad_()
-            options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": sweeps, "adjoint": dv.ReverseSweep(tape)}
+            options = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, sweeps, tape=tape)}
+            # TODO62: the solver of this call
             sizes.append(saved_bytes(lambda v=v, o=options, x=x, m=model: dv.step(m, x, v, **o), own_tensors(model)))
         assert sizes[1] - sizes[0] == tape_bytes
 
@@ -118,11 +128,11 @@ def test_bad_arguments_are_named(name: str, value: Any) -> None:
 
 def test_auto_chooses_by_size() -> None:
     model = beam_model()
-    small, large = (model.memory(sweeps=sweeps, tape="auto") for sweeps in (20, 60_000))
+    small, large = (model.memory(dv.VBD(0.01, sweeps, tape="auto")) for sweeps in (20, 60_000))
     assert small["tape"] == 20 * model.num_active * 72
     assert large["tape"] == 60_000 * model.num_active * 24
-    long = model.memory(sweeps=20, steps=100_000)
-    assert long["kept"] < 0.05 * model.memory(sweeps=20, steps=100_000, checkpoint_every=None)["kept"]
+    long = model.memory(dv.VBD(0.01, 20), steps=100_000)
+    assert long["kept"] < 0.05 * model.memory(dv.VBD(0.01, 20), steps=100_000, checkpoint_every=None)["kept"]
 
 
 ROLLOUTS = [
@@ -151,10 +161,10 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
     x = model.rest_points.clone()
     v = torch.zeros_like(x).requires_grad_()
     mu = torch.full((model.num_tets,), 1e4, dtype=x.dtype, requires_grad=True)
-    options = {"mu": mu, "lam": 1e4, "time_step": 0.01, "sweeps": SWEEPS, "adjoint": dv.ReverseSweep(tape),
-               "check_energy": False}  # a look takes some memory for a moment  # fmt: skip
+    options = {"mu": mu, "lam": 1e4, "check_energy": False, "solver": dv.VBD(0.01, SWEEPS,
+                                                                             tape=tape)}  # a look takes some memory for a moment  # fmt: skip
 
-    def forward(steps: int = steps, schedule: Any = schedule, save: Any = save) -> dv.Trajectory:
+    def forward(steps: int = steps, schedule: Any = schedule, save: Any = save) -> dv.results.Trajectory:
         return dv.rollout(model, x, v, steps=steps, checkpoint_every=schedule, save=save, **options)
 
     def backward(*given: Any) -> None:
@@ -168,7 +178,7 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
     )
     held, _ = allocated_bytes(forward)
     peak = allocated_bytes(backward)[1]
-    predicted = model.memory(sweeps=SWEEPS, steps=steps, tape=tape, checkpoint_every=schedule, save=save)
+    predicted = model.memory(dv.VBD(0.01, SWEEPS, tape=tape), steps=steps, checkpoint_every=schedule, save=save)
     if isinstance(schedule, dv.BinomialCheckpoints) and save != "last":  # an upper estimate, see its documentation
         assert 0.7 * predicted["kept"] <= peak - passing <= predicted["kept"]
     else:
@@ -186,11 +196,10 @@ def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
     options = {
         "mu": 1e4,
         "lam": 1e4,
-        "time_step": 0.01,
-        "sweeps": SWEEPS,
         "steps": 36,
         "save": "last",
         "check_energy": False,
+        "solver": dv.VBD(0.01, SWEEPS),
     }
     dv.rollout(model, x, v, **options)  # what a Model measures once is over
     adjoint = dv.ReverseSweep("full")
@@ -205,5 +214,5 @@ def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
 def test_bytes_of_the_model_are_those_of_its_tensors() -> None:
     model = beam_model()
     storages = {t.data_ptr(): t.numel() * t.element_size() for t in own_tensors(model)}
-    assert model.memory(sweeps=1)["model"] == sum(storages.values())
-    assert model.memory(sweeps=1)["total"] == sum(model.memory(sweeps=1)[k] for k in ("kept", "scratch"))
+    assert model.memory(dv.VBD(0.01, 1))["model"] == sum(storages.values())
+    assert model.memory(dv.VBD(0.01, 1))["total"] == sum(model.memory(dv.VBD(0.01, 1))[k] for k in ("kept", "scratch"))

@@ -67,7 +67,8 @@ def test_equals_the_reference(case: str, sweeps: int, device: str) -> None:
 def test_equals_the_step_of_the_package(case: str, device: str) -> None:
     scene = build_scene(case, "delaunay", "medium")
     model, inputs = model_of(scene, device), inputs_of(scene, device)
-    expected = evaluate(lambda **given: dv.step(model, sweeps=3, **given), inputs)
+    # TODO62: the solver of this call
+    expected = evaluate(lambda **given: dv.step(model, **given, sweeps=3), inputs)
     found = evaluate(composed(model, 3), inputs)
     assert_agree(found, expected, lambda: testing.spread(model_of(scene), inputs_of(scene), 3))
 

@@ -184,7 +184,7 @@ def test_gradients_are_those_of_a_plain_backward(device: str, energies: tuple) -
         given = {"x": x, "v": torch.zeros_like(x), "force": torch.zeros_like(x), "rest_points": x.clone()}
         given |= {"mu": x.new_tensor(2e4), "lam": x.new_tensor(4e4), "density": x.new_tensor(1e3)}
         given = {name: value.requires_grad_() for name, value in given.items()}
-        end, v = dv.step(model, **given, time_step=0.01, sweeps=3)
+        end, v = dv.step(model, solver=dv.VBD(0.01, 3), **given)
         loss = end.square().sum() + v.sum()
         if compiled:
             with compiled_autograd._enable(torch.compile(backend="eager")):

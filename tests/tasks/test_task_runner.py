@@ -16,9 +16,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.tasks import Problem, Settings, Stage, solve, table
-from diffvbd.tasks.capture import captured
-from diffvbd.tasks.newton import Newton
-from diffvbd.tasks.optimizer import PATIENCE, optimizer_of
+from diffvbd.tasks.optimizer import PATIENCE, Newton, optimizer_of
+from diffvbd.tasks.runner import captured
 from diffvbd.testing import tolerance
 
 CENTER = (0.5, -1.0)
@@ -420,8 +419,8 @@ def push(before: bool = False, rollout: bool = True) -> Problem:
         calls.add_(1)
         if not rollout:
             return (force - 1).square()
-        end = dv.rollout(model, x, torch.zeros_like(x), mu=1e4, lam=1e4, time_step=1 / 50, sweeps=3, steps=5,
-                         force=force * way, gravity=(0, 0, 0), save="last").x[-1]  # fmt: skip
+        end = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(1 / 50, 3), mu=1e4, lam=1e4, steps=5, force=force * way,
+                         gravity=(0, 0, 0), save="last").x[-1]  # fmt: skip
         return ((end - x)[:, 0].mean() - 0.1).square()
 
     stages = [Stage(loss, 6, optimizer=lambda p: torch.optim.LBFGS(p, 1, 6, line_search_fn="strong_wolfe"),
@@ -434,7 +433,7 @@ def test_a_run_ends_with_the_line(tmp_path: Path) -> None:
     result = solve(problem, Settings(tmp_path))
     found = result.refined
     # implicit Euler goes (n + 1) / n of the right way in n steps: smaller ones go less far
-    assert isinstance(found, dv.Refinement) and found.before == result.history[0]["loss"]
+    assert isinstance(found, dv.results.Refinement) and found.before == result.history[0]["loss"]
     assert found.loss < found.smaller_steps < result.history[0]["loss"]
     assert str(found) in table(problem, result).splitlines()[-1]
     assert str(found) in (tmp_path / "log.json").read_text(encoding="utf-8")

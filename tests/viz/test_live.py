@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd.viz import clock, motion, opened, values
-from diffvbd.viz.scenery import scenery_of
+from diffvbd.viz import clock, motion, values
+from diffvbd.viz.motion import opened, scenery_of
 
 MESH = dv.mesh.join([dv.mesh.cube(2, 0.2, split="kuhn"), dv.mesh.cube(2, 0.2, split="kuhn").translate((0.0, 0.5, 0.0))])
 MODEL = dv.Model(MESH, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)))
@@ -21,9 +21,9 @@ X = MODEL.rest_points
 STEP = 0.01
 
 
-def falling(steps: int = 6, scenes: int | None = None) -> dv.Trajectory:
+def falling(steps: int = 6, scenes: int | None = None) -> dv.results.Trajectory:
     x = X if scenes is None else X.expand(scenes, -1, -1).clone()
-    return dv.rollout(MODEL, x, torch.zeros_like(x), steps=steps, mu=1e4, lam=1e4, time_step=STEP, sweeps=3)
+    return dv.rollout(MODEL, x, torch.zeros_like(x), dv.VBD(STEP, 3), steps=steps, mu=1e4, lam=1e4)
 
 
 # --- motions ----------------------------------------------------------------------------------------------------------
@@ -77,7 +77,7 @@ def test_colors_are_the_quantities() -> None:
     known = values.Values(MODEL, mu, 1e4)
     speed = np.linalg.norm(moving.velocities, axis=-1)[:, MESH.surface].mean(-1)  # pyright: ignore
     assert known.values("speed", moving) == pytest.approx(speed)
-    stress = dv.stress(MODEL, torch.from_numpy(moving.points), torch.from_numpy(mu), 1e4).von_mises.numpy()
+    stress = dv.stress(MODEL, torch.from_numpy(moving.points), mu=torch.from_numpy(mu), lam=1e4).von_mises.numpy()
     assert known.values("stress", moving) == pytest.approx(stress[:, moving.tets])
     assert stress.max() > 0
     assert known.values("stiffness", moving) == pytest.approx(mu[moving.tets])
