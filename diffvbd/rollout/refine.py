@@ -33,7 +33,8 @@ HELPS = {"K": "more sweeps", "2 K": "more sweeps", "h": "smaller steps", "h/2": 
 
 @dataclass(frozen=True)
 class GradientTest:
-    """Error of the gradient with respect to a parameter, see :func:`diffvbd.refine`: shares of the gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
+    """Error of the gradient with respect to a parameter, see :func:`diffvbd.refine`: shares of the gradient, or of the
+    largest slope of the loss within a tenth of the parameter, if that is larger [-].
 
     Attributes:
         finer: From that of each finer run, by name.
