@@ -48,12 +48,12 @@ def memory(
     Returns:
         A dict of bytes. ``"model"``: index data and rest scalars of the Model. ``"tape"``: of one step, scenes x sweeps
         x active vertices x 72 (full), 24 (compact) or 0 bytes in float64 (104 and 32 with a floor). ``"step"``: what
-        one step keeps for its backward with the state it starts from, tape included. ``"kept"``: the largest amount kept
-        at once: all steps without checkpoints; states plus the steps of one segment with checkpoints every n; states
-        plus one step with BinomialCheckpoints, there an upper estimate if frames are saved. It counts the state of the
-        random number generator (5 kB) with every checkpoint. ``rest`` adds the graph of the rest metric, once (297 B
-        per tet), for rest_points that the scenes share. ``"scratch"``: of one backward step, in scenes that run side by
-        side on as many threads. ``"total"``: kept + scratch.
+        one step keeps for its backward with the state it starts from, tape included. ``"kept"``: the largest amount
+        kept at once: all steps without checkpoints; states plus the steps of one segment with checkpoints every n;
+        states plus one step with BinomialCheckpoints, there an upper estimate if frames are saved. It counts the state
+        of the random number generator (5 kB) with every checkpoint. ``rest`` adds the graph of the rest metric, once
+        (297 B per tet), for rest_points that the scenes share. ``"scratch"``: of one backward step, in scenes that run
+        side by side on as many threads. ``"total"``: kept + scratch.
 
     Raises:
         ValueError, TypeError: For what rollout would refuse; it names the argument.
