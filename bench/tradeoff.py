@@ -24,8 +24,8 @@ from bench.advice_scenes import Scene
 from bench.common import digits, markdown_table
 from bench.tradeoff_peers import peers
 from bench.tradeoff_scenes import SCENES, gripper, pile
-from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, converted, pilots_of
-from diffvbd.rollout.search import start_of
+from diffvbd.rollout.tune import FRAMES, Pilot, Pilots, converted, pilots_of
+from diffvbd.rollout.tune import start_of
 
 LONGEST = 1 / 30  # [s], the first step
 ERRORS = (0.1, 0.01, 0.001)

@@ -52,7 +52,7 @@ ROOMS = (
     "_version", "safeguards", "mask", "checks", "distributed", "tuples", "said", "lasting", "scopes", "reference",
     "energies", "mesh", "ops", "contact",
     "model", "adjoint", "step", "rollout", "inspect", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
-    "cli_mesh", "cli_scene", "cli_view", "cli", "__main__",
+    "cli", "__main__",
 )  # fmt: skip
 OPTIONAL = {
     "matplotlib",
@@ -158,7 +158,7 @@ def test_nothing_imports_tests_or_benchmarks_and_dependencies_are_declared() -> 
     roots = {(m, i.split(".")[0]) for m, imports in PYTHON.items() for i in imports}
     assert not {(m, i) for m, i in roots if i in ("tests", "bench", "pytest", "hypothesis", "conftest")}
     importers = {m for m, i in roots if i in OPTIONAL}
-    allowed = {"mesh.read", "mesh.repair", "mesh.tetrahedralize", "mesh.usd", "testing.scenes"}
+    allowed = {"mesh.read", "mesh.surfaces", "mesh.motions", "testing.scenes"}
     assert {m for m in importers if not m.startswith("viz.")} <= allowed
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..model.model import Model
+from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
 from ..said import warn
 from ..scopes import is_captured
@@ -37,7 +37,7 @@ _FIELDS = _DIFFERENTIABLE + 1  # and the origin
 
 
 def global_sweep(
-    model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
+    model: System, fields: ops.SweepFields, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
     then: Callable[[Tensor], Tensor] = lambda x: x,
 ) -> Tensor:  # fmt: skip
     """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``fields``: without contact."""
@@ -223,7 +223,7 @@ class _Structure(NamedTuple):
     free: Tensor  # [free]
 
 
-def _structure(model: Model) -> _Structure:
+def _structure(model: System) -> _Structure:
     count, tets, free = model.num_vertices, model._topology[0], ~model._pinned
     a, b = (list(corners) for corners in zip(*PAIRS, strict=True))
     rows, columns = tets[:, a + b].reshape(-1), tets[:, b + a].reshape(-1)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..tuples import replaced
 from .bodies import connected
-from .coarse_plan import ROW, in_blocks
-from .rest import rest_metric
+from .coarse import ROW, in_blocks
+from .material import rest_metric
 
 
 class MovingBodies(NamedTuple):

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..model.model import Model
+from ..model.system import system_of
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
-from .energies import StableNeoHookean, build_energies
-from .friction import floor_friction
-from .layout import Layout, build_layout, dot, put, solve6, take
+from .energies import StableNeoHookean, build_energies, floor_friction
 from .rigid import Correction
-from .scene import Scene, build_scene
+from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
 
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
 SOFT = 0.02  # h^2 times a tet's stiffness over the mass of its corners, below which it hardly acts within a step
@@ -24,36 +24,43 @@ class Trajectory(NamedTuple):
     v: Tensor
 
 
+def executed(model: Any, solver: Any) -> Any:
+    """The model with the attributes that the solver decides; what is no Model has them already."""
+    return system_of(model, solver) if isinstance(model, Model) else model
+
+
 def step(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     coarse_steps: Tensor | None = None,
     record: list[Tensor] | None = None,
+    **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
-    """One time step; every tensor argument is differentiable by autograd.
+    """One time step of a model by a solver (`diffvbd.VBD`); every tensor argument is differentiable by autograd.
 
     x, v: positions [m] and velocities [m/s], [..., V, 3]; leading dimensions are scenes. mu, lam [Pa] broadcast to
     x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
     coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
     given; record: a list, to which the step appends the lengths that it took.
-    Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
+    parameters: of energies, as `floor_kappa`. Raises ValueError when an unpinned vertex starts below a floor plane.
+    Returns (x', v').
     """
-    layout = build_layout(model, tet_order)
-    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
+    system = executed(model, solver)
+    layout = build_layout(system, tet_order)
+    numbers = solver.time_step, solver.sweeps
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
     return advance(x, v, force, gravity, prescribed, coarse_steps, record)
 
 
@@ -61,35 +68,35 @@ def rollout(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
     steps: int,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     force_per_step: Tensor | Sequence[Tensor] | None = None,
     prescribed_per_step: Tensor | Sequence[Tensor] | None = None,
     coarse_steps: Tensor | Sequence[Tensor] | None = None,
-    taken: Tensor | Sequence[Tensor] | None = None,
     record: list[Tensor] | None = None,
+    **parameters: Any,
 ) -> Trajectory:
     """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
-    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps` and `taken`, and
+    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps`, and
     `record` gets an entry for each step. Other arguments as in `step`."""
-    layout = build_layout(model, tet_order)
-    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
+    system = executed(model, solver)
+    layout = build_layout(system, tet_order)
+    numbers = solver.time_step, solver.sweeps
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]
         held = prescribed if prescribed_per_step is None else prescribed_per_step[n]
-        given = tuple(None if a is None else a[n] for a in (coarse_steps, taken))
+        given = None if coarse_steps is None else coarse_steps[n]
         x, v = advance(x, v, f, gravity, held, given, record)
         xs.append(x)
         vs.append(v)
@@ -390,3 +397,53 @@ def _saturation(update: Tensor, limit: float) -> Tensor:
     moves = square > 0
     length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)
     return limit / (length + limit + SATURATION_EPS)
+
+
+def incremental_potential(
+    model: Any,
+    x: Tensor,
+    y: Tensor,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    x_prev: Tensor | None = None,
+    *,
+    rest_points: Tensor | None = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+) -> Tensor:
+    """G(x) = 1/2 sum m |x - y|^2 + h^2 E(x), h^2-scaled [kg m^2], shape x.shape[:-2].
+
+    x, y: positions and predictor [m], [..., V, 3]; mu, lam [Pa] as in `step`. E is elastic energy (zero at rest) plus
+    barriers (inf at a gap <= 0 of an unpinned vertex) and anchors. x_prev: state at the start of the step, for the
+    lagged damping of a floor; None stands for x itself, where the damping vanishes.
+    """
+    scene = build_scene(
+        model,
+        build_layout(model),
+        x,
+        mu=mu,
+        lam=lam,
+        time_step=time_step,
+        rest_points=rest_points,
+        density=density,
+        parameters=parameters,
+    )
+    rows = x.transpose(-1, -2)
+    lagged = rows if x_prev is None else x_prev.transpose(-1, -2)
+    total = (scene.mass / 2 * ((x - y) ** 2).sum(-1)).sum(-1)
+    for energy in build_energies(scene):
+        total = total + energy.energy(rows, lagged)
+    return total
+
+
+def residual(
+    model: Any, x: Tensor, y: Tensor, mu: Any, lam: Any, time_step: float, *args: Any, **options: Any
+) -> Tensor:
+    """dG/dx [kg m], [..., V, 3], by autograd, detached; arguments as in `incremental_potential`. Zero at unpinned
+    vertices of a converged step; at a pinned vertex it is h^2 times the force that holds it (for y = x there)."""
+    with torch.enable_grad():
+        x = x.detach().requires_grad_()
+        total = incremental_potential(model, x, y, mu, lam, time_step, *args, **options)
+        (gradient,) = torch.autograd.grad(total.sum(), x)
+    return gradient

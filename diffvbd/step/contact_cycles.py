@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..model.model import Model
+from ..model.system import System
 from ..ops import SweepSettings
 from ..scopes import recorders
 from ..tuples import replaced
@@ -84,7 +84,7 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     return SweptPart(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None)
 
 
-def _cycles(model: Model, sweeps: int) -> list[int]:
+def _cycles(model: System, sweeps: int) -> list[int]:
     """Sweeps of each cycle of a part, with corrections the first sweep alone; [sweeps] where nothing is done between
     them."""
     if model.coarse is None or not model.coarse_geometry.bodies:
@@ -110,10 +110,10 @@ def of_going(part: SweptPart, going: Tensor) -> SweptPart:
     return part if part.lengths is None else replaced(part, lengths=torch.where(going[:, 0], part.lengths, 0.0))
 
 
-def record_parts(model: Model, x: Tensor, parts: Sequence[SweptPart]) -> None:
+def record_parts(model: System, x: Tensor, parts: Sequence[SweptPart]) -> None:
     """For coarse.record(): what the parts of a step that ends at x have done."""
     if model.coarse is not None:
-        for found in recorders("coarse"):
+        for found in recorders("subspace"):
             lengths = [part.lengths for part in parts if part.lengths is not None]
             empty = x.new_empty((0, len(x), model.coarse_geometry.bodies))
             found.append(torch.cat([empty, *lengths]).movedim(0, 1))

@@ -10,8 +10,7 @@ from diffvbd.adjoint.rise import RiseParts, rise_of_bodies, rise_parts
 from diffvbd.adjoint.sweep import sweep
 from diffvbd.model.moving import moving_bodies, moving_vertices
 from diffvbd.reference.energies import build_energies
-from diffvbd.reference.layout import build_layout, dot
-from diffvbd.reference.scene import Scene
+from diffvbd.reference.scene import Scene, build_layout, dot
 from diffvbd.reference.scene import build_scene as reference_scene
 from diffvbd.step.arguments import GRAVITY, acceleration_of, prepare
 from diffvbd.step.predict import begin
