@@ -12,8 +12,8 @@ from torch import Tensor
 
 from diffvbd.contact.above_floor import above_floor
 from diffvbd.contact.start import Decided, _Start
-from diffvbd.ops import contact_part as ops_part
-from diffvbd.ops.contact_part import ASKS, PartBodies, Whole
+from diffvbd.ops import contact as ops_part
+from diffvbd.ops.contact import ASKS, PartBodies, Whole
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.testing import generator, relative_error, tolerance
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.ops import contact_start
+from diffvbd.ops import contact as contact_start
 
 # pairs, room for them, corner points of all scenes; on CUDA short lists go another way (csrc/cuda/keep.cu)
 SIZES = {"none": (0, 0, 7), "empty": (0, 200, 7), "few": (300, 300, 40), "room": (2_900, 5_000, 900),

@@ -10,8 +10,8 @@ import torch
 from helpers.grouped import grouped
 from torch import Tensor
 
-from diffvbd.ops import motion as ops_motion
-from diffvbd.ops.motion import WAYS, Ways
+from diffvbd.ops import contact as ops_motion
+from diffvbd.ops.contact import WAYS, Ways
 from diffvbd.testing import generator, tolerance
 
 NAN, INF = float("nan"), float("inf")

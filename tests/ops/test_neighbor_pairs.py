@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from diffvbd import ops
-from diffvbd.ops import neighbors as ops_neighbors
-from diffvbd.ops.neighbors import neighbor_pairs
+from diffvbd.ops import contact as ops_neighbors
+from diffvbd.ops.contact import neighbor_pairs
 
 DTYPES = [torch.float64, torch.float32]
 

@@ -16,7 +16,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import mesh, ops
 from diffvbd.adjoint.contact_lag import Pairs, at_corners
-from diffvbd.ops import contact_rigid
+from diffvbd.ops import contact as contact_rigid
 from diffvbd.step.rigid_terms import Scenes, pair_terms
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import SCENES, compiled, noise

@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 import torch
+from diffvbd.model.rest import shape_gradients
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import ops
-from diffvbd.model.rest import shape_gradients
-from diffvbd.ops import coarse_cuda
+from diffvbd.ops import coarse as coarse_cuda
 from diffvbd.step.coarse_sums import coarse_mass, coarse_stiffness
 from diffvbd.testing import generator, relative_error, tolerance
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from diffvbd.model.rest import shape_gradients
 from helpers.marks import slow
 from helpers.small_step import (
     ARGUMENTS,
@@ -26,7 +27,6 @@ import diffvbd as dv
 from diffvbd import ops
 from diffvbd.adjoint.contact_lag import no_pairs
 from diffvbd.contact.detection import detect
-from diffvbd.model.rest import shape_gradients
 from diffvbd.step.coarse import coarse_parts
 from diffvbd.step.rigid_contact import bodies_of
 from diffvbd.testing import relative_error, tolerance
