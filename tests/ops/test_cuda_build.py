@@ -1,9 +1,7 @@
 """CUDA sources compile for every architecture without a device; the object is found, or compiled once and cached."""
 
-import ast
 import functools
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -11,7 +9,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -75,46 +72,6 @@ def compile_for(kernels: list[Path], architectures: list[str], folder: Path, *fl
 # --- the sources ------------------------------------------------------------------------------------------------------
 
 
-@needs_csrc
-def test_kernels_include_no_torch() -> None:
-    """That is why they compile in seconds, with any torch, and here."""
-    paths = [p for p in (CSRC / "cuda").rglob("*") if p.suffix in (".cu", ".cuh", ".h")]
-    assert len(KERNELS) >= 1 and len(paths) > len(KERNELS)
-    for path in paths:
-        included = re.findall(r'^\s*#\s*include\s*[<"]([^>"]+)[>"]', path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert not [name for name in included if re.match(r"torch|ATen|c10|Python\.h", name)], path
-    assert set(QUICK) <= set(STEMS)
-
-
-@needs_csrc
-def test_every_source_is_in_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
-    for variable in ("DIFFVBD_NO_CLONES", "DIFFVBD_QUICK"):
-        monkeypatch.delenv(variable, raising=False)
-    # of setup.py only the assignments up to the list are executed
-    names: dict[str, Any] = {"os": os}
-    for node in ast.parse((ROOT / "setup.py").read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and "CPU_SOURCES" not in names:
-            exec(ast.unparse(node), names)
-    cpu = names["CPU_SOURCES"]
-    sources = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".cpp", ".cu")}
-    cuda = {p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)}
-    assert len(cpu) == len(set(cpu)) and set(cpu) | cuda == sources and not set(cpu) & cuda
-
-
-@needs_csrc
-def test_the_extension_has_all_sources_and_headers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpp_extension, "CUDA_HOME", "/cuda")
-    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
-    monkeypatch.chdir(ROOT)
-    extension = build_cuda.extension()
-    assert extension.sources == [p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)]
-    headers = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".h", ".cuh")}
-    assert set(extension.depends) == headers
-    assert "cudart" in extension.libraries and "torch_python" not in extension.libraries
-    # torch adds no architectures of its own where a flag looks as if it named one
-    assert not [flag for flags in extension.extra_compile_args.values() for flag in flags if "arch" in flag]
-
-
 def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a")
     assert build_cuda.architectures() == "8.6;9.0a"
@@ -144,14 +101,6 @@ def test_kernels_compile(tmp_path: Path, kernel: Path, architecture: str) -> Non
     """To machine code, as ptxas alone finds what does not fit the hardware: the variant that has everything. The
     architectures take turns."""
     compile_for([kernel], [architecture], tmp_path, *quick(), "-DDIFFVBD_ONE_VARIANT")
-
-
-@pytest.mark.hours
-@needs_csrc
-@needs_nvcc
-@pytest.mark.parametrize(("kernel", "architecture"), TURNS, ids=STEMS)
-def test_every_variant_compiles(tmp_path: Path, kernel: Path, architecture: str) -> None:
-    compile_for([kernel], [architecture], tmp_path, *quick())
 
 
 @pytest.mark.hours
@@ -327,14 +276,6 @@ def test_jit_failure_says_why_and_can_be_repaired(fake: Fake) -> None:
     assert "step.h(7): error" in message() and not list(fake.cache.rglob("*.so"))
     fake.mode("build")
     assert native.jit_build().read_text() == "object 2"
-
-
-def test_require_cuda_loads_what_it_compiled(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded = []
-    monkeypatch.setattr(torch.ops, "load_library", loaded.append)
-    native.require_cuda()
-    native.require_cuda()
-    assert native.has_cuda() and loaded == [str(native.jit_build())] and len(fake.runs()) == 1
 
 
 def test_jit_says_that_sources_are_missing(fake: Fake) -> None:

@@ -205,16 +205,16 @@ def test_compiled_adjoint_is_that_of_autograd(name: str, device: str, monkeypatc
 
     monkeypatch.setattr(rigid_contact, "_adjoints", both)
     leaves = {"x": x, "v": v, "density": x.new_full((), 1e3)}
-    parameters = {"floor_barrier.kappa": 1e3} if dv.FloorBarrier in map(type, energies) else {}
-    parameters |= {"pair_barrier.kappa": 1e3} if dv.PairBarrier in map(type, energies) else {}
+    parameters = {"floor_kappa": 1e3} if dv.FloorBarrier in map(type, energies) else {}
+    parameters |= {"pair_kappa": 1e3} if dv.PairBarrier in map(type, energies) else {}
     values = {key: x.new_full((), value).requires_grad_() for key, value in parameters.items()}
     for leaf in leaves.values():
         leaf.requires_grad_()
-    end = dv.step(model, leaves["x"], leaves["v"], mu=1e5, lam=1e5, time_step=0.01, sweeps=2, density=leaves["density"],
-                  parameters=values)  # fmt: skip
+    end = dv.step(model, leaves["x"], leaves["v"], dv.VBD(0.01, 2), mu=1e5, lam=1e5, density=leaves["density"],
+                  **values)  # fmt: skip
     sum(((t * noise(name, shape=t.shape, size=1.0).to(t)).sum() for t in end), x.new_zeros(())).backward()
     assert (max(longest) > 1) == (name in ("many", "held"))
-    wanted = {"x", "x_prev", "y", "mass"} | ({"lag"} if "pair_barrier.kappa" in values else {"floor_lag"})
+    wanted = {"x", "x_prev", "y", "mass"} | ({"lag"} if "pair_kappa" in values else {"floor_lag"})
     assert all(seen[field] > 0 for field in wanted), seen
     assert all(
         float(leaf.grad.abs().max()) > 0 for leaf in (*leaves.values(), *values.values()) if leaf.grad is not None
