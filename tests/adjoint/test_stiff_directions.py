@@ -8,7 +8,7 @@ from helpers.marks import quick_and_slow, slow
 from helpers.results import TAPES, evaluated
 
 import diffvbd as dv
-from bench import limits_adjoint as limits
+from bench import limits
 from diffvbd import testing
 from diffvbd.testing import many_digits, tolerance
 
