@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from .. import ops
-from ..checks import check_kind, fail
+from ..checks import check_kind, check_positive, fail
 from ..contact.surface import ContactSurface
 from ..mask import CONTACT, ELASTIC, EXACT_BLOCK, PAPER_BLOCK
 from ..ops import regimes
@@ -54,6 +54,9 @@ class System(Model):
 
     def _check(self) -> None:
         """Raises where a solver does not suit the Model."""
+        for name, unit in (("saturation", "m"), ("regularization", "kg")):
+            if getattr(self, name):  # in the Model's dtype, of which the solver knows nothing
+                check_positive(name, getattr(self, name), unit, self.dtype)
         if self.start == "inertia" and self.contact is not None:
             fail("start", '"auto" or "predictor" with a PairBarrier, whose steps approach y in substeps', '"inertia"')
         if self.coarse is None:
