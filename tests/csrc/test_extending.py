@@ -64,7 +64,7 @@ def class_of(path: Path, name: str) -> str:
 def add_an_energy(root: Path) -> None:
     """The four places of docs/guides/extend.md."""
     energies = root / "csrc" / "energies"
-    header = (energies / "anchor_h").read_text(encoding="utf-8")
+    header = (energies / "anchor.h").read_text(encoding="utf-8")
     (energies / "tether.h").write_text(renamed(header), encoding="utf-8")
     edit(energies / "tether.h", "      const R k = s.h * s.h * data[i];\n",
          "      R k = R(0);\n      k += select(data[i] > R(0), s.h * s.h * data[i], R(0));\n")  # fmt: skip
