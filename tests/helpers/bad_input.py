@@ -19,8 +19,7 @@ def doubles(*values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def model_of(device: str, kind: str = "exact", **options: Any) -> dv.Model:
-    # TODO62: block=kind of the solver
+def model_of(device: str, **options: Any) -> dv.Model:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.5), dv.Anchor(1.0))
     return dv.Model(MESH, pinned=[0], energies=energies, device=device, **options)
 

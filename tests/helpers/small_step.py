@@ -55,10 +55,7 @@ def small_inputs(model: dv.Model, seed: int = 0) -> Arguments:
 
 
 def run_step(model: dv.Model, arguments: Arguments, **options: Any) -> tuple[Tensor, Tensor]:
-    given = {k: t for k, t in arguments.items() if k not in PARAMETERS}
-    parameters = {k: t for k, t in arguments.items() if k in PARAMETERS}
-    # TODO62: the solver of this call
-    return dv.step(model, given.pop("x"), given.pop("v"), **given, **parameters, **{**STEP, **options})
+    return dv.step(model, **{**arguments, **STEP, **options})
 
 
 def scalar(x: Tensor, v: Tensor) -> Tensor:

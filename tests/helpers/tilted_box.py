@@ -10,8 +10,7 @@ import diffvbd as dv
 SOFT: dict[str, Any] = {"young": 1e5, "poisson": 0.3, "gravity": (0.0, 0.0, 0.0)}
 
 
-# TODO62: give the solver of model: subspace=coarse, ?=subspace from a variable
-def tilted_box(coarse: Any = None) -> tuple[dv.Model, Tensor, Tensor]:
+def tilted_box() -> tuple[dv.Model, Tensor, Tensor]:
     box = dv.mesh.box(3, 0.1)
     points = torch.tensor(box.points) - 0.05
     c, s = torch.tensor(0.3).double().cos(), torch.tensor(0.3).double().sin()

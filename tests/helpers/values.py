@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+import diffvbd as dv
+
 STEP = {"solver": dv.VBD(1 / 60, 3)}
 
 
