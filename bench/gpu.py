@@ -36,9 +36,9 @@ from bench.measure import (
 )
 from bench.tables import Table, times
 from bench.tradeoff import gripper
-from diffvbd.ops.regimes import regime
 from diffvbd.tasks import cover_the_spot
 from diffvbd.tasks.problem import Settings
+from diffvbd.testing import regime
 
 GRADIENTS = ("x", "v", "material")
 

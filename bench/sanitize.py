@@ -25,7 +25,7 @@ import diffvbd as dv
 from bench import common
 from bench.tables import Table
 from diffvbd import mesh
-from diffvbd.ops.regimes import regime
+from diffvbd.testing import regime
 
 DEVICE = "cuda"
 SANITIZER = "compute-sanitizer"
