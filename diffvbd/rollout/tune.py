@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from ..model.model import Model
 from ..model.solver import BDF2, SDIRK2, VBD, ImplicitEuler, Integrator
 from ..model.system import system_of
 from ..model.warnings import is_nearly_incompressible
-from ..said import percent, silence
+from ..said import log_progress, percent, silence
 from ..scopes import record_to, refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, check_state, given_of, material_of, prepare
 from ..step.integrators import SAME_TIME_STEP
@@ -174,7 +173,6 @@ def _value(function: Callable[[float], Any], time: float) -> Tensor:
 
 # --- trial runs -------------------------------------------------------------------------------------------------------
 
-LOGGER = logging.getLogger("diffvbd")
 SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
@@ -285,7 +283,7 @@ class TrialRuns:
         self.spent += seconds
         self.runs += 1
         if self.progress:
-            LOGGER.info("trial run %d: %s, %.2g s", self.runs, settings, seconds)
+            log_progress("trial run %d: %s, %.2g s", self.runs, settings, seconds)
         traj, value, gradient = out
         x, v = traj.x.detach(), traj.v.detach()
         if not bool(torch.isfinite(x[-1]).all()):
@@ -927,7 +925,7 @@ def advise(
             each modulus and to a velocity that is added to all vertices. Without a quantity it is the mean squared way.
         device: Where the trials run; None: the Model's.
         time_budget: How long trials may run [s]; the search ends with the one that exceeds it.
-        progress: Log each trial run (logger "diffvbd", level INFO).
+        progress: Print each trial run, by the logger "diffvbd".
         inputs: As in rollout, constant or a function of the time [s]: loads at the middle of each step, all else at its
             end, and what is marked by :func:`diffvbd.step_average` over all of it. What swings within steps has these
             made shorter; a single push that is shorter than they are may go unseen unless it is averaged.
