@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.autograd import Function, forward_ad
 
-from ..scopes import transformed
 from .load import raw
 
 Bars = Sequence[Tensor | None]  # adjoints; None where there is none
@@ -33,6 +32,7 @@ def no_second_derivative(*_: Any) -> NoReturn:
     )
 
 
+_peek = torch._C._functorch.peek_interpreter_stack  # pyright: ignore[reportAttributeAccessIssue]
 CONTACT = "torch.func transforms and batched gradients (is_grads_batched) of a step with contact are not supported"
 
 
@@ -169,16 +169,15 @@ class Differentiable:
         self.function = _Forward
 
     def __call__(self, *args: Any) -> Any:
-        if torch.compiler.is_compiling() or transformed():
+        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
             return self.function.apply(*args)
         if torch.is_grad_enabled():
             for t in args[: self.count]:
                 if t is not None and t.requires_grad:
                     # what apply() does where no transforms are active, but for looking at each argument
                     return super(Function, self.function).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
-        if forward_ad._current_level >= 0:
-            return self.function.apply(*args)  # which raises where there are tangents
-        return self.run(*args)
+        with torch._C._AutoDispatchBelowAutograd():  # half of what a call of an operator costs beside its work
+            return self.run(*args)
 
 
 def _like(bar: Tensor | None, t: Tensor) -> Tensor:
@@ -243,8 +242,10 @@ def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def distinct(*tensors: Tensor | None) -> list[Tensor | None]:
-    """Contiguous, and none of them twice, which torch.compile refuses."""
+    """Contiguous, and for torch.compile, which refuses that, none of them twice."""
     out: list[Tensor | None] = []
+    if not torch.compiler.is_compiling():
+        return [t if t is None else t.contiguous() for t in tensors]
     for t in tensors:
         t = t if t is None else t.contiguous()
         out.append(t.view_as(t) if t is not None and any(t is other for other in out) else t)
