@@ -1,9 +1,9 @@
 #include <algorithm>
 
-#include "advance.h"
-#include "clear.h"
+#include "arrays.h"
 #include "cluster.cuh"
-#include "small_scenes.h"
+#include "common.cuh"
+#include "contact.h"
 
 namespace diffvbd::cuda {
 namespace {
@@ -34,8 +34,7 @@ struct GridTeam {
   unsigned* flags;
   template <class F>
   __device__ void each(const Range& items, const F& f) const {
-    for (int64_t i = items.begin + static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < items.end;
-         i += static_cast<int64_t>(gridDim.x) * kThreads) {
+    for (int64_t i = items.begin + own_item(kThreads); i < items.end; i += static_cast<int64_t>(gridDim.x) * kThreads) {
       f(i);
     }
   }
@@ -220,7 +219,7 @@ __global__ void __launch_bounds__(kThreads, 2)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     narrow_kernel(const __grid_constant__ NarrowInputs<T> in, int64_t pairs, T* constants) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t i = own_item(kThreads);
   if (i < pairs) narrow_pair(in, i, constants + kConstants * i);
 }
 
@@ -283,17 +282,13 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
 template <class T>
 cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
   if (pairs == 0) return cudaSuccess;
-  const auto blocks = static_cast<unsigned>((pairs + kThreads - 1) / kThreads);
+  const auto blocks = blocks_for(pairs, kThreads);
   narrow_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                       \
-  template cudaError_t narrow<T>(const NarrowInputs<T>&, int64_t, T*, cudaStream_t); \
-  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&, int64_t);     \
-  template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(narrow)
+DIFFVBD_INSTANTIATE(advance_workspace_bytes)
+DIFFVBD_INSTANTIATE(advance)
 
 }  // namespace diffvbd::cuda

@@ -7,7 +7,8 @@
 
 #include "../rigid/body.h"
 #include "bodies.h"
-#include "exchange.cuh"
+#include "common.cuh"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 
@@ -316,7 +317,7 @@ __global__ void __launch_bounds__(kThreads)
 constexpr int kVertexThreads = 128;
 template <class T>
 unsigned blocks_of(const rigid::Inputs<T>& in) {
-  return static_cast<unsigned>((in.scenes * in.vertices + kVertexThreads - 1) / kVertexThreads);
+  return blocks_for(in.scenes * in.vertices, kVertexThreads);
 }
 struct Row {
   int64_t scene;
@@ -324,7 +325,7 @@ struct Row {
   bool exists;
   template <class T>
   __device__ explicit Row(const rigid::Inputs<T>& in) {
-    const int64_t row = static_cast<int64_t>(blockIdx.x) * kVertexThreads + threadIdx.x;
+    const int64_t row = own_item(kVertexThreads);
     exists = row < in.scenes * in.vertices;
     scene = row / in.vertices;
     vertex = static_cast<int32_t>(row % in.vertices);

@@ -1,5 +1,5 @@
-// The blocks of a cluster share a small scene: they meet in less time than a launch takes, and see each other's shared
-// memory. Before compute capability 9 a cluster is one block.
+// Small scenes, each for one block or for the blocks of a cluster. These synchronize in less time than a launch takes,
+// and see each other's shared memory. Before compute capability 9 a cluster is one block.
 #pragma once
 
 #include <cooperative_groups.h>
@@ -7,6 +7,14 @@
 #include <cstdint>
 
 namespace diffvbd::cuda {
+
+constexpr int64_t kSmallScene = 4096;  // vertices of a scene
+constexpr int64_t kFewPairs = 131072;  // pairs that each scene has room for, most of it unused, unless there are
+constexpr int64_t kManyScenes = 64;    // scenes enough to fill the device
+
+inline bool has_block_each(int64_t vertices, int64_t scenes, int64_t pairs) {
+  return vertices <= kSmallScene && (pairs <= kFewPairs * scenes || kManyScenes <= scenes);
+}
 
 constexpr int kMostBlocks = 8;           // of a cluster, on every device that has them
 constexpr int64_t kPairsOfBlock = 1024;  // worth a block of their own

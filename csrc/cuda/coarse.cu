@@ -2,6 +2,7 @@
 #include "../coarse/line.h"
 #include "bodies.cuh"
 #include "coarse.h"
+#include "common.cuh"
 #include "group.cuh"
 
 namespace diffvbd::cuda {
@@ -73,7 +74,7 @@ template <class T, int threads, bool reverse>
 __global__ void __launch_bounds__(kRowThreads) solve_rows(const __grid_constant__ View<T> a, int k) {
   const coarse::Plan& p = a.c.plan;
   const int64_t unknowns = int64_t{3} * p.functions;
-  const int64_t item = (static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x) / threads;
+  const int64_t item = own_item(kRowThreads) / threads;
   const bool exists = item < a.s.scenes * unknowns;
   const int64_t scene = exists ? item / unknowns : 0, row = exists ? item - scene * unknowns : 0;
   const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
@@ -105,7 +106,7 @@ __device__ __forceinline__ Vec3<T> prolonged(const coarse::Inputs<T>& c, int64_t
 // The way of a correction, or that of its transpose.
 template <class T, bool reverse>
 __global__ void __launch_bounds__(kRowThreads) prolong(const __grid_constant__ View<T> a, int k) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions;
   const Vec3<T> way = prolonged(a.c, i - scene * a.s.positions, reverse ? a.solved(scene, k) : a.tape(scene, k));
@@ -117,7 +118,7 @@ template <class T>
 __global__ void __launch_bounds__(kRowThreads)
     press_rows(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in) {
   const coarse::Plan& p = a.c.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t item = own_item(kRowThreads);
   if (item >= a.s.scenes * p.listed) return;
   const int64_t scene = item / p.listed;
   const int i = static_cast<int>(item - scene * p.listed), position = __ldg(p.list_position + i);
@@ -196,7 +197,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kRowThreads)
     move_bodies(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i == 0) *barrier = 0;
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
@@ -218,7 +219,7 @@ template <class T>
 __global__ void __launch_bounds__(kRowThreads)
     sum_adjoints(const __grid_constant__ StepView<T> s, T* __restrict__ total) {
   const int64_t active = int64_t{__ldg(s.plan.color_block + s.plan.colors)} * kSlice;
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i >= s.scenes * active) return;
   const int64_t scene = i / active, position = i - scene * active, row = scene * s.positions + position;
   Place<1> at(scene, static_cast<int>(position / kSlice), 0);
@@ -234,7 +235,7 @@ __global__ void __launch_bounds__(kRowThreads)
 // Back to where the correction began.
 template <class T>
 __global__ void __launch_bounds__(kRowThreads) move_back(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i == 0) *barrier = 0;
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
@@ -257,7 +258,7 @@ template <class T>
 __global__ void __launch_bounds__(kRowThreads) sum_products(const __grid_constant__ View<T> a) {
   const coarse::Plan& p = a.c.plan;
   const int64_t unknowns = int64_t{3} * p.functions;
-  const int64_t item = (static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x) / 32;
+  const int64_t item = own_item(kRowThreads) / 32;
   if (item >= a.s.scenes * unknowns) return;
   const int64_t scene = item / unknowns, row = item - scene * unknowns;
   const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);

@@ -203,6 +203,3 @@ GradientKernel<T> gradient_kernel_of(int energies, int lanes) {
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_GRADIENT(T, wanted) \
-  template diffvbd::cuda::GradientKernel<T> diffvbd::cuda::gradient_kernel_of<T, (wanted)>(int, int);

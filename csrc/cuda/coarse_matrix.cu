@@ -2,6 +2,7 @@
 #include "../coarse/line.h"
 #include "bodies.cuh"
 #include "coarse.h"
+#include "common.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -76,7 +77,7 @@ __global__ void __launch_bounds__(kPairThreads)
     assemble_pairs(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ turns,
                    double* __restrict__ matrix) {
   const Plan& p = in.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= in.scenes * p.cells) return;
   const int64_t scene = item / p.cells, cell = item - scene * p.cells;
   const Cell at(p, static_cast<int>(cell));
@@ -289,7 +290,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
     vertices_vjp(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ turns, T* __restrict__ x_bar) {
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= in.scenes * in.vertices) return;
   const int64_t scene = item / in.vertices, v = item - scene * in.vertices;
   Vector sum{0, 0, 0};
@@ -308,8 +309,7 @@ __global__ void __launch_bounds__(kPairThreads)
     stiffness_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar,
                   const double* __restrict__ turns, T* __restrict__ stiffness_bar) {
   const Plan& p = in.plan;
-  const int64_t plane = int64_t{p.width} * p.width,
-                item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t plane = int64_t{p.width} * p.width, item = own_item(kPairThreads);
   const bool shared = in.stiffness.scene == 0;
   if (item >= (shared ? 1 : in.scenes) * p.groups * plane) return;
   const int64_t first_scene = item / (p.groups * plane);
@@ -334,7 +334,7 @@ template <class T>
 __global__ void __launch_bounds__(kPairThreads)
     mass_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar, T* __restrict__ mass_bar) {
   const Plan& p = in.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= in.scenes * p.cells) return;
   const int64_t scene = item / p.cells;
   const Cell at(p, static_cast<int>(item - scene * p.cells));
@@ -342,8 +342,6 @@ __global__ void __launch_bounds__(kPairThreads)
   const T* own = bar + 9 * (scene * p.cells + __ldg(p.mass_ptr + at.body)) + 3 * at.i * n + 3 * at.j;
   mass_bar[item] = own[0] + own[n + 1] + own[2 * n + 2];
 }
-
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kPairThreads - 1) / kPairThreads); }
 
 // Pivots of the bodies [first, first + count), whose matrices have at most so many tiles.
 template <class T>
@@ -368,7 +366,7 @@ void invert_all(const MatrixInputs<T>& in, const MatrixWork& work, T* inverse, c
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
     store_matrices(const double* __restrict__ matrix, int64_t count, T* __restrict__ out) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t i = own_item(kPairThreads);
   if (i < count) out[i] = T(matrix[i]);
 }
 
@@ -378,7 +376,7 @@ __global__ void __launch_bounds__(kPairThreads)
     add_presses(const __grid_constant__ coarse::Inputs<T> c, int64_t base, int64_t scenes, int64_t positions,
                 const double* __restrict__ press, double* __restrict__ matrix) {
   const Plan& p = c.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= scenes * p.cells) return;
   const int64_t scene = item / p.cells;
   const Cell at(p, static_cast<int>(item - scene * p.cells));
@@ -412,12 +410,13 @@ cudaError_t coarse_inverse(const MatrixInputs<T>& in, const MatrixWork& work, T*
   if (p.groups > 0) {
     turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, work.turn);
   }
-  assemble_pairs<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, work.turn, work.matrix);
+  assemble_pairs<<<blocks_for(in.scenes * p.cells, kPairThreads), kPairThreads, 0, stream>>>(in, work.turn,
+                                                                                             work.matrix);
   if (inverts) {
     invert_all(in, work, inverse, stream);
   } else if (p.cells > 0) {
     const int64_t count = in.scenes * 9 * p.cells;
-    store_matrices<<<blocks_for(count), kPairThreads, 0, stream>>>(work.matrix, count, inverse);
+    store_matrices<<<blocks_for(count, kPairThreads), kPairThreads, 0, stream>>>(work.matrix, count, inverse);
   }
   return cudaGetLastError();
 }
@@ -426,8 +425,8 @@ template <class T>
 cudaError_t pressed_inverse(const coarse::Inputs<T>& c, int64_t base, int64_t scenes, int64_t positions,
                             const double* press, const MatrixWork& work, T* inverse, cudaStream_t stream) {
   if (scenes * c.plan.cells == 0) return cudaSuccess;
-  add_presses<<<blocks_for(scenes * c.plan.cells), kPairThreads, 0, stream>>>(c, base, scenes, positions, press,
-                                                                              work.matrix);
+  add_presses<<<blocks_for(scenes * c.plan.cells, kPairThreads), kPairThreads, 0, stream>>>(c, base, scenes, positions,
+                                                                                            press, work.matrix);
   MatrixInputs<T> in{};
   in.plan = c.plan, in.scenes = scenes;
   invert_all(in, work, inverse, stream);
@@ -443,21 +442,17 @@ cudaError_t coarse_inverse_vjp(const MatrixInputs<T>& in, const T* bar, double* 
   if (p.groups > 0 && p.width > 0) {
     turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, turn);
     const int64_t pairs = (in.stiffness.scene == 0 ? 1 : in.scenes) * p.groups * plane;
-    stiffness_vjp<<<blocks_for(pairs), kPairThreads, 0, stream>>>(in, bar, turn, stiffness_bar);
+    stiffness_vjp<<<blocks_for(pairs, kPairThreads), kPairThreads, 0, stream>>>(in, bar, turn, stiffness_bar);
     turn_groups_vjp<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, bar, turn);
   }
-  vertices_vjp<<<blocks_for(in.scenes * in.vertices), kPairThreads, 0, stream>>>(in, turn, x_bar);
-  if (p.cells > 0) mass_vjp<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, bar, mass_bar);
+  vertices_vjp<<<blocks_for(in.scenes * in.vertices, kPairThreads), kPairThreads, 0, stream>>>(in, turn, x_bar);
+  if (p.cells > 0)
+    mass_vjp<<<blocks_for(in.scenes * p.cells, kPairThreads), kPairThreads, 0, stream>>>(in, bar, mass_bar);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                \
-  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, bool, cudaStream_t);  \
-  template cudaError_t pressed_inverse<T>(const coarse::Inputs<T>&, int64_t, int64_t, int64_t, const double*, \
-                                          const MatrixWork&, T*, cudaStream_t);                               \
-  template cudaError_t coarse_inverse_vjp<T>(const MatrixInputs<T>&, const T*, double*, T*, T*, T*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(coarse_inverse)
+DIFFVBD_INSTANTIATE(pressed_inverse)
+DIFFVBD_INSTANTIATE(coarse_inverse_vjp)
 
 }  // namespace diffvbd::cuda

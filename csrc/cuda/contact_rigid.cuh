@@ -11,8 +11,6 @@ using rigid::Body;
 
 constexpr int kOne = 128;  // threads of a block where each has an item of its own
 
-inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kOne - 1) / kOne); }
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
 __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
 
 // Bytes of a part of a workspace, rounded up to what any type needs.

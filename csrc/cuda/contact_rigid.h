@@ -48,7 +48,7 @@ struct RigidReverse {
   contact::CorrectionAdjoints<T> out;
 };
 template <class T>
-cudaError_t rigid_reverse(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
+cudaError_t rigid_contact_backward(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
 // Its parts before and after rigid_backward(), kernel by kernel.
 template <class T>
 cudaError_t rigid_end_backward(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);

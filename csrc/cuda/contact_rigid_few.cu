@@ -2,9 +2,9 @@
 // group.
 #include "../contact/rigid_slip.h"
 #include "cholesky.cuh"
-#include "contact_rigid_presses.cuh"
+#include "cluster.cuh"
+#include "common.cuh"
 #include "contact_rigid_rows.cuh"
-#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
@@ -368,11 +368,6 @@ cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const Grou
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                 \
-  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, bool, double*, \
-                                    double*, double*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(solve_few)
 
 }  // namespace diffvbd::cuda

@@ -209,5 +209,3 @@ SweepKernel forward_kernel(int energies, int lanes) {
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_FORWARD(T) template diffvbd::cuda::SweepKernel diffvbd::cuda::forward_kernel<T>(int, int);

@@ -1,6 +1,7 @@
 // What surrounds the sweeps: from the user's arrays to sweep order and back, once a step, one thread per vertex or tet.
 #pragma once
 
+#include "common.cuh"
 #include "group.cuh"
 
 namespace diffvbd::cuda {
@@ -35,7 +36,7 @@ __device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scen
 template <class T>
 __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                               int64_t base, const T* ends, const T* x_bar, const T* v_bar, unsigned* barrier) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i == 0) *barrier = 0;  // of the cooperative grid that comes next
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
@@ -75,7 +76,7 @@ __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __
 template <class T>
 __global__ void store_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                                int64_t base, T* x, T* velocity) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local;
   const int64_t vertex = __ldg(s.plan.order + (i - local * s.positions));
@@ -92,7 +93,7 @@ template <class T>
 __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                               int64_t base, int64_t scenes) {
   const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice;
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= scenes * pairs) return;
   const int64_t local = i / pairs, scene = base + local;
   const int pair = max(0, __ldg(s.plan.pair + (i - local * pairs)));
@@ -120,7 +121,7 @@ __device__ __forceinline__ Vec3<T> rows_left(const StepView<T>& s, int64_t scene
 template <class T>
 __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                                int64_t base, const __grid_constant__ StepAdjoints<T> out) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
   const int64_t vertex = __ldg(s.plan.order + position);
@@ -161,7 +162,7 @@ __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const _
 template <class T>
 __global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
                            const __grid_constant__ StepAdjoints<T> out, bool material) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= s.scenes * s.plan.num_tets) return;
   const int64_t local = i / s.plan.num_tets, scene = base + local, tet = i - local * s.plan.num_tets;
   const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice, to = scene * s.plan.num_tets + tet;
@@ -193,10 +194,7 @@ __global__ void sum_rows(const T* values, int64_t stride, int64_t step, int64_t 
   T sum = T(0);
   for (int64_t i = threadIdx.x; i < count; i += kFrameThreads) sum += row[i * step];
   part[threadIdx.x] = sum;
-  for (int half = kFrameThreads / 2; half > 0; half /= 2) {
-    __syncthreads();
-    if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
-  }
+  reduce_block<kFrameThreads>(part, [](T& own, const T& other) { own += other; });
   if (threadIdx.x == 0) out[blockIdx.x * out_stride] = part[0];
 }
 

@@ -1,5 +1,6 @@
 #include <algorithm>
 
+#include "common.cuh"
 #include "islands.cuh"
 
 namespace diffvbd::cuda {
@@ -8,10 +9,7 @@ namespace {
 constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
 constexpr int32_t kCompared = 32;              // bodies that one thread compares with one
 
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
 int threads_for(int64_t items, int64_t segments) { return items > kLongSegment * segments ? kThreads : kWarp; }
-
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
 
 template <class T>
 __global__ void start_kernel(const IslandInputs<T> in, IslandWork<T> work) {
@@ -141,36 +139,33 @@ cudaError_t find_islands(const IslandInputs<T>& in, int32_t* island, void* memor
   if (n == 0) return cudaSuccess;
   const auto blocks = static_cast<unsigned>(n);
   if (!again) {
-    start_kernel<<<blocks_for(std::max(points, in.scenes)), kThreads, 0, stream>>>(in, work);
-    if (points > 0) colliders_kernel<<<blocks_for(points), kThreads, 0, stream>>>(in, work);
-    if (in.num_planes > 0) planes_kernel<<<blocks_for(in.scenes * in.num_planes), kThreads, 0, stream>>>(in, work);
+    start_kernel<<<blocks_for(std::max(points, in.scenes), kThreads), kThreads, 0, stream>>>(in, work);
+    if (points > 0) colliders_kernel<<<blocks_for(points, kThreads), kThreads, 0, stream>>>(in, work);
+    if (in.num_planes > 0)
+      planes_kernel<<<blocks_for(in.scenes * in.num_planes, kThreads), kThreads, 0, stream>>>(in, work);
     bodies_sync_kernel<<<blocks, threads_for(in.vertices, in.mesh_bodies), 0, stream>>>(in, work);
   }
   if (in.mesh_bodies <= kFewBodies) {
     scene_sync_kernel<<<static_cast<unsigned>(in.scenes), kThreads, 0, stream>>>(in, work, island);
     return cudaGetLastError();
   }
-  apart_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+  apart_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
   const int64_t comparisons = n * ((in.mesh_bodies + kCompared - 1) / kCompared);
   // One round more than the joins: it finds out whether they have settled, and if not makes one island of the scene.
   for (int round = 0; round <= kJoins; ++round) {
     islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
-    sweep_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
-    join_kernel<<<blocks_for(comparisons), kThreads, 0, stream>>>(in, work, round < kJoins);
-    label_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+    sweep_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
+    join_kernel<<<blocks_for(comparisons, kThreads), kThreads, 0, stream>>>(in, work, round < kJoins);
+    label_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
   }
   islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
-  sweep_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+  sweep_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
   islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
-  finish_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work, island);
+  finish_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work, island);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                        \
-  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&); \
-  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t, bool);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(islands_workspace_bytes)
+DIFFVBD_INSTANTIATE(find_islands)
 
 }  // namespace diffvbd::cuda

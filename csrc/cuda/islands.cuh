@@ -1,13 +1,10 @@
 // Islands of the bodies of a scene: what its kernels share, and all of it by one block.
 #pragma once
 
-#include <type_traits>
-
-#include "block_sum.cuh"
+#include "atomics.cuh"
 #include "bodies.cuh"
-#include "islands.h"
-#include "ordered.cuh"
-#include "union.cuh"
+#include "contact.h"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -15,7 +12,6 @@ namespace {
 using namespace contact;
 
 constexpr int32_t kFewBodies = 512;  // of a scene, up to which a block finds all its islands
-constexpr size_t kAlignment = 256;
 
 // Views of the workspace; without memory, its size.
 template <class T>
@@ -30,15 +26,12 @@ struct IslandWork {
   size_t bytes = 0;
 
   IslandWork(const IslandInputs<T>& in, void* memory) {
-    auto* at = static_cast<unsigned char*>(memory);
-    const auto take = [&](auto*& pointer, int64_t items) {
-      pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at + bytes);
-      bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
-    };
+    Parts<> take(memory);
     const int64_t n = in.scenes * in.mesh_bodies;
     take(bodies, n), take(islands, n), take(boxes, n), take(label, n), take(stays, n);
     take(unsettled, in.scenes);
     take(colliders, in.scenes * in.colliders()), take(objects, in.scenes);
+    bytes = take.bytes;
   }
 };
 

@@ -1,6 +1,7 @@
+#include "cluster.cuh"
+#include "common.cuh"
+#include "contact.h"
 #include "islands.cuh"
-#include "motion.h"
-#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
@@ -83,7 +84,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     among_others(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
-  const int64_t place = int64_t{blockIdx.x} * kThreads + threadIdx.x, bodies = in.motion.bodies;
+  const int64_t place = own_item(kThreads), bodies = in.motion.bodies;
   if (place >= in.motion.scenes * bodies) return;
   room_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
 }
@@ -172,7 +173,7 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   if (bodies > 0) {
     if (const auto error = for_bodies(in.motion, Wish<T>{in, work}, stream)) return error;
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
-    among_others<T><<<static_cast<unsigned>((bodies + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, work);
+    among_others<T><<<blocks_for(bodies, kThreads), kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     for (int round = 0; round < kRoomRounds; ++round) {
       if (const auto error = for_bodies(in.motion, BesideIsland<T>{in, work}, stream)) return error;
@@ -183,14 +184,10 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                   \
-  template cudaError_t find_motion<T>(const MotionInputs<T>&, T*, T*, T*, cudaStream_t);                         \
-  template cudaError_t reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&, cudaStream_t);        \
-  template cudaError_t coast<T>(const MotionInputs<T>&, double, T*, cudaStream_t);                               \
-  template cudaError_t reverse_coast<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&, cudaStream_t); \
-  template cudaError_t find_rooms<T>(RoomInputs<T>, const RoomWork<T>&, void*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(find_motion)
+DIFFVBD_INSTANTIATE(reverse_motion)
+DIFFVBD_INSTANTIATE(coast)
+DIFFVBD_INSTANTIATE(reverse_coast)
+DIFFVBD_INSTANTIATE(find_rooms)
 
 }  // namespace diffvbd::cuda

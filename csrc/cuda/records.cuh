@@ -2,7 +2,7 @@
 // waits for each would wait most of the time.
 #pragma once
 
-#include "place.cuh"
+#include "lane_layout.cuh"
 
 namespace diffvbd::cuda {
 

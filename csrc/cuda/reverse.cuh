@@ -227,7 +227,3 @@ SweepKernel reverse_kernel(int energies) {
 }
 
 }  // namespace diffvbd::cuda
-
-// Few threads a vertex and many are compiled apart: these are the files that take longest.
-#define DIFFVBD_INSTANTIATE_REVERSE(T, wanted, lanes) \
-  template diffvbd::cuda::SweepKernel diffvbd::cuda::reverse_kernel<T, (wanted), diffvbd::cuda::lanes>(int);

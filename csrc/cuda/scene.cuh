@@ -6,7 +6,7 @@
 #include <utility>
 
 #include "group.cuh"
-#include "scene_kernels.h"
+#include "step.h"
 
 namespace diffvbd::cuda {
 namespace {

@@ -109,7 +109,3 @@ cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, con
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_SCENE_FORWARD(T)                \
-  template cudaError_t diffvbd::cuda::run_scene_forward<T>( \
-      const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&, const Choice&, uint8_t*, cudaStream_t);

@@ -246,8 +246,3 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_SCENE_REVERSE(T)                                                                          \
-  template cudaError_t diffvbd::cuda::run_scene_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*, \
-                                                           const StepAdjoints<T>&, const Choice&, uint8_t*,           \
-                                                           cudaStream_t);

@@ -1,5 +1,4 @@
-// What passes between ops_cuda.cpp and the kernels: plain structs, launchers. No torch here, and no CUDA either but the
-// stream.
+// Interface between the bindings and the kernels of a step: plain structs and launchers, without torch.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -131,6 +130,33 @@ struct ContactView {
   uint8_t* cut;                       // in the forward
 };
 
+// Of the blocks [begin, end) of a color, whose kernel may wait for the one before by itself (`follows`, follow.cuh).
+// Each returns after its launches. Where warps share a vertex, all but reverse() are part of the sweep's kernel; where
+// that has all sweeps, reverse() too.
+template <class T>
+struct ContactPasses {
+  const StepView<T>& s;
+  const ContactView<T>& c;
+  cudaStream_t stream;
+
+  // Before their turn: the pairs' part of the blocks; sweep: in the reverse, else negative.
+  cudaError_t assemble(int sweep, int64_t begin, int64_t end, bool follows) const;
+  // After it: takes back what planes do not let pass of the motion.
+  cudaError_t limit(int sweep, int64_t begin, int64_t end, bool follows) const;
+  // In the reverse, before their turn: what pairs have sent.
+  cudaError_t prepare(int64_t begin, int64_t end, bool follows) const;
+  // And after it: the adjoint of assemble(). few: a warp for each kind of pair of a vertex.
+  cudaError_t reverse(bool few, int64_t begin, int64_t end, bool follows) const;
+  // After the last turn, before the adjoints are stored: what is left for vertices and colliders.
+  cudaError_t collect(const StepAdjoints<T>& out) const;
+  // After the adjoints are stored: those of the start of the step, of kappa.
+  cudaError_t store(const StepAdjoints<T>& out) const;
+
+ private:
+  template <class... P, class... A>
+  cudaError_t over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool follows, A... arguments) const;
+};
+
 // A kernel that takes a StepView and a Range, and a ContactView where the set has contact.
 using SweepKernel = const void*;
 
@@ -210,5 +236,13 @@ cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const Ste
 template <class T>
 cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
                         const StepAdjoints<T>& out, const Choice& choice, void* workspace, cudaStream_t stream);
+
+// rare [scenes]: for the kernels
+template <class T>
+cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
+                              const Choice& choice, uint8_t* rare, cudaStream_t stream);
+template <class T>
+cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
+                              const StepAdjoints<T>& out, const Choice& choice, uint8_t* rare, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -5,16 +5,13 @@
 #include <cub/device/device_radix_sort.cuh>
 
 #include "../contact/candidates.h"
-#include "exchange.cuh"
-#include "ordered.cuh"
+#include "atomics.cuh"
+#include "common.cuh"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 
 constexpr int kThreads = 256;
-
-inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
-
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
 
 // Bits of numbers up to `most`; at least one.
 inline int bits_of(uint64_t most) {
@@ -36,7 +33,7 @@ struct Forest {
 
   // Sizes, and memory by take(pointer, items).
   template <class T, class Take>
-  void lay_out(const contact::Surfaces<T>& in, const Take& take) {
+  void lay_out(const contact::Surfaces<T>& in, Take& take) {
     scenes = in.scenes;
     count[0] = in.num_triangles, count[1] = in.num_edges, count[2] = in.num_points;
     const int room = (64 - bits_of(static_cast<uint64_t>(3 * in.scenes))) / 3;
@@ -165,21 +162,21 @@ template <class T>
 cudaError_t build_forest(const contact::Surfaces<T>& in, const Forest& forest, void* sort, size_t sort_bytes,
                          cudaStream_t stream) {
   if (forest.sorted && in.scenes * in.num_points > 0) {
-    bounds_kernel<<<blocks_for(in.scenes * in.num_points), kThreads, 0, stream>>>(in, forest);
+    bounds_kernel<<<blocks_for(in.scenes * in.num_points, kThreads), kThreads, 0, stream>>>(in, forest);
   }
   const int64_t n = forest.size();
   if (forest.sorted && n > 0) {
-    codes_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, forest);
+    codes_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, forest);
     if (auto error = cub::DeviceRadixSort::SortPairs(sort, sort_bytes, forest.keys, forest.sorted_keys, forest.items,
                                                      forest.sorted_items, n, 0, forest.key_bits(), stream))
       return error;
   }
   for (int kind = 0; kind < 2 && in.scenes > 0; ++kind) {
-    leaves_kernel<<<blocks_for(in.scenes * forest.leaves[kind]), kThreads, 0, stream>>>(in, forest, kind);
+    leaves_kernel<<<blocks_for(in.scenes * forest.leaves[kind], kThreads), kThreads, 0, stream>>>(in, forest, kind);
     for (int32_t width = forest.leaves[kind]; forest.sorted && width > 1;) {
       int steps = 0;
       while (steps < 9 && width >> steps > 1) ++steps;
-      fold_kernel<<<blocks_for(in.scenes * width / 2), kThreads, 0, stream>>>(forest, kind, width, steps);
+      fold_kernel<<<blocks_for(in.scenes * width / 2, kThreads), kThreads, 0, stream>>>(forest, kind, width, steps);
       width >>= steps;
     }
   }

@@ -4,6 +4,7 @@ import ast
 import functools
 import os
 import re
+import runpy
 import shutil
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from diffvbd.ops import build_cuda
 from diffvbd.ops import load as native
 
 KERNELS = sorted(CSRC.glob("cuda/*.cu"))
+INSTANCES = build_cuda.cuda_instances()
 BINDINGS = sorted(CSRC.glob("bind/cuda/*.cpp"))
 ARCHITECTURES = ("80", "90", "100", "120")
 LIMIT = 120  # [s] for what takes one on an idle machine: a hang, not slowness
@@ -62,7 +64,10 @@ def failures(jobs: list[tuple[Path, list[str]]], folder: Path) -> dict[str, str]
 
 
 def compile_for(kernels: list[Path], architectures: list[str], folder: Path, *flags: str) -> None:
-    """As the package is built, and with `flags`."""
+    """As the package is built, and with `flags`. Instances are written into the folder."""
+    for name, text in INSTANCES.items():
+        (folder / name).write_text(text.replace("../../csrc", str(CSRC)), encoding="utf-8")
+    kernels = [folder / k if k.name in INSTANCES else k for k in kernels]
     known = subprocess.run([str(nvcc()), "--list-gpu-code"], capture_output=True, text=True).stdout.split()
     missing = {f"sm_{a}" for a in architectures} - set(known)
     if missing:
@@ -90,12 +95,15 @@ def test_kernels_include_no_torch() -> None:
 def test_every_source_is_in_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in ("DIFFVBD_NO_CLONES", "DIFFVBD_QUICK"):
         monkeypatch.delenv(variable, raising=False)
-    # of setup.py only the assignments up to the list are executed
-    names: dict[str, Any] = {"os": os}
+    monkeypatch.chdir(ROOT)
+    # of setup.py only what comes before the list is executed
+    names: dict[str, Any] = {"os": os, "runpy": runpy}
     for node in ast.parse((ROOT / "setup.py").read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and "CPU_SOURCES" not in names:
+        if isinstance(node, ast.Assign | ast.FunctionDef) and "CPU_SOURCES" not in names:
             exec(ast.unparse(node), names)
-    cpu = names["CPU_SOURCES"]
+    written = {f"{build_cuda.INSTANCES}/{name}" for name in names["SWEEPS"]}
+    assert len(written) == 6 and written < set(names["CPU_SOURCES"])
+    cpu = [source for source in names["CPU_SOURCES"] if source not in written]
     sources = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".cpp", ".cu")}
     cuda = {p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)}
     assert len(cpu) == len(set(cpu)) and set(cpu) | cuda == sources and not set(cpu) & cuda
@@ -107,7 +115,9 @@ def test_the_extension_has_all_sources_and_headers(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
     monkeypatch.chdir(ROOT)
     extension = build_cuda.extension()
-    assert extension.sources == [p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)]
+    bindings, kernels = ([p.relative_to(ROOT).as_posix() for p in paths] for paths in (BINDINGS, KERNELS))
+    instances = [f"{build_cuda.INSTANCES}/{name}" for name in INSTANCES]
+    assert extension.sources == [*bindings, *instances, *kernels]
     headers = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".h", ".cuh")}
     assert set(extension.depends) == headers
     assert "cudart" in extension.libraries and "torch_python" not in extension.libraries
@@ -132,8 +142,9 @@ def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
     assert build_cuda.architectures() == "8.0 9.0+PTX"
 
 
-TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(KERNELS)]
-STEMS = [k.stem for k in KERNELS]
+UNITS = [*KERNELS, *map(Path, INSTANCES)]
+TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(UNITS)]
+STEMS = [k.stem for k in UNITS]
 QUICK = ("scene_reverse_float", "contact_float")  # the sweep, all energies with their adjoints, pairs
 
 
@@ -158,7 +169,7 @@ def test_every_variant_compiles(tmp_path: Path, kernel: Path, architecture: str)
 @needs_csrc
 @needs_nvcc
 def test_every_variant_compiles_as_it_is_built(tmp_path: Path) -> None:
-    compile_for([k for k in KERNELS for _ in ARCHITECTURES], [*ARCHITECTURES] * len(KERNELS), tmp_path)
+    compile_for([k for k in UNITS for _ in ARCHITECTURES], [*ARCHITECTURES] * len(UNITS), tmp_path)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cuda/begin.h"
+#include "../../cuda/bodies.h"
 #include "bodies.h"
 
 namespace {
@@ -46,8 +46,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::
     start::Candidates<T> two{}, parting{};
     if (chooses) two = diffvbd::candidates<T>(f, settings, false, x_start, from_y, y);
     if (may_part) parting = diffvbd::candidates<T>(f, settings, true, x_start, apart, y);
-    const cuda::Choice<T> of_others{chooses ? &two : nullptr, data<T>(from_y), data<uint8_t>(falls)};
-    const cuda::Choice<T> of_corrected{may_part ? &parting : nullptr, data<T>(apart), data<uint8_t>(alone)};
+    const cuda::StartChoice<T> of_others{chooses ? &two : nullptr, data<T>(from_y), data<uint8_t>(falls)};
+    const cuda::StartChoice<T> of_corrected{may_part ? &parting : nullptr, data<T>(apart), data<uint8_t>(alone)};
     check(cuda::begin<T>(in, teams, of_corrected, other_teams, of_others, data<T>(x_start), data<T>(y),
                          data<double>(shared), current_stream(x)),
           "the beginning of a step");

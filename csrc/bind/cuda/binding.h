@@ -9,7 +9,7 @@
 #include <string>
 #include <vector>
 
-#include "../../cuda/clear.h"
+#include "../../cuda/arrays.h"
 #include "../arguments.h"
 
 namespace diffvbd::cuda {

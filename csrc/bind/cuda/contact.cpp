@@ -1,13 +1,12 @@
 // CUDA implementations of detection, islands and sums over segments: tensors in, raw pointers on.
+#include "../../cuda/contact.h"
+
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 
-#include "../../cuda/detect.h"
-#include "../../cuda/intersect.h"
-#include "../../cuda/islands.h"
-#include "../../cuda/segments.h"
+#include "../../cuda/arrays.h"
 #include "../detection.h"
 #include "binding.h"
 

@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "../../cuda/contact.h"
-#include "../../cuda/lowest.h"
 #include "sweep.h"
 
 namespace {
@@ -99,7 +98,7 @@ Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& plane
     const std::vector<int64_t> shape{in.scenes, in.bodies, in.num_planes};
     const Tensor own = empty(x, shape, ScalarType::Int);
     Tensor out = empty(x, shape, ScalarType::Int);
-    check(cuda::lowest_vertices<T>(in, data<int32_t>(own), data<int32_t>(out), current_stream(x)),
+    check(cuda::support_vertices<T>(in, data<int32_t>(own), data<int32_t>(out), current_stream(x)),
           "the search for the lowest vertices");
     return out;
   });

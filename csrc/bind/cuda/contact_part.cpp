@@ -4,7 +4,7 @@
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
-#include "../../cuda/part.h"
+#include "../../cuda/contact.h"
 #include "binding.h"
 
 namespace {

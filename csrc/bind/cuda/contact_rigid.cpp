@@ -130,7 +130,7 @@ contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::
                                       t.pairs.sums<T>(),
                                       data<int32_t>(pushing),
                                       t.out<T>()};
-      check(cuda::rigid_reverse<T>(inputs[k], own, current_stream(x)), "the adjoint of rigid motions");
+      check(cuda::rigid_contact_backward<T>(inputs[k], own, current_stream(x)), "the adjoint of rigid motions");
       end_bar = own.out.vertices.x;
     }
     return t.all();

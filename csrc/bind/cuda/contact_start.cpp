@@ -7,9 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cuda/advance.h"
-#include "../../cuda/keep.h"
-#include "../../cuda/start.h"
+#include "../../cuda/contact.h"
 #include "binding.h"
 
 namespace {

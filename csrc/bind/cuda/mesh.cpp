@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "../../cuda/reductions.h"
+#include "../../cuda/arrays.h"
 #include "sweep.h"
 
 namespace {

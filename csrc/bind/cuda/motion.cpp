@@ -1,5 +1,5 @@
 // CUDA implementations of motions and rooms of bodies: tensors in, raw pointers on.
-#include "../../cuda/motion.h"
+#include "../motion.h"
 
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
@@ -7,8 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cuda/islands.h"
-#include "../motion.h"
+#include "../../cuda/contact.h"
 #include "binding.h"
 
 namespace {

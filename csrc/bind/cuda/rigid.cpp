@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cuda/rigid.h"
+#include "../../cuda/bodies.h"
 #include "bodies.h"
 
 namespace {

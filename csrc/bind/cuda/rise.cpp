@@ -6,7 +6,7 @@
 
 #include <vector>
 
-#include "../../cuda/rise.h"
+#include "../../cuda/bodies.h"
 #include "binding.h"
 
 namespace {

@@ -4,7 +4,7 @@
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
-#include "../../cuda/sweep_rooms.h"
+#include "../../cuda/contact.h"
 #include "binding.h"
 
 namespace {
@@ -27,7 +27,7 @@ Tensor contact_sweep_rooms(const Tensor& x, const Tensor& start, const Tensor& b
         more, least);
     Tensor out = empty(x, {in.scenes, in.vertices});
     const Tensor wishes = empty(x, {in.scenes, in.bodies}), most = empty(x, {in.scenes});
-    check(cuda::sweep_rooms<T>(in, data<T>(wishes), data<T>(most), data<T>(out), current_stream(x)),
+    check(cuda::sweep_radii<T>(in, data<T>(wishes), data<T>(most), data<T>(out), current_stream(x)),
           "the rooms of sweeps");
     return out;
   });

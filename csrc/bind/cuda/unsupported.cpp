@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cuda/unsupported.h"
+#include "../../cuda/contact.h"
 #include "binding.h"
 
 namespace {
@@ -27,7 +27,8 @@ Tensor contact_unsupported(const Tensor& x, const Tensor& origin, const Tensor& 
     const auto in = diffvbd::unsupported_inputs<T>(
         {x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr}, time_step);
     Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3});
-    check(cuda::unsupported<T>(in, data<T>(out), current_stream(x)), "what contact leaves of an acceleration");
+    check(cuda::residual_acceleration<T>(in, data<T>(out), current_stream(x)),
+          "what contact leaves of an acceleration");
     return out;
   });
 }
@@ -46,7 +47,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_unsupported_backward(
     const diffvbd::UnsupportedBars bars(
         in, wants_planes, [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); }, zeros);
     zeros.clear();
-    check(cuda::unsupported_backward<T>(in, data<const T>(bar), bars.pointers<T>(), current_stream(x)),
+    check(cuda::residual_acceleration_backward<T>(in, data<const T>(bar), bars.pointers<T>(), current_stream(x)),
           "what contact leaves of an acceleration");
     return bars.tensors();
   });

@@ -1,9 +1,9 @@
-// Loads and stores of a thread, and which of the threads of a vertex it is.
+// Loads and stores of a thread, and its place among the threads of a vertex.
 #pragma once
 
 #include "../core/vec.h"
-#include "exchange.cuh"
 #include "step.h"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 

@@ -1,9 +1,26 @@
-// Gathers and fixed-order sums on the device; the twins of cpu/reductions.h, and pack_rest.
+// Arrays on the device: clears, gathers and sums in a fixed order.
 #pragma once
 
-#include "step.h"
+#include <cuda_runtime_api.h>
+
+#include <cstdint>
+#include <vector>
+
+#include "../core/plan_views.h"
 
 namespace diffvbd::cuda {
+
+struct Span {
+  void* data;  // at a multiple of 16 bytes
+  int64_t bytes;
+  // Of the rows of pairs, where only the device knows how many there are: entries / 4 rows of so many bytes, the rest
+  // is left as it is.
+  const int32_t* entries = nullptr;
+  int64_t row = 0;
+};
+
+// For a few bytes, too: in a captured graph cudaMemsetAsync takes 6 microseconds for them, and a kernel 1.
+cudaError_t clear(const std::vector<Span>& spans, cudaStream_t stream);
 
 // rest [scenes, T, 7] -> as the pairs see it: k_ij k_ik k_il c6, [scenes, slots, 4 / W, kSlice, W], W scalars being 16
 // bytes
@@ -25,5 +42,11 @@ cudaError_t sum_segments(const T* values, const int64_t* ptr, const int32_t* ent
 int64_t partial_sums(int64_t rows, int64_t columns);
 template <class T>
 cudaError_t sum_rows(const T* values, int64_t rows, int64_t columns, T* partial, T* out, cudaStream_t stream);
+
+// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]) in an order that depends on the
+// shapes alone
+template <class T>
+cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
+                        int64_t segments, int64_t c, T* out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -1,10 +1,10 @@
-// Minimum and maximum of floating-point numbers by atomics of integers in the same order: their results do not depend
-// on who comes first.
+// Minimum, maximum and union of sets by atomics: results that do not depend on the order of threads.
 #pragma once
 
 #include <cuda_runtime.h>
 
 #include <cstdint>
+#include <cuda/atomic>
 
 namespace diffvbd::cuda {
 
@@ -46,6 +46,32 @@ __device__ __forceinline__ void lower(U* place, U value) {
 template <class U>
 __device__ __forceinline__ void raise(U* place, U value) {
   if (value > *static_cast<volatile U*>(place)) atomicMax(place, value);
+}
+
+// Labels are read and shortened while others join them: whatever is read is an item of the same set.
+__device__ inline ::cuda::atomic_ref<int32_t, ::cuda::thread_scope_device> shared_label(const int32_t* label,
+                                                                                        int32_t i) {
+  return ::cuda::atomic_ref<int32_t, ::cuda::thread_scope_device>(const_cast<int32_t*>(label)[i]);
+}
+
+__device__ inline int32_t root_of(const int32_t* label, int32_t i) {
+  for (;;) {
+    const int32_t parent = shared_label(label, i).load(::cuda::std::memory_order_relaxed);
+    if (parent == i) return i;
+    i = parent;
+  }
+}
+
+// Hangs the larger of two roots under the smaller.
+__device__ inline void unite(int32_t* label, int32_t a, int32_t b) {
+  for (;;) {
+    a = root_of(label, a), b = root_of(label, b);
+    if (a == b) return;
+    const int32_t low = a < b ? a : b, high = a < b ? b : a;
+    const int32_t before = atomicMin(label + high, low);
+    if (before == high) return;
+    a = before, b = low;
+  }
 }
 
 }  // namespace diffvbd::cuda

@@ -1,7 +1,10 @@
+// Compact list of pairs (contact/keep.h): a part of a list in the memory of the whole; the host does not learn its
+// size.
 #include <cub/device/device_scan.cuh>
 
-#include "exchange.cuh"
-#include "keep.h"
+#include "common.cuh"
+#include "contact.h"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -10,12 +13,9 @@ using namespace contact;
 
 constexpr int kThreads = 128, kWarp = 32;
 
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
-
 template <class T>
 __global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ KeepInputs<T> in, int32_t* kept) {
-  const int64_t i = own_item();
+  const int64_t i = own_item(kThreads);
   if (i <= in.count) kept[i] = i < in.count && stays(in, i) ? 1 : 0;
 }
 // Calls f(number(entry), its place in the shorter list) for the entries of a corner point whose pairs stay; a warp for
@@ -64,12 +64,12 @@ __device__ void copy_entries_of(const KeepInputs<T>& in, const int32_t* kept, in
 
 template <class T>
 __global__ void __launch_bounds__(kThreads) count_entries(const __grid_constant__ KeepInputs<T> in, int32_t* counts) {
-  count_entries_of(in, own_item() / kWarp, counts);
+  count_entries_of(in, own_item(kThreads) / kWarp, counts);
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     copy_pairs(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item();
+  const int64_t i = own_item(kThreads);
   if (i >= in.count) return;
   if (stays(in, i)) copy_pair(in, i, kept[i], out);
   if (kept[in.count] <= i) leave_empty(i, out);
@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     copy_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item() / kWarp;
+  const int64_t i = own_item(kThreads) / kWarp;
   if (i < in.corners) copy_entries_of(in, kept, i, out.ptr[i], out);
 }
 
@@ -126,7 +126,7 @@ __global__ void __launch_bounds__(kThreads)
     return;
   }
   __shared__ int of_warps[kThreads / kWarp];
-  const int64_t i = own_item(), listed = in.ptr[in.corners] / 4;
+  const int64_t i = own_item(kThreads), listed = in.ptr[in.corners] / 4;
   const unsigned lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   const bool own = i < in.count && stays(in, i);
   const unsigned found = __ballot_sync(kWholeWarp, own);
@@ -144,7 +144,7 @@ template <class T>
 __global__ void __launch_bounds__(kThreads)
     keep_few_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const int32_t* counts,
                      const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item() / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
+  const int64_t i = own_item(kThreads) / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
   int before = sums_before(first, first, [&](int64_t corner) { return counts[corner]; }).all;
   if (i > in.corners) return;
   for (int64_t k = first; k < i; ++k) before += counts[k];
@@ -174,30 +174,26 @@ int64_t keep_bytes(const KeepInputs<T>& in) {
 template <class T>
 cudaError_t keep(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, cudaStream_t stream) {
   auto* kept = static_cast<int32_t*>(workspace);
-  const unsigned of_corners = blocks_for((in.corners + 1) * kWarp);
+  const unsigned of_corners = blocks_for((in.corners + 1) * kWarp, kThreads);
   if (are_few(in)) {
     auto* counts = reinterpret_cast<int32_t*>(static_cast<uint8_t*>(workspace) + aligned(in.count * sizeof(int32_t)));
-    const unsigned of_pairs = blocks_for(in.count);
+    const unsigned of_pairs = blocks_for(in.count, kThreads);
     keep_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, of_pairs, kept, counts, out);
     keep_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, kept, counts, out);
     return cudaGetLastError();
   }
   void* scan = static_cast<uint8_t*>(workspace) + aligned((in.count + 1) * sizeof(int32_t));
   size_t bytes = scan_bytes(in);
-  flag_pairs<T><<<blocks_for(in.count + 1), kThreads, 0, stream>>>(in, kept);
+  flag_pairs<T><<<blocks_for(in.count + 1, kThreads), kThreads, 0, stream>>>(in, kept);
   if (auto error = cub::DeviceScan::ExclusiveSum(scan, bytes, kept, kept, in.count + 1, stream)) return error;
   count_entries<T><<<of_corners, kThreads, 0, stream>>>(in, out.ptr);
   if (auto error = cub::DeviceScan::ExclusiveSum(scan, bytes, out.ptr, out.ptr, in.corners + 1, stream)) return error;
-  if (in.count > 0) copy_pairs<T><<<blocks_for(in.count), kThreads, 0, stream>>>(in, kept, out);
-  if (in.corners > 0) copy_entries<T><<<blocks_for(in.corners * kWarp), kThreads, 0, stream>>>(in, kept, out);
+  if (in.count > 0) copy_pairs<T><<<blocks_for(in.count, kThreads), kThreads, 0, stream>>>(in, kept, out);
+  if (in.corners > 0) copy_entries<T><<<blocks_for(in.corners * kWarp, kThreads), kThreads, 0, stream>>>(in, kept, out);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                          \
-  template int64_t keep_bytes<T>(const KeepInputs<T>&); \
-  template cudaError_t keep<T>(const KeepInputs<T>&, const Kept<T>&, void*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(keep_bytes)
+DIFFVBD_INSTANTIATE(keep)
 
 }  // namespace diffvbd::cuda

@@ -1,7 +1,6 @@
-// A block for each body of each scene, as large as bodies are on average.
-#pragma once
-
+// Start of a substep (contact/part.h, contact/above_floor_reverse.h): a block for each body, a thread for each vertex.
 #include "bodies.cuh"
+#include "contact.h"
 
 namespace diffvbd::cuda {
 
@@ -57,5 +56,53 @@ struct BodyBlock {
     __syncthreads();
   }
 };
+
+namespace {
+
+template <class T, template <class> class Act>
+__global__ void __launch_bounds__(kMostThreads) body_kernel(const __grid_constant__ Act<T> act) {
+  __shared__ double part[kMostThreads / kWarp][BodyBlock::kSums];
+  const int64_t item = blockIdx.x, bodies = act.in.scene.bodies;
+  act(rigid::Body<T>{act.in.scene, item / bodies, static_cast<int32_t>(item % bodies)}, BodyBlock{part});
+}
+
+template <class Act>
+__global__ void __launch_bounds__(kVertexThreads) vertex_kernel(const __grid_constant__ Act act) {
+  const Row row(act.in.scene);
+  if (row.exists) act(row.scene, row.vertex);
+}
+
+}  // namespace
+
+template <class Act>
+cudaError_t act_on_bodies(const Act& act, cudaStream_t stream) {
+  const int64_t items = act.in.scene.scenes * act.in.scene.bodies;
+  if (items == 0) return cudaSuccess;
+  const int threads = threads_for(act.in.scene.vertices, act.in.scene.bodies);
+  body_kernel<<<static_cast<unsigned>(items), threads, 0, stream>>>(act);
+  return cudaGetLastError();
+}
+
+template <class Act>
+cudaError_t act_on_vertices(const Act& act, cudaStream_t stream) {
+  if (act.in.scene.scenes * act.in.scene.vertices == 0) return cudaSuccess;
+  vertex_kernel<<<blocks_of(act.in.scene), kVertexThreads, 0, stream>>>(act);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_ACT(on, Act)                                                  \
+  template cudaError_t act_on_##on(const contact::Act<float>&, cudaStream_t); \
+  template cudaError_t act_on_##on(const contact::Act<double>&, cudaStream_t);
+DIFFVBD_ACT(bodies, AboveFloorWays)
+DIFFVBD_ACT(bodies, ReverseAboveFloor)
+DIFFVBD_ACT(bodies, Frames)
+DIFFVBD_ACT(bodies, Bends)
+DIFFVBD_ACT(bodies, HeldUp)
+DIFFVBD_ACT(vertices, Wishes)
+DIFFVBD_ACT(vertices, Holds)
+DIFFVBD_ACT(vertices, Falls)
+DIFFVBD_ACT(vertices, Starts)
+DIFFVBD_ACT(vertices, ReverseStarts)
+#undef DIFFVBD_ACT
 
 }  // namespace diffvbd::cuda
