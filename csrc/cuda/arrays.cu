@@ -9,7 +9,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kThreads = 256, kMost = 8;  // spans of a launch
+constexpr int kThreads = 256, kMost = 8;  // spans per launch
 constexpr int64_t kBlocks = 1024;         // of a span, at most
 
 struct Spans {
@@ -106,7 +106,7 @@ __global__ void short_rows_kernel(const T* values, int64_t rows, int64_t columns
   out[i] = sum;
 }
 
-// one block for each chunk of each row
+// A block for each chunk of each row.
 template <class T>
 __global__ void chunk_kernel(const T* values, int64_t columns, int64_t chunks, T* out) {
   __shared__ T part[kThreads];
@@ -175,12 +175,12 @@ DIFFVBD_INSTANTIATE(sum_rows)
 
 namespace {
 
-constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of up to so many terms; above, kThreads
-constexpr int64_t kFewTerms = 32;              // of a segment on average, up to which a thread adds one up
+constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of up to so many terms; otherwise kThreads
+constexpr int64_t kFewTerms = 32;              // terms of a segment on average up to which a thread sums it
 constexpr int32_t kShortSegment = 512;         // terms up to which it may
-constexpr int64_t kManySums = 1 << 15;         // of longer ones, above which a warp adds up all columns of a segment
+constexpr int64_t kManySums = 1 << 15;  // sums of longer segments above which a warp sums all columns of a segment
 
-// A block for kThreads segments of a scene: a thread for each column of a short one, all for a long one.
+// A block for kThreads segments of a scene: a thread for each column of a short one, all threads for a long one.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     short_segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
@@ -215,16 +215,16 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// The sum of one column of a segment, always in the same order, whoever adds it up: of a short one kWarp threads, of a
-// long one kThreads take every so many terms, and half of them add what the others have, again and again.
+// Sum of one column of a segment in a fixed order, by any kernel: kWarp threads for a short one, kThreads for a long
+// one take every so many terms, and halve their number again and again.
 template <class T>
 struct Column {
-  const T* values;  // of its first item
+  const T* values;  // of the first item
   const int32_t* order;
   int64_t c;
   int32_t begin, end;
   __device__ bool is_long() const { return end - begin > kLongSegment; }
-  // What one of so many threads has.
+  // Part of one of `threads` threads.
   __device__ T part(int thread, int threads) const {
     T sum = T(0);
     for (int32_t e = begin + thread; e < end; e += threads) sum += values[order[e] * c];
@@ -238,7 +238,7 @@ __device__ Column<T> column_of(const T* values, const int32_t* order, const int3
   return {values + scene * items * c + k, order, c, ptr[s], ptr[s + 1]};
 }
 
-// A warp for some columns of a segment, one after another.
+// A warp for some columns of a segment in turn.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     warp_segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
@@ -250,7 +250,7 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t k = first; k < first + columns; ++k) {
     const Column<T> own = column_of(values, order, ptr, items, segments, c, row, k);
     T sum;
-    if (own.is_long()) {  // as many threads would
+    if (own.is_long()) {  // the order of kThreads threads
       T parts[kThreads / kWarp];
       for (int w = 0; w < kThreads / kWarp; ++w) parts[w] = own.part(lane + kWarp * w, kThreads);
       for (int half = kThreads / kWarp / 2; half > 0; half /= 2) {

@@ -13,17 +13,16 @@ namespace diffvbd::cuda {
 struct Span {
   void* data;  // at a multiple of 16 bytes
   int64_t bytes;
-  // Of the rows of pairs, where only the device knows how many there are: entries / 4 rows of so many bytes, the rest
-  // is left as it is.
+  // Rows of pairs, whose number only the device knows: entries / 4 rows of `row` bytes; the rest stays as it is.
   const int32_t* entries = nullptr;
   int64_t row = 0;
 };
 
-// For a few bytes, too: in a captured graph cudaMemsetAsync takes 6 microseconds for them, and a kernel 1.
+// Also for a few bytes: in a captured graph cudaMemsetAsync takes 6 microseconds for them, a kernel 1.
 cudaError_t clear(const std::vector<Span>& spans, cudaStream_t stream);
 
-// rest [scenes, T, 7] -> as the pairs see it: k_ij k_ik k_il c6, [scenes, slots, 4 / W, kSlice, W], W scalars being 16
-// bytes
+// rest [scenes, T, 7] -> layout of the pairs, k_ij k_ik k_il c6: [scenes, slots, 4 / W, kSlice, W], W scalars being 16
+// bytes.
 template <class T>
 cudaError_t pack_rest(const GroupPlan& plan, int64_t scenes, const T* rest, T* packed, cudaStream_t stream);
 
@@ -37,14 +36,13 @@ template <class T>
 cudaError_t sum_segments(const T* values, const int64_t* ptr, const int32_t* entry, int64_t scenes, int64_t n,
                          int64_t segments, int64_t c, T* out, cudaStream_t stream);
 
-// values [rows, columns] -> [rows], in an order that depends on the shape alone. `partial` holds partial_sums()
-// scalars.
+// values [rows, columns] -> [rows], in an order that depends only on the shape. partial: partial_sums() scalars.
 int64_t partial_sums(int64_t rows, int64_t columns);
 template <class T>
 cudaError_t sum_rows(const T* values, int64_t rows, int64_t columns, T* partial, T* out, cudaStream_t stream);
 
-// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]) in an order that depends on the
-// shapes alone
+// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]) in an order that depends only on
+// the shapes.
 template <class T>
 cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                         int64_t segments, int64_t c, T* out, cudaStream_t stream);

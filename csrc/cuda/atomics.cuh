@@ -38,7 +38,7 @@ __device__ __forceinline__ T value_of(Ordered<T> bits) {
   return value;
 }
 
-// Looks first: most numbers change nothing, and reading is cheap where many threads share a place.
+// Reads first: most numbers change nothing, and reads of a shared location are cheap.
 template <class U>
 __device__ __forceinline__ void lower(U* place, U value) {
   if (value < *static_cast<volatile U*>(place)) atomicMin(place, value);
@@ -48,7 +48,7 @@ __device__ __forceinline__ void raise(U* place, U value) {
   if (value > *static_cast<volatile U*>(place)) atomicMax(place, value);
 }
 
-// Labels are read and shortened while others join them: whatever is read is an item of the same set.
+// Labels may change while they are read; every value read is an item of the same set.
 __device__ inline ::cuda::atomic_ref<int32_t, ::cuda::thread_scope_device> shared_label(const int32_t* label,
                                                                                         int32_t i) {
   return ::cuda::atomic_ref<int32_t, ::cuda::thread_scope_device>(const_cast<int32_t*>(label)[i]);
@@ -62,7 +62,7 @@ __device__ inline int32_t root_of(const int32_t* label, int32_t i) {
   }
 }
 
-// Hangs the larger of two roots under the smaller.
+// Makes the larger of two roots a child of the smaller.
 __device__ inline void unite(int32_t* label, int32_t a, int32_t b) {
   for (;;) {
     a = root_of(label, a), b = root_of(label, b);

@@ -24,7 +24,7 @@ __global__ void __launch_bounds__(kVertexThreads)
   if (row.exists) reverse_vertex(in, a, row.scene, row.vertex);
 }
 
-// What a kernel does to a body.
+// Actions of the kernels on a body.
 template <class T>
 struct Choose {
   static constexpr bool keeps_record = false, computes = false;

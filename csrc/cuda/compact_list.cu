@@ -18,8 +18,8 @@ __global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ K
   const int64_t i = own_item(kThreads);
   if (i <= in.count) kept[i] = i < in.count && stays(in, i) ? 1 : 0;
 }
-// Calls f(number(entry), its place in the shorter list) for the entries of a corner point whose pairs stay; a warp for
-// each. Returns how many there are.
+// Calls f(number(entry), index in the compact list) for the entries of a corner point whose pairs stay, a warp for each
+// corner. Returns how many there are.
 template <class T, class Number, class F>
 __device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Number& number, const F& f) {
   constexpr int kAhead = 8;  // entries of a thread that are read at once: a corner of a collider may have thousands
@@ -27,7 +27,7 @@ __device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Numb
   const int32_t end = in.ptr[corner + 1];
   int32_t count = 0;
   for (int32_t first = in.ptr[corner]; first < end; first += kAhead * kWarp) {
-    int32_t entries[kAhead], numbers[kAhead];  // -1: there is none that stays
+    int32_t entries[kAhead], numbers[kAhead];  // -1: dropped
 #pragma unroll
     for (int u = 0; u < kAhead; ++u) {
       const int32_t own = first + u * kWarp + static_cast<int32_t>(lane);
@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kThreads)
   if (i < in.corners) copy_entries_of(in, kept, i, out.ptr[i], out);
 }
 
-// Where lists are short, each block adds up by itself what comes before its own: two launches in place of eight.
+// Short lists: each block sums what precedes its part itself, two launches in place of eight.
 constexpr int64_t kFewPairs = 1 << 15, kFewCorners = 1 << 12;
 
 template <class T>
@@ -92,7 +92,7 @@ bool are_few(const KeepInputs<T>& in) {
 struct Sums {
   int before, all;
 };
-// The sums over the threads of a block; all must call it.
+// Sums over the threads of a block; all must call it.
 __device__ Sums sums_of_block(Sums own) {
   __shared__ int before[kThreads / kWarp], all[kThreads / kWarp];
   const unsigned warp = threadIdx.x / kWarp;
@@ -103,7 +103,7 @@ __device__ Sums sums_of_block(Sums own) {
   for (int i = 0; i < kThreads / kWarp; ++i) sum.before += before[i], sum.all += all[i];
   return sum;
 }
-// The sum of value(i) over i in [0, end), and over those below `first`.
+// Sum of value(i) over i in [0, end), and over those below `first`.
 template <class Value>
 __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
   Sums own{0, 0};
@@ -116,11 +116,11 @@ __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
   return sums_of_block(own);
 }
 
-// The pairs, by the first blocks; how many entries corner points keep, by the others.
+// The first blocks copy pairs; the others count the entries that corner points keep.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    keep_few_pairs(const __grid_constant__ KeepInputs<T> in, unsigned blocks, int32_t* kept, int32_t* counts,
-                   const __grid_constant__ Kept<T> out) {
+    compact_few_pairs(const __grid_constant__ KeepInputs<T> in, unsigned blocks, int32_t* kept, int32_t* counts,
+                      const __grid_constant__ Kept<T> out) {
   if (blockIdx.x >= blocks) {
     count_entries_of(in, (static_cast<int64_t>(blockIdx.x - blocks) * kThreads + threadIdx.x) / kWarp, counts);
     return;
@@ -142,8 +142,8 @@ __global__ void __launch_bounds__(kThreads)
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    keep_few_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const int32_t* counts,
-                     const __grid_constant__ Kept<T> out) {
+    compact_few_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const int32_t* counts,
+                        const __grid_constant__ Kept<T> out) {
   const int64_t i = own_item(kThreads) / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
   int before = sums_before(first, first, [&](int64_t corner) { return counts[corner]; }).all;
   if (i > in.corners) return;
@@ -166,20 +166,20 @@ size_t scan_bytes(const KeepInputs<T>& in) {
 }  // namespace
 
 template <class T>
-int64_t keep_bytes(const KeepInputs<T>& in) {
+int64_t compact_list_bytes(const KeepInputs<T>& in) {
   if (are_few(in)) return aligned(in.count * sizeof(int32_t)) + aligned((in.corners + 1) * sizeof(int32_t));
   return aligned((in.count + 1) * sizeof(int32_t)) + aligned(static_cast<int64_t>(scan_bytes(in)));
 }
 
 template <class T>
-cudaError_t keep(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, cudaStream_t stream) {
+cudaError_t compact_list(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, cudaStream_t stream) {
   auto* kept = static_cast<int32_t*>(workspace);
   const unsigned of_corners = blocks_for((in.corners + 1) * kWarp, kThreads);
   if (are_few(in)) {
     auto* counts = reinterpret_cast<int32_t*>(static_cast<uint8_t*>(workspace) + aligned(in.count * sizeof(int32_t)));
     const unsigned of_pairs = blocks_for(in.count, kThreads);
-    keep_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, of_pairs, kept, counts, out);
-    keep_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, kept, counts, out);
+    compact_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, of_pairs, kept, counts, out);
+    compact_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, kept, counts, out);
     return cudaGetLastError();
   }
   void* scan = static_cast<uint8_t*>(workspace) + aligned((in.count + 1) * sizeof(int32_t));
@@ -193,7 +193,7 @@ cudaError_t keep(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, c
   return cudaGetLastError();
 }
 
-DIFFVBD_INSTANTIATE(keep_bytes)
-DIFFVBD_INSTANTIATE(keep)
+DIFFVBD_INSTANTIATE(compact_list_bytes)
+DIFFVBD_INSTANTIATE(compact_list)
 
 }  // namespace diffvbd::cuda

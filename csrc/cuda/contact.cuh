@@ -13,10 +13,10 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr int kContactThreads = kWarpsPerBlock * kSlice;
-// Threads for a vertex: of a color, of a color with few vertices, and for a corner point.
+// Threads for a vertex of a color, for a vertex of a small color, and for a corner point.
 constexpr int kShare = 8, kWide = 32, kCornerShare = 8;
 
-// Which vertices of the blocks [begin, end) a warp has, where it is one of `roles` for them.
+// Vertices of the blocks [begin, end) that a warp works on, as one of `roles` warps.
 template <int share>
 struct Part {
   int64_t scene;
@@ -32,21 +32,21 @@ struct Part {
     block = static_cast<int>(begin + i / share), part = static_cast<int>(i % share);
     there = scene < s.scenes;
   }
-  __device__ __forceinline__ Place<share> place() const { return {scene, block, part}; }
+  __device__ __forceinline__ LaneLayout<share> place() const { return {scene, block, part}; }
   template <class T>
-  __device__ __forceinline__ int64_t row(const StepView<T>& s, const Place<share>& at) const {
+  __device__ __forceinline__ int64_t row(const StepView<T>& s, const LaneLayout<share>& at) const {
     return scene * s.positions + static_cast<int64_t>(block) * kSlice + at.v;
   }
 };
 
-// sweep: in the reverse, in which positions of the color are those of the tape; else negative.
+// sweep: in the reverse, whose tape has the positions of the color; otherwise negative.
 template <int share, class T>
 __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactView<T> c,
                                  int sweep, int64_t begin, int64_t end) {
   const Part<share> part(s, begin, end);
   wait_for_previous();
   if (!part.there) return;
-  const Place<share> at = part.place();
+  const LaneLayout<share> at = part.place();
   T* to = s.w.contact + part.row(s, at) * kContactScalars;
   const auto gather = [&](const auto& rows) {
     PairsOf<T, share, std::decay_t<decltype(rows)>>(s, c.in, at, rows).gather(to);
@@ -64,14 +64,15 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
   const Part<share> part(s, begin, end);
   wait_for_previous();
   if (!part.there) return;
-  const Place<share> at = part.place();
+  const LaneLayout<share> at = part.place();
   const int64_t row = part.row(s, at);
   const SweepRows<T> rows = sweep_rows(s, at.scene, begin, end, MovingRows<T>{s.w.x, s.w.moved});
   PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, rows);
   const Vec3<T> from = load_row(s.w.x, row), d = load_row(s.w.moved, row) - from;
-  const int exponent = pairs.limit(pairs.room(), from, d);
+  const int exponent = pairs.limit(pairs.trust_region(), from, d);
   if (pairs.vertex < 0 || at.lane != 0) return;
-  c.cut[((s.base + at.scene) * s.sweeps + sweep) * c.in.num_vertices + pairs.vertex] = static_cast<uint8_t>(exponent);
+  c.truncations[((s.base + at.scene) * s.sweeps + sweep) * c.in.num_vertices + pairs.vertex] =
+      static_cast<uint8_t>(exponent);
   if (exponent > 0) store_row(s.w.moved, row, from + contact::limit_of<T>(exponent) * d);
 }
 
@@ -86,12 +87,12 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
   const Part<share> part(s, begin, end);
   wait_for_previous();
   if (!part.there) return;
-  const Place<share> at = part.place();
+  const LaneLayout<share> at = part.place();
   const SweepRows<T> rows = settled_rows(s, at.scene, begin, end);
   const PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, rows);
   if (!__any_sync(kWholeWarp, pairs.touches())) return;
   T now[3];
-  take_sent(c, pairs, now);
+  take_scattered(c, pairs, now);
   if (pairs.touches() && at.lane == 0) add_row(s.w.x_bar, part.row(s, at), contact::vector_at(now));
 }
 
@@ -102,10 +103,10 @@ __global__ void __launch_bounds__(kContactThreads, 3)
   const Part<share> part(s, begin, end, roles);
   wait_for_previous();
   if (!part.there) return;
-  send_pairs(s, c, part.place(), part.role, begin, end);
+  scatter_pairs(s, c, part.place(), part.role, begin, end);
 }
 
-// Over the threads of a share, which may come out of loops of their own.
+// Sum over the threads of a vertex, which may leave their loops at different times.
 template <int share, class T, class... R>
 __device__ __forceinline__ void sum_share(R&... values) {
   __syncwarp();
@@ -156,8 +157,8 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
 
 constexpr int kSumThreads = 1024;
 
-// Adds up a scalar of the slots of each scene's pairs, one block a scene, in an order fixed by the number of pairs.
-// each: slots of a pair; stride: scalars from one slot to the next.
+// Sum of a scalar of the slots of each scene's pairs, a block each, in an order fixed by the number of pairs. each:
+// slots of a pair; stride: scalars between slots.
 template <class T>
 __global__ void __launch_bounds__(kSumThreads) sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base,
                                                             const T* slots, int each, int stride, T* out) {
@@ -191,11 +192,11 @@ __global__ void sum_lag_slots(const int32_t* entries, const T* slots, int64_t it
 }
 
 template <class... P, class... A>
-cudaError_t launch_pass(void (*kernel)(P...), int64_t items, cudaStream_t stream, bool follows, A... arguments) {
+cudaError_t launch_pass(void (*kernel)(P...), int64_t items, cudaStream_t stream, bool dependent, A... arguments) {
   if (items == 0) return cudaSuccess;
   void* pointers[] = {&arguments...};
   const unsigned blocks = blocks_for(items, kContactThreads);
-  return launch(reinterpret_cast<const void*>(kernel), blocks, dim3(kContactThreads), pointers, 0, stream, follows);
+  return launch(reinterpret_cast<const void*>(kernel), blocks, dim3(kContactThreads), pointers, 0, stream, dependent);
 }
 template <class... P, class... A>
 cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t stream, A... arguments) {
@@ -206,27 +207,27 @@ cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t str
 
 template <class T>
 template <class... P, class... A>
-cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool follows,
+cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool dependent,
                                    A... arguments) const {
-  return launch_pass(kernel, s.scenes * (end - begin) * warps * kSlice, stream, follows, s, c, arguments..., begin,
+  return launch_pass(kernel, s.scenes * (end - begin) * warps * kSlice, stream, dependent, s, c, arguments..., begin,
                      end);
 }
 template <class T>
-cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool follows) const {
-  return over(assemble_contact<kShare, T>, begin, end, kShare, follows, sweep);
+cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool dependent) const {
+  return over(assemble_contact<kShare, T>, begin, end, kShare, dependent, sweep);
 }
 template <class T>
-cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool follows) const {
-  return over(limit_contact<kShare, T>, begin, end, kShare, follows, sweep);
+cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool dependent) const {
+  return over(limit_contact<kShare, T>, begin, end, kShare, dependent, sweep);
 }
 template <class T>
-cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool follows) const {
-  return over(prepare_contact<kShare, T>, begin, end, kShare, follows);
+cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool dependent) const {
+  return over(prepare_contact<kShare, T>, begin, end, kShare, dependent);
 }
 template <class T>
-cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool follows) const {
-  if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, follows, kRoles);
-  return over(reverse_contact<kShare, T>, begin, end, kShare, follows, 1);
+cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool dependent) const {
+  if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, dependent, kRoles);
+  return over(reverse_contact<kShare, T>, begin, end, kShare, dependent, 1);
 }
 template <class T>
 cudaError_t ContactPasses<T>::collect(const StepAdjoints<T>& out) const {
@@ -250,8 +251,8 @@ cudaError_t sum_lag(const ContactInputs<T>& in, int64_t scenes, const ContactAdj
   return launch_contact(sum_lag_slots<T>, items, stream, entries, from, items, lag);
 }
 
-// Clears the rows [from, to), of so many scalars, that belong to the threads of the block: side by side, where each
-// thread by itself would write far apart. All threads must call it.
+// Clears the rows [from, to) that belong to the threads of the block. Neighbouring threads write neighbouring scalars.
+// All threads must call it.
 template <class T>
 __device__ __forceinline__ void clear_rows(T* rows, int scalars, int64_t from, int64_t to) {
   const int64_t begin = static_cast<int64_t>(blockIdx.x) * blockDim.x, end = begin + blockDim.x;
@@ -261,7 +262,7 @@ __device__ __forceinline__ void clear_rows(T* rows, int scalars, int64_t from, i
 
 namespace {
 
-// A pair that is in the list, with what its lag depends on.
+// Listed pair with the inputs of its lagged quantities.
 template <class T>
 struct LagPair {
   const int32_t* record;
@@ -277,7 +278,7 @@ struct LagPair {
   }
 };
 
-// Three scalars of a pair, beside what it has for its corners.
+// Three scalars of a pair in addition to those of its corners.
 template <class T>
 struct OwnScalars {
   T of[3];
@@ -318,8 +319,8 @@ __global__ void lag_reverse(const __grid_constant__ ContactInputs<T> in, const T
 }
 
 template <class T>
-__global__ void rubbing_forward(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
-                                const T* x, int64_t scenes, int64_t pairs, T* values, T* slots) {
+__global__ void friction_forward(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
+                                 const T* x, int64_t scenes, int64_t pairs, T* values, T* slots) {
   const int64_t pair = own_item();
   const int64_t count = in.listed.ptr[scenes * in.corners] / 4;
   clear_rows(values, contact::kLagScalars, count, pairs);
@@ -335,9 +336,9 @@ __global__ void rubbing_forward(const __grid_constant__ ContactInputs<T> in, con
 }
 
 template <class T>
-__global__ void rubbing_reverse(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
-                                const contact::RubbingBars<T> given, const T* x, int64_t scenes, int64_t pairs,
-                                T* slots) {
+__global__ void friction_reverse(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
+                                 const contact::RubbingBars<T> given, const T* x, int64_t scenes, int64_t pairs,
+                                 T* slots) {
   const int64_t pair = own_item();
   if (pair >= pairs || 4 * pair >= in.listed.ptr[scenes * in.corners]) return;
   const LagPair<T> at(in, x, pair);
@@ -346,7 +347,7 @@ __global__ void rubbing_reverse(const __grid_constant__ ContactInputs<T> in, con
   store_slots(out.pair.x, {out.pair.kappa, out.friction, out.damping}, slots + kLagSlots * pair);
 }
 
-// By corner point, with a warp: what its pairs' corners have received, [B, N, 3].
+// Sum for each corner point over the corners of its pairs [B, N, 3], a warp each.
 template <class T>
 __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t scenes, const T* slots, T* out) {
   const int64_t i = own_item(), row = i / kSlice;
@@ -362,7 +363,7 @@ __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t
   to[0] = sum.x, to[1] = sum.y, to[2] = sum.z;
 }
 
-// Sums of slots: of corner points, and of three scalars of pairs by scene, of which some may be null.
+// Sums of slots over corner points, and of three scalars of pairs by scene, of which some may be null.
 template <class T>
 cudaError_t sum_slots(const ContactInputs<T>& in, int64_t scenes, const T* slots, T* points, const SceneSums<T>& of,
                       cudaStream_t stream) {
@@ -394,19 +395,19 @@ cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t sc
 }
 
 template <class T>
-cudaError_t rubbing(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x, int64_t scenes,
-                    int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream) {
-  if (auto error = launch_contact(rubbing_forward<T>, pairs, stream, in, by, x, scenes, pairs, values, slots)) {
+cudaError_t lagged_friction(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
+                            int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream) {
+  if (auto error = launch_contact(friction_forward<T>, pairs, stream, in, by, x, scenes, pairs, values, slots)) {
     return error;
   }
   return sum_slots(in, scenes, slots, push, {}, stream);
 }
 
 template <class T>
-cudaError_t rubbing_backward(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                             const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
-                             T* points, T* kappa, T* friction, T* damping, cudaStream_t stream) {
-  if (auto error = launch_contact(rubbing_reverse<T>, pairs, stream, in, by, given, x, scenes, pairs, slots)) {
+cudaError_t lagged_friction_backward(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
+                                     const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs,
+                                     T* slots, T* points, T* kappa, T* friction, T* damping, cudaStream_t stream) {
+  if (auto error = launch_contact(friction_reverse<T>, pairs, stream, in, by, given, x, scenes, pairs, slots)) {
     return error;
   }
   return sum_slots(in, scenes, slots, points, {kappa, friction, damping}, stream);

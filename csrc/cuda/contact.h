@@ -24,14 +24,14 @@
 
 namespace diffvbd::cuda {
 
-// After all scenes: the slots of the corners of each lagged pair added up; zero where there is none.
+// After all scenes: sum of the slots of the corners of each lagged pair; zero where there is none.
 template <class T>
 cudaError_t sum_lag(const contact::ContactInputs<T>& in, int64_t scenes, const contact::ContactAdjoints<T>& slots,
                     int64_t pairs, T* lag, cudaStream_t stream);
 
-// contact_lag and its adjoint; `pairs` that the list has room for, `count` on the device at ptr[scenes corners]. The
-// reverse writes `slots` [pairs, kLagSlots], three scalars for each corner and after each of the first three corners
-// one of the pair, and adds them up.
+// Lagged quantities of pairs and their adjoint. pairs: capacity of the list; its length is on the device, at ptr[scenes
+// corners]. The reverse writes `slots` [pairs, kLagSlots] and sums them: three scalars for each corner, and after each
+// of the first three corners one of the pair.
 constexpr int kLagSlots = 16;
 template <class T>
 cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
@@ -39,16 +39,16 @@ cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t sc
 template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
                               const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
-// As cpu/contact_lag.cpp's contact_rubbing; friction and damping may be null.
+// As the CPU operator contact_rubbing; friction and damping may be null.
 template <class T>
-cudaError_t rubbing(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
-                    int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
+cudaError_t lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
+                            int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
 template <class T>
-cudaError_t rubbing_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                             const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
-                             T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
+cudaError_t lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
+                                     const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs,
+                                     T* slots, T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
 
-// Bytes of memory that a detection works in.
+// Bytes of workspace.
 template <class T>
 size_t detect_workspace_bytes(const contact::Surfaces<T>& in, int64_t capacity);
 
@@ -56,7 +56,7 @@ template <class T>
 cudaError_t detect(const contact::Surfaces<T>& in, const contact::Detected<T>& out, void* workspace,
                    cudaStream_t stream);
 
-// Bytes of memory that a search works in.
+// Bytes of workspace.
 template <class T>
 size_t intersections_workspace_bytes(const contact::Surfaces<T>& in, int64_t capacity);
 
@@ -64,32 +64,33 @@ template <class T>
 cudaError_t find_intersections(const contact::Surfaces<T>& in, const contact::Intersections& out, void* workspace,
                                cudaStream_t stream);
 
-// Bytes of memory that find_islands works in.
+// Bytes of workspace of find_islands().
 template <class T>
 size_t islands_workspace_bytes(const contact::IslandInputs<T>& in);
 
-// island [B, mesh_bodies]. again: the workspace is that of a call that differed in its rooms alone.
+// island [B, mesh_bodies]. again: the workspace is that of a call that differed only in radii.
 template <class T>
 cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, void* workspace, cudaStream_t stream,
                          bool again = false);
 
-// Bytes of memory that it works in, where the list has room for so many pairs.
+// Bytes of workspace for a list of that capacity.
 template <class T>
 int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in, int64_t capacity);
 
-// share, stuck [1] as cpu/advance.h. capacity: pairs that the list has room for.
+// share, infeasible [1] as on the CPU. capacity: of the list of pairs.
 template <class T>
-cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
-                    int multiprocessors, cudaStream_t stream);
+cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* infeasible,
+                    void* workspace, int multiprocessors, cudaStream_t stream);
 
 // constants [pairs, 8] (contact/narrow.h).
 template <class T>
-cudaError_t narrow(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
+cudaError_t refresh_gaps(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
 
 template <class T>
-int64_t keep_bytes(const contact::KeepInputs<T>& in);
+int64_t compact_list_bytes(const contact::KeepInputs<T>& in);
 template <class T>
-cudaError_t keep(const contact::KeepInputs<T>& in, const contact::Kept<T>& out, void* workspace, cudaStream_t stream);
+cudaError_t compact_list(const contact::KeepInputs<T>& in, const contact::Kept<T>& out, void* workspace,
+                         cudaStream_t stream);
 
 // own, out: [B, bodies, planes]
 template <class T>
@@ -109,25 +110,27 @@ cudaError_t reverse_coast(const contact::MotionInputs<T>& in, double chord, cons
 
 // islands: memory of islands_workspace_bytes().
 template <class T>
-cudaError_t find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work, void* islands, cudaStream_t stream);
+cudaError_t find_trust_radii(contact::RoomInputs<T> in, const contact::RoomWork<T>& work, void* islands,
+                             cudaStream_t stream);
 
-// Calls act(body, team) for all bodies of all scenes, a block for each.
+// Calls act(body, team) for all bodies of all scenes, a block each.
 template <class Act>
 cudaError_t act_on_bodies(const Act& act, cudaStream_t stream);
-// Calls act(scene, vertex) for all of them.
+// Calls act(scene, vertex) for all vertices of all scenes.
 template <class Act>
 cudaError_t act_on_vertices(const Act& act, cudaStream_t stream);
 
-// sums [B, bodies, 4] is for the kernels; u [B, bodies, 3]
+// u [B, bodies, 3]; sums [B, bodies, 4]: workspace
 template <class T>
 cudaError_t translation(const contact::TranslationInputs<T>& in, T* sums, T* u, cudaStream_t stream);
 
-// `zeroed` [B bodies (3 + 3 + 7 planes)]: rate, mean, adjoints of the planes by island. x_bar is zero at first.
+// zeroed [B bodies (3 + 3 + 7 planes)]: zero workspace for rate, mean and adjoints of the planes by island. x_bar is
+// zero at first.
 template <class T>
 cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed,
                                  T* move_bar, T* mass_bar, T* x_bar, T* planes_bar, cudaStream_t stream);
 
-// radii [B, V]; wishes [B, bodies] and most [B] are for the kernels
+// radii [B, V]; wishes [B, bodies], most [B]: workspace
 template <class T>
 cudaError_t sweep_radii(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream);
 

@@ -12,10 +12,10 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kPartsApart = 16;  // threads of a pair: one for each part of its work, in a half of a warp
+constexpr int kPartsApart = 16;  // threads of a pair, one for each part of its work, in half a warp
 static_assert(kWorkParts <= kPartsApart);
 
-// A listed pair: whether it pushes; those that do, few of them, in any order: how many, and which.
+// Marks whether a listed pair pushes, and lists those that do, in any order.
 template <class T>
 __device__ void find_pushing(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                              int64_t row, int32_t* count, int32_t* pushing) {
@@ -23,7 +23,7 @@ __device__ void find_pushing(const RigidInputs<T>& in, const VirtualMotions<T>& 
   out.pushes[row] = pushes;
   if (pushes) pushing[atomicAdd(count, 1)] = static_cast<int32_t>(row);
 }
-// A part of the work of one that does.
+// Work of one part of a pair that pushes.
 template <class T>
 __device__ void store_barrier(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                               int64_t row, int part) {
@@ -49,7 +49,7 @@ __device__ void sum_at_point(const RigidInputs<T>& in, const RigidWork<T>& work,
   if (lane == 0) store_at_point(sum, point, out);
 }
 
-// What a team does for a body, of that place: of the end of a correction, of its motion, and of its vertices.
+// Work of a team for a body: end of a correction, its motion, and its vertices.
 template <class T, class Team>
 __device__ void end_of_body(const RigidReverse<T>& r, const Body<T>& body, int64_t unit, const Team& team) {
   const int64_t at = kUnknowns * unit;
@@ -68,13 +68,14 @@ __device__ void vertices_of_body(const RigidInputs<T>& in, const RigidReverse<T>
   reverse_vertices(in, body, team, r.motions + at, r.solutions + at, r.way, r.sums, r.out);
 }
 
-// Memory of a block that solves for a group of so many bodies.
+// Shared memory of a block that solves for a group.
 template <int most>
 struct GroupSolve {
   double own[kUnknowns * most], diagonal[kUnknowns * most], blocks[kUnknowns * kUnknowns * most];
 };
 
-// x = factor^-T factor^-1 x of the group that begins at a place of a scene, by a block; zero of one that did not move.
+// x = factor^-T factor^-1 x of the group that begins at a place of a scene, by a block; zero for a group that did not
+// move.
 template <class T, int most>
 __device__ void solve_group(const RigidInputs<T>& in, int64_t scene, int32_t first, const double* factor, double* x,
                             GroupSolve<most>& memory) {
@@ -101,9 +102,9 @@ __device__ void solve_group(const RigidInputs<T>& in, int64_t scene, int32_t fir
   each([&](int32_t i) { at(i) = memory.own[i]; });
 }
 
-constexpr int64_t kBlocksOfPushing = 2048;  // which share the pairs that push, whose number only the device knows
+constexpr int64_t kBlocksOfPushing = 2048;  // blocks that loop over the pairs that push; only the device knows how many
 
-// The first row of blocks: the listed pairs; pushing: how many push, and which. The second: the lagged pairs.
+// First row of blocks: listed pairs; pushing: how many push, and which. Second row: lagged pairs.
 template <class T>
 __global__ void __launch_bounds__(kOne) rows_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given,
                                                     RigidWork<T> out, int32_t* pushing) {
@@ -112,7 +113,7 @@ __global__ void __launch_bounds__(kOne) rows_kernel(const __grid_constant__ Rigi
     if (row < out.listed) find_pushing(in, given, out, row, pushing, pushing + 1);
     return;
   }
-  // nobody reads the rows of what is not there: most of what a list has room for
+  // rows beyond the list are not read
   if (row < in.first_lagged(in.scene.scenes)) store_lagged(in, given, out, row);
 }
 
@@ -135,34 +136,18 @@ __global__ void __launch_bounds__(kOne)
   if (point < in.scene.scenes * in.gate.corners) sum_at_point(in, work, out, point);
 }
 
-// The body of a block, and its place.
-template <class T>
-struct Own {
-  int64_t unit;
-  Body<T> body;
-  __device__ explicit Own(const RigidInputs<T>& in)
-      : unit(blockIdx.x), body{in.scene, unit / in.bodies(), static_cast<int32_t>(unit % in.bodies())} {}
-};
-template <class T>
+enum BodyStage { kEnd, kMotion, kVertices };
+// A block for each body of each scene.
+template <class T, BodyStage stage>
 __global__ void __launch_bounds__(kThreads)
-    end_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
+    body_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
   __shared__ double part[kWarps][kMostSums];
-  const Own<T> own(in);
-  end_of_body(r, own.body, own.unit, BlockTeam{part});
-}
-template <class T>
-__global__ void __launch_bounds__(kThreads)
-    motion_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
-  __shared__ double part[kWarps][kMostSums];
-  const Own<T> own(in);
-  motion_of_body(in, r, own.body, own.unit, BlockTeam{part});
-}
-template <class T>
-__global__ void __launch_bounds__(kThreads)
-    vertices_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
-  __shared__ double part[kWarps][kMostSums];
-  const Own<T> own(in);
-  vertices_of_body(in, r, own.body, own.unit, BlockTeam{part});
+  const int64_t unit = blockIdx.x;
+  const Body<T> body{in.scene, unit / in.bodies(), static_cast<int32_t>(unit % in.bodies())};
+  const BlockTeam team{part};
+  if constexpr (stage == kEnd) end_of_body(r, body, unit, team);
+  if constexpr (stage == kMotion) motion_of_body(in, r, body, unit, team);
+  if constexpr (stage == kVertices) vertices_of_body(in, r, body, unit, team);
 }
 template <class T>
 __global__ void __launch_bounds__(kOne)
@@ -196,15 +181,15 @@ cudaError_t solve_groups(const RigidInputs<T>& in, const double* factor, double*
 
 template <class T>
 cudaError_t rigid_end_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
-  end_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  body_kernel<T, kEnd><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
   if (auto error = solve_groups(in, r.factor, r.solutions, stream)) return error;
-  motion_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  body_kernel<T, kMotion><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
   return cudaGetLastError();
 }
 
 template <class T>
 cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
-  vertices_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  body_kernel<T, kVertices><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
   const int64_t points = in.scene.scenes * (in.gate.corners - in.gate.vertices);
   if (points > 0) colliders_kernel<T><<<blocks_for(points, kOne), kOne, 0, stream>>>(in, r);
   return cudaGetLastError();
@@ -252,7 +237,7 @@ __global__ void __launch_bounds__(kThreads)
   };
   bool went = false;
   block.each(in.bodies(), [&](int32_t b) { went = went || r.shares[unit + b] != 0; });
-  if (!__syncthreads_or(went)) {  // a captured step makes all of its corrections, most of which move nothing
+  if (!__syncthreads_or(went)) {  // a captured step launches all corrections, and most move nothing
     const int64_t first = 3 * scene * in.scene.vertices;
     if (r.end_bar == r.out.vertices.x) return;
     return each(first, first + 3 * in.scene.vertices, [&](int64_t i) { r.out.vertices.x[i] = r.end_bar[i]; });
@@ -288,7 +273,7 @@ cudaError_t rigid_contact_backward(const RigidInputs<T>& in, const RigidReverse<
   const int64_t scenes = in.scene.scenes, rows = r.work.listed + r.work.lagged;
   if (scenes == 0 || in.bodies() == 0) return cudaSuccess;
   if (in.together() && scenes < kManyScenes && has_block_each(in.gate.corners, scenes, rows)) {
-    const int64_t pairs = std::max(rows, kPairsOfBlock * scenes * in.bodies());  // a block for each body at least
+    const int64_t pairs = std::max(rows, kPairsOfBlock * scenes * in.bodies());  // at least one block for each body
     return launch_clusters(scene_kernel<T>, scenes, pairs, kThreads, stream, in, r);
   }
   if (auto error = rigid_end_backward(in, r, stream)) return error;

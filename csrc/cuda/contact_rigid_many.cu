@@ -9,35 +9,35 @@ namespace {
 
 constexpr int kTeam = 256, kTeamWarps = kTeam / 32;
 constexpr int kOwn = kUnknowns + rigid::kSix;
-constexpr int kLines = 4;  // slips that a thread keeps while a step looks for its length
+constexpr int kLines = 4;  // tangential motions that a thread stores during a line search
 constexpr int kMostUnknowns = kUnknowns * kMostCoupled;
-constexpr int64_t kShared = 16;    // bodies up to which their matrix is in shared memory, where there are many groups
-constexpr int kStatic = 16 << 10;  // bytes of shared memory that are not for the matrix, at most
+constexpr int64_t kShared = 16;    // bodies whose matrix is in shared memory where there are many groups
+constexpr int kStatic = 16 << 10;  // bytes of static shared memory, at most
 
 using Warp = Tile<32>;
 
-// The system of a group.
+// Newton system of a group.
 template <class T>
 struct GroupSystem {
   const RigidInputs<T>& in;
-  PairRoom room;
+  PairCapacity capacity;
   int64_t scene;
   Groups groups;
   int32_t first, count;
   const int32_t* sides;
-  double *center, *motion, *steps, *press;        // of the scene's bodies; of all rows
-  double* rubbing;                                // [kRubScalars, lagged rows]
+  double *center, *motion, *steps, *forces;       // of the scene's bodies; of all rows
+  double* friction_rows;                          // [kFrictionScalars, lagged rows]
   int32_t* floors;                                // of the scene, as of GroupMemory
   double *base, *matrix, *gradient, *step, *own;  // own: the motion of the group
-  const uint64_t* touching;                       // [count] a bit for each body that a body touches,
-  const uint64_t* columns;  // [count] bits of the blocks of the factor that are not zero, below the diagonal
+  const uint64_t* touching;                       // [count] bit set of the bodies that a body touches
+  const uint64_t* columns;  // [count] bit set of the nonzero blocks of the factor below the diagonal
   const int32_t* rows;      // as of GroupMemory
-  const int32_t* begin;     // [count] where those of a body begin,
-  const int32_t* lagged;    // [count] those of lagged pairs among them,
-  const int32_t* end;       // [count] and where they end
-  int32_t* borne;           // [count] how often planes bear vertices of a body
+  const int32_t* begin;     // [count] begin of the rows of a body,
+  const int32_t* lagged;    // [count] of its lagged rows,
+  const int32_t* end;       // [count] and end
+  int32_t* borne;           // [count] contacts of a body's vertices with planes
   double (*part)[2];
-  int2 all_rows;  // where those of all begin and end
+  int2 all_rows;  // begin and end of the rows of all bodies
 
   __device__ int32_t size() const { return kUnknowns * count; }
   __device__ int32_t member(int32_t b) const { return groups.member(first + b); }
@@ -55,7 +55,7 @@ struct GroupSystem {
     for (auto i = static_cast<int32_t>(threadIdx.x); i < items; i += kTeam) f(i);
   }
   template <class F>
-  __device__ void each_body(const F& f) const {  // with a warp
+  __device__ void each_body(const F& f) const {  // a warp each
     for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kTeamWarps) f(b);
   }
   template <int n>
@@ -71,16 +71,16 @@ struct GroupSystem {
     }
   }
 
-  // No motion, and no factor.
+  // A group that does not move: no motion, no factor.
   __device__ void stay(double* factor) const {
     each(size(), [&](int32_t i) { unknown(motion, i) = 0; });
     each_body([&](int32_t b) {
       const Whole whole = whole_of(body(b), Warp());
       if (Warp().leads()) rigid::put(center + 3 * member(b), whole.center);
     });
-    if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
+    if (threadIdx.x == 0) *factor = CUDART_NAN;  // solving with it gives NaN
   }
-  // Adds to a body's gradient and its own part of a matrix, whose entries lanes have one each.
+  // Adds to the gradient and the diagonal block of a body; each lane has one entry.
   __device__ void put_own(double mine, int32_t b, double* to, double* gradients) const {
     const int32_t entry = Warp().lane - kUnknowns;
     if (entry < 0) gradients[kUnknowns * b + entry + kUnknowns] += mine;
@@ -89,7 +89,7 @@ struct GroupSystem {
     while (rigid::at6(i + 1, 0) <= entry) ++i;
     at(to, b, i, b, entry - rigid::at6(i, 0)) += mine;
   }
-  // Gradient and matrix of what acts on vertices alone but for friction; and which vertices planes bear.
+  // Gradient and matrix of vertices except friction, and contacts with planes.
   __device__ void add_vertices(int32_t b) const {
     const Body<T> own = body(b);
     const Warp warp;
@@ -126,7 +126,7 @@ struct GroupSystem {
     if (warp.leads()) borne[b] = found;
   }
   __device__ int32_t* floors_of(const Body<T>& own) const { return floors + in.planes * in.scene.ptr[own.body]; }
-  // Friction on planes, linear about where a body has gone.
+  // Friction on planes, linearized about the current motion.
   __device__ void add_floors(int32_t b, double* out) const {
     const Body<T> own = body(b);
     const Vector c = center_of(b);
@@ -139,24 +139,24 @@ struct GroupSystem {
       rigid::add_vertex(arm, g, H, out, out + kUnknowns);
     }
   }
-  // What a body's pairs of a list, and friction on planes, add to its own part of the matrix; and what the pairs add to
-  // the parts between it and bodies before it.
-  template <bool rubs>
+  // Contribution of a body's pairs of a list, and of friction on planes, to its diagonal block; and of the pairs to the
+  // blocks with earlier bodies.
+  template <bool lagged_rows>
   __device__ void add_pairs(int32_t b, double* of, double* gradients) const {
-    const int32_t from = rubs ? lagged[b] : begin[b], to = rubs ? end[b] : lagged[b];
+    const int32_t from = lagged_rows ? lagged[b] : begin[b], to = lagged_rows ? end[b] : lagged[b];
     const Vector c = center_of(b);
     const int lane = Warp().lane;
     double own[32] = {};
-    if constexpr (rubs) add_floors(b, own);
+    if constexpr (lagged_rows) add_floors(b, own);
     for (int32_t e = from + lane; e < to; e += 32) {
-      const PairPress a = press_of<rubs>(rows[e] >> 1);
+      const PairPress a = force_of<lagged_rows>(rows[e] >> 1);
       const int side = rows[e] & 1;
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
         own[j] += a.gradient(side, j, c);
-        const Vector pressed = a.stiffness * a.map(side, j, c);
+        const Vector force = a.stiffness * a.map(side, j, c);
 #pragma unroll
-        for (int i = j; i < kUnknowns; ++i) own[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
+        for (int i = j; i < kUnknowns; ++i) own[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), force);
       }
     }
     put_own(sums_by_lane(own), b, of, gradients);
@@ -167,15 +167,15 @@ struct GroupSystem {
       for (int32_t e = from + lane; e < to; e += 32) {
         const int32_t entry = rows[e];
         if (sides[entry ^ 1] != number) continue;
-        const PairPress a = press_of<rubs>(entry >> 1);
+        const PairPress a = force_of<lagged_rows>(entry >> 1);
         const int side = entry & 1;
 #pragma unroll
         for (int j = 0; j < kUnknowns; ++j) {
-          const Vector pressed = a.stiffness * a.map(1 - side, j, d);
+          const Vector force = a.stiffness * a.map(1 - side, j, d);
 #pragma unroll
           for (int i = 0; i < kUnknowns; ++i) {
             const int k = kUnknowns * i + j;
-            (k < 32 ? most[k % 32] : rest[k - 32 < 0 ? 0 : k - 32]) += dot(a.map(side, i, c), pressed);
+            (k < 32 ? most[k % 32] : rest[k - 32 < 0 ? 0 : k - 32]) += dot(a.map(side, i, c), force);
           }
         }
       }
@@ -188,34 +188,38 @@ struct GroupSystem {
       }
     }
   }
-  template <bool rubs>
-  __device__ PairPress press_of(int64_t row) const {
-    if constexpr (!rubs) return load_press(press + kPressDoubles * row, sides + 2 * row);
-    PairPress a = sides_of_rub(row);
-    a.force = rub_vector(kForce, row);
-    const auto s = [&](int k) { return rub(kStiffness + k, row); };
+  template <bool lagged_rows>
+  __device__ PairPress force_of(int64_t row) const {
+    if constexpr (!lagged_rows) return load_press(forces + kPressDoubles * row, sides + 2 * row);
+    PairPress a = friction_sides(row);
+    a.force = friction_vector(kForce, row);
+    const auto s = [&](int k) { return friction(kStiffness + k, row); };
     a.stiffness = {s(0), s(1), s(2), s(3), s(4), s(5)};
     return a;
   }
-  // A scalar, or three, of a row that rubs.
-  __device__ double& rub(int k, int64_t row) const { return rubbing[k * room.lagged + row - room.listed]; }
-  __device__ Vector rub_vector(int k, int64_t row) const { return {rub(k, row), rub(k + 1, row), rub(k + 2, row)}; }
-  __device__ void put_rub(int k, int64_t row, const Vector& a) const {
-    rub(k, row) = a.x, rub(k + 1, row) = a.y, rub(k + 2, row) = a.z;
+  // Scalar or vector of a lagged pair.
+  __device__ double& friction(int k, int64_t row) const {
+    return friction_rows[k * capacity.lagged + row - capacity.listed];
   }
-  // Where its sides are.
-  __device__ PairPress sides_of_rub(int64_t row) const {
+  __device__ Vector friction_vector(int k, int64_t row) const {
+    return {friction(k, row), friction(k + 1, row), friction(k + 2, row)};
+  }
+  __device__ void put_friction(int k, int64_t row, const Vector& a) const {
+    friction(k, row) = a.x, friction(k + 1, row) = a.y, friction(k + 2, row) = a.z;
+  }
+  // Sides of a lagged pair.
+  __device__ PairPress friction_sides(int64_t row) const {
     PairPress a;
     for (int side = 0; side < 2; ++side) {
       a.body[side] = sides[2 * row + side];
-      a.weight[side] = rub(kWeight + side, row), a.at[side] = rub_vector(kAt + 3 * side, row);
+      a.weight[side] = friction(kWeight + side, row), a.at[side] = friction_vector(kAt + 3 * side, row);
       a.pull[side] = a.torque[side] = Vector{};
     }
-    a.doubled = 1;  // all that rub a body are of its group
+    a.doubled = 1;  // all lagged pairs of a body are in its group
     return a;
   }
 
-  // Of what does not change, all blocks of a column that may not be zero.
+  // Copies the nonzero blocks of a column of the constant matrix.
   __device__ void copy_column(int32_t b) const {
     for (uint64_t blocks = columns[b] | uint64_t{1} << b; blocks != 0; blocks &= blocks - 1) {
       const int32_t row = __ffsll(static_cast<long long>(blocks)) - 1;
@@ -225,7 +229,7 @@ struct GroupSystem {
     }
   }
 
-  // What does not change as bodies move: all but friction and damping.
+  // Terms that do not change as bodies move: all but friction and damping.
   __device__ void assemble() const {
     each(size() * size(), [&](int32_t i) { base[i] = matrix[i] = 0; });
     each(size(), [&](int32_t i) { gradient[i] = own[i] = unknown(motion, i) = 0; });
@@ -236,41 +240,43 @@ struct GroupSystem {
     if (in.lag) {
       each_row([&](int64_t row) {
         PairPress a;
-        Rubbing rubs;
-        lagged_sides(in, row - room.listed, CornerPoints<T>{in, false}, -1, a, rubs);  // it acts, or had no row
-        put_rub(kNormal, row, rubs.n), put_rub(kSlipBefore, row, rubs.u);
-        rub(kLoad, row) = rubs.size, rub(kDamping, row) = rubs.damping, rub(kApproach, row) = rubs.approach;
+        Rubbing load;
+        lagged_sides(in, row - capacity.listed, CornerPoints<T>{in, false}, -1, a,
+                     load);  // rows exist only for pairs that act
+        put_friction(kNormal, row, load.n), put_friction(kTangentialBefore, row, load.u);
+        friction(kLoad, row) = load.size, friction(kDamping, row) = load.damping,
+                        friction(kApproach, row) = load.approach;
         for (int side = 0; side < 2; ++side) {
-          put_rub(kAt + 3 * side, row, a.at[side]);
-          rub(kWeight + side, row) = a.weight[side];
+          put_friction(kAt + 3 * side, row, a.at[side]);
+          friction(kWeight + side, row) = a.weight[side];
         }
       });
     }
     __syncthreads();
   }
-  // And these, linear about where bodies have gone.
+  // Friction and damping, linearized about the current motion.
   __device__ void add_friction() const {
     if (in.lag)
       each_row([&](int64_t row) {
-        PairPress a = sides_of_rub(row);
-        const Rubbing own = {rub_vector(kNormal, row), rub_vector(kSlipBefore, row), rub(kLoad, row),
-                             rub(kDamping, row), rub(kApproach, row)};
+        PairPress a = friction_sides(row);
+        const Rubbing own = {friction_vector(kNormal, row), friction_vector(kTangentialBefore, row),
+                             friction(kLoad, row), friction(kDamping, row), friction(kApproach, row)};
         contact::rub(own, way_of(a, {center, motion}), in.friction_eps, a);
-        put_rub(kForce, row, a.force), put_rub(kSlip, row, a.slip);
+        put_friction(kForce, row, a.force), put_friction(kTangential, row, a.slip);
         const Sym3<double>& s = a.stiffness;
         const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz};
-        for (int k = 0; k < 6; ++k) rub(kStiffness + k, row) = entries[k];
+        for (int k = 0; k < 6; ++k) friction(kStiffness + k, row) = entries[k];
       });
     __syncthreads();
     each_body([&](int32_t b) { add_pairs<true>(b, matrix, step); });
   }
-  // Calls f(row) for the lagged pairs, each once, in a thread's share.
+  // Calls f(row) for the lagged pairs of a thread, each once.
   template <class F>
   __device__ void each_row(const F& f) const {
     each(all_rows.y - all_rows.x, [&](int32_t i) {
       const int64_t row = rows[all_rows.x + i] >> 1;
       const int side = rows[all_rows.x + i] & 1;
-      if (row >= room.listed && side == (sides[2 * row] < 0 ? 1 : 0)) f(row);
+      if (row >= capacity.listed && side == (sides[2 * row] < 0 ? 1 : 0)) f(row);
     });
   }
 
@@ -290,7 +296,7 @@ struct GroupSystem {
       step[row] += sum;
     });
   }
-  // Of the matrix, of the step and of the motion after it: half of the first is what the step lowers the potential by.
+  // Energy norms of the step and of the motion after it; half of the first is the expected decrease.
   __device__ void energies(double* total) const {
     total[0] = total[1] = 0;
     each(size(), [&](int32_t j) {
@@ -310,13 +316,13 @@ struct GroupSystem {
     });
     reduce<2>(total);
   }
-  // Calls f(line) for what slips, in a thread's share.
+  // Calls f(line) for the tangential motions of a thread.
   template <class F>
   __device__ void each_line(const F& f) const {
     if (in.lag) {
       each_row([&](int64_t row) {
-        const Vector n = rub_vector(kNormal, row), way = way_of(sides_of_rub(row), {center, steps});
-        f(SlipLine(rub_vector(kSlip, row), way - dot(n, way) * n, rub(kLoad, row), in.friction_eps));
+        const Vector n = friction_vector(kNormal, row), way = way_of(friction_sides(row), {center, steps});
+        f(SlipLine(friction_vector(kTangential, row), way - dot(n, way) * n, friction(kLoad, row), in.friction_eps));
       });
     }
     if (in.planes == 0) return;
@@ -353,7 +359,7 @@ struct GroupSystem {
 
   __device__ void solve(Pivots& pivots) const {
     Settling state = kOnItsWay;  // the same for all threads
-    const bool slips = in.rubs(scene);
+    const bool has_friction = in.rubs(scene);
     for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
       each_body([&](int32_t b) { copy_column(b); });
       each(size(), [&](int32_t i) { step[i] = gradient[i]; });
@@ -371,23 +377,23 @@ struct GroupSystem {
       each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });
       __syncthreads();
       double of[2] = {0, 0};
-      if (slips) energies(of);
-      const double taken = settle(state, slips, of[0], of[1], [&](double fall) { return share(fall); });
+      if (has_friction) energies(of);
+      const double taken = settle(state, has_friction, of[0], of[1], [&](double fall) { return share(fall); });
       each(size(), [&](int32_t i) { unknown(motion, i) = own[i] += taken * step[i]; });
       __syncthreads();
     }
   }
 };
 
-// Memory of a group, shared.
+// Shared memory of a group.
 struct Lists {
   int32_t begin[kMostCoupled], lagged[kMostCoupled], end[kMostCoupled], borne[kMostCoupled];  // as of GroupSystem
   int32_t place[kMostCoupled], member[kMostCoupled];
   uint64_t touching[kMostCoupled], columns[kMostCoupled];  // as of GroupSystem
 };
 
-// The order in which bodies are eliminated, by a warp: always next the one that touches the fewest of those left, and
-// then these touch one another. Two bodies a lane, which keeps whom they touch.
+// Minimum-degree order of elimination, by a warp: next is the body that touches the fewest remaining ones, which then
+// touch one another. A lane keeps the neighbours of two bodies.
 __device__ void find_order(int32_t count, Lists& lists) {
   const int lane = static_cast<int>(threadIdx.x % 32);
   uint64_t own[2], left = count < 64 ? (uint64_t{1} << count) - 1 : ~uint64_t{0};
@@ -410,7 +416,7 @@ __device__ void find_order(int32_t count, Lists& lists) {
     if (lane == 0) lists.place[next] = step, lists.columns[step] = rest;
   }
   __syncwarp();
-  // what was found by number, by place
+  // bit sets by number become bit sets by place
   const auto by_place = [&](uint64_t bits) {
     uint64_t out = 0;
     for (; bits != 0; bits &= bits - 1) out |= uint64_t{1} << lists.place[__ffsll(static_cast<long long>(bits)) - 1];
@@ -422,7 +428,7 @@ __device__ void find_order(int32_t count, Lists& lists) {
   }
 }
 
-// Brings the rows of a group into their order, and its bodies into that of their elimination.
+// Sorts the rows of a group and orders its bodies for elimination.
 template <class T>
 __device__ void find_order(const GroupSystem<T>& system, const GroupRows<T>& rows, int32_t* ordered, Lists& lists) {
   const int32_t count = system.count, n = system.groups.bodies;
@@ -443,11 +449,11 @@ __device__ void find_order(const GroupSystem<T>& system, const GroupRows<T>& row
   __syncthreads();
 }
 
-// fits: unknowns whose matrix fits into the dynamic shared memory.
+// fits: unknowns whose matrix fits into dynamic shared memory.
 template <class T>
-__global__ void __launch_bounds__(kTeam)
-    groups_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory,
-                  int32_t* ordered, double* center, double* motion, double* factors, int32_t fits) {
+__global__ void __launch_bounds__(kTeam) groups_kernel(const __grid_constant__ RigidInputs<T> in, PairCapacity capacity,
+                                                       const __grid_constant__ GroupMemory memory, int32_t* ordered,
+                                                       double* center, double* motion, double* factors, int32_t fits) {
   __shared__ double part[kTeamWarps][2], vectors[3][kMostUnknowns];
   __shared__ Lists lists;
   __shared__ Pivots pivots;
@@ -460,12 +466,12 @@ __global__ void __launch_bounds__(kTeam)
   const int32_t count = groups.count(first), size = kUnknowns * count;
   if (count <= kFew || count > in.room) return;
   const int64_t at = in.matrix_size() * scene + groups.matrix(first);
-  const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
-  // shared, as there are not enough registers for it
+  const GroupRows<T> rows{in, capacity, memory, scene, groups, first, count};
+  // in shared memory for lack of registers
   alignas(GroupSystem<T>) __shared__ unsigned char bytes[sizeof(GroupSystem<T>)];
   if (threadIdx.x == 0) {
     new (bytes) GroupSystem<T>{in,
-                               room,
+                               capacity,
                                scene,
                                groups,
                                first,
@@ -474,8 +480,8 @@ __global__ void __launch_bounds__(kTeam)
                                center + 3 * n * scene,
                                motion + kUnknowns * n * scene,
                                memory.steps + kUnknowns * n * scene,
-                               memory.press,
-                               memory.rubbing,
+                               memory.forces,
+                               memory.friction,
                                memory.floors + scene * in.scene.vertices * in.planes,
                                memory.bases + at,
                                size <= fits ? matrix : factors + at,
@@ -504,7 +510,7 @@ __global__ void __launch_bounds__(kTeam)
 }  // namespace
 
 template <class T>
-cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory,
+cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairCapacity& capacity, const GroupMemory& memory,
                                  int32_t* ordered, double* center, double* motion, double* factors,
                                  cudaStream_t stream) {
   int device = 0, room_for = 0, processors = 0;
@@ -513,16 +519,16 @@ cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room,
   if (auto error = cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device)) return error;
   const int64_t largest = most_grouped(in.bodies());
   const auto blocks = static_cast<unsigned>(in.scene.scenes * in.bodies());
-  // where there are many, a multiprocessor has several at once
+  // with many groups a multiprocessor runs several blocks at once
   const int64_t most_shared = blocks > 2 * processors ? kShared : kMostCoupled;
   auto unknowns = static_cast<int32_t>(kUnknowns * (largest < most_shared ? largest : most_shared));
   const auto bytes_of = [](int32_t n) { return static_cast<int>(n * n * sizeof(double)); };
   while (unknowns > 0 && bytes_of(unknowns) + kStatic > room_for) unknowns -= kUnknowns;
-  // the same for all scenes, which other threads may be about to launch
+  // the same value for all launches: other threads may launch concurrently
   const auto most = cudaFuncAttributeMaxDynamicSharedMemorySize;
   if (auto error = cudaFuncSetAttribute(groups_kernel<T>, most, room_for - kStatic)) return error;
   groups_kernel<T>
-      <<<blocks, kTeam, bytes_of(unknowns), stream>>>(in, room, memory, ordered, center, motion, factors, unknowns);
+      <<<blocks, kTeam, bytes_of(unknowns), stream>>>(in, capacity, memory, ordered, center, motion, factors, unknowns);
   return cudaGetLastError();
 }
 

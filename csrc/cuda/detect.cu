@@ -12,21 +12,21 @@ namespace {
 using namespace contact;
 
 constexpr int kWarp = 32;
-// Leaves that one thread finds for a query; a block takes over from there. Few queries leave threads idle.
+// Leaves that one thread visits for a query before a block takes over. Few queries leave threads idle.
 constexpr int kMostHits = 96, kMostHitsOfFew = 12;
 constexpr int64_t kFewQueries = 65536;
-constexpr int kStepsTogether = 8;    // of a traversal, before the threads of a warp look at what they have found
-constexpr int kHeavyBlocks = 512;    // that share the queries with more
-constexpr int32_t kSubtrees = 4096;  // parts of a tree that the threads of such a block share
-constexpr int64_t kCandidates = 2;   // kept by the first search for each pair that fits
+constexpr int kStepsTogether = 8;    // steps of a traversal before the warp examines its leaves
+constexpr int kHeavyBlocks = 512;    // blocks for the queries with more leaves
+constexpr int32_t kSubtrees = 4096;  // parts of a tree for the threads of such a block
+constexpr int64_t kCandidates = 2;   // candidates that the first search keeps, per pair of the capacity
 
-// A query whose search goes on at `node`.
+// Query whose search continues at `node`.
 struct Heavy {
   int64_t query;
   int32_t node;
 };
 
-// Views of the workspace; without memory, its size.
+// Parts of the workspace; without memory, its size.
 template <class T>
 struct Workspace {
   Forest forest{};
@@ -71,18 +71,17 @@ __device__ bool kept_all(const Workspace<T>& work, int64_t capacity) {
   return *work.found <= static_cast<unsigned long long>(kCandidates * capacity);
 }
 
-// Puts a key into a list of `room`. One addition for all threads that are here together.
-__device__ void append(unsigned long long* count, unsigned long long* list, int64_t room, uint64_t key) {
+// Appends a key to a list, with one atomic for all threads that are here together.
+__device__ void append(unsigned long long* count, unsigned long long* list, int64_t capacity, uint64_t key) {
   const unsigned together = __activemask(), lane = threadIdx.x % 32;
   const int leader = __ffs(static_cast<int>(together)) - 1;
   unsigned long long first = 0;
   if (static_cast<int>(lane) == leader) first = atomicAdd(count, static_cast<unsigned long long>(__popc(together)));
   const unsigned long long place = __shfl_sync(together, first, leader) + __popc(together & ((1U << lane) - 1));
-  if (place < static_cast<unsigned long long>(room)) list[place] = key;
+  if (place < static_cast<unsigned long long>(capacity)) list[place] = key;
 }
 
-// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs; that one
-// lists.
+// One of two searches: first for the near gaps of all corner points, then for the near pairs, which also lists.
 template <class T, bool listing>
 struct Search {
   const Surfaces<T>& in;
@@ -110,7 +109,7 @@ struct Search {
     }
   }
 
-  // Of a pair that may be listed.
+  // Second search of a pair that may be listed.
   __device__ void settle(const Candidate& c, const PairGap<T>& of) const {
     const auto [gap, begins, least] = of;
     const Constants<T> constants = constants_of(in, c);
@@ -126,15 +125,15 @@ struct Search {
     if (is_listed(in, c, least, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
 
-  // Of a point that is not finite: it counts as touching, so that nobody takes the scene for a good one.
-  __device__ void meet_nothing() const { atomicAdd(&work.touching[0], 1ULL); }
+  // A point that is not finite counts as touching, so that the scene is not taken for valid.
+  __device__ void count_nonfinite() const { atomicAdd(&work.touching[0], 1ULL); }
 
-  // What query q looks for: those of points come first, in the order of the forest.
+  // Query q: first those of points, then those of edges, in the order of the forest.
   struct Query {
     Box box;
     int64_t scene;
     int kind;
-    int32_t leaf;  // of an edge: its own
+    int32_t leaf;  // own leaf of an edge
   };
   __device__ Query query(int64_t q) const {
     const Forest& forest = work.forest;
@@ -166,7 +165,7 @@ struct Search {
     }
   }
 
-  // Nodes from..end of the tree, leaves from `first` on.
+  // Nodes [from, end) of the tree, leaves from `first` on.
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first) const {
     const Near near(*this, q);
     each_leaf(near.nodes, work.forest.leaves[q.kind], from, end, near, [&](int32_t leaf) {
@@ -175,7 +174,7 @@ struct Search {
     });
   }
 
-  // Whether a node may hold what the query looks for.
+  // Whether a node may contain a candidate.
   struct Near {
     const Surfaces<T>& in;
     const Box* nodes;
@@ -187,20 +186,20 @@ struct Search {
           box(q.box),
           reach(squared_reach(search.in, q.scene, q.box.group)) {}
     __device__ bool operator()(const Box& node) const {
-      const float square = distance2(node, box);  // most are out of any reach
+      const float square = distance2(node, box);  // rejects most nodes
       return square <= reach.any && square <= reach.to(node.group) && !in.ignores(box.group, node.group);
     }
   };
 };
 
-// Leaves that the threads of a warp have found and not yet looked at, and whose they are.
+// Leaves that a warp has found and not yet examined, and their finders.
 struct Finds {
   int32_t leaf[2 * kWarp], item[kWarp], scene[kWarp];
   uint8_t finder[2 * kWarp], kind[kWarp];
 };
 
-// A thread for each query. Threads that walk through a tree find leaves at different times, and few at once: a warp
-// collects them, and looks at as many as it has threads.
+// A thread for each query. Threads find leaves at different times, so a warp collects them and examines as many as it
+// has threads.
 template <class T, bool listing>
 __global__ void __launch_bounds__(kThreads)
     search_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity, int64_t queries, int most_hits) {
@@ -213,17 +212,17 @@ __global__ void __launch_bounds__(kThreads)
   const auto q = search.query(i < queries ? i : queries - 1);
   bool walks = i < queries;
   if (walks && is_empty(q.box)) {
-    if (!listing && q.kind == kPointTriangle) search.meet_nothing();
+    if (!listing && q.kind == kPointTriangle) search.count_nonfinite();
     walks = false;
   }
-  // Each pair of edges once: an edge looks to the right of it in the tree.
+  // Each pair of edges once: an edge looks to its right in the tree.
   int32_t node = q.kind == kEdgeEdge ? next_node(q.leaf) : kRoot;
   walks = walks && !(q.kind == kEdgeEdge && node == kRoot);
   finds.item[lane] = q.box.item, finds.scene[lane] = static_cast<int32_t>(q.scene);
   finds.kind[lane] = static_cast<uint8_t>(q.kind);
   const typename Search<T, listing>::Near near(search, q);
   const int32_t leaves = work.forest.leaves[q.kind];
-  int hits = 0, count = 0;  // count: of all threads of the warp
+  int hits = 0, count = 0;  // count: of the warp
   for (bool goes_on = true; goes_on || count > 0;) {
     int32_t leaf = -1;
     for (int step = 0; step < kStepsTogether && walks && leaf < 0; ++step) {
@@ -256,7 +255,7 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// The rest of the searches with many hits, a block for each: its threads share the tree.
+// Rest of the searches with many leaves, a block for each.
 template <class T, bool listing>
 __global__ void heavy_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity) {
   const Search<T, listing> search{in, work, capacity};
@@ -273,7 +272,7 @@ __global__ void heavy_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
   }
 }
 
-// Points and planes, a thread for each point. Apart from the other searches, which would take more registers with it.
+// Points and planes, a thread for each point; separate, because the other searches would need more registers with it.
 template <class T, bool listing>
 __global__ void __launch_bounds__(kThreads)
     planes_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity, int64_t points) {
@@ -312,17 +311,18 @@ void launch_search(const Surfaces<T>& in, const Workspace<T>& work, int64_t capa
   launch_planes<T, listing>(in, work, capacity, stream);
 }
 
-constexpr int64_t kMostCompared = int64_t{1} << 23;  // boxes, of all scenes
-constexpr int32_t kMostScanned = 2048;               // that one query is compared with
+constexpr int64_t kMostCompared = int64_t{1} << 23;  // comparisons of all scenes
+constexpr int32_t kMostScanned = 2048;               // comparisons of a query
 
 template <class T>
 bool is_scanned(const Surfaces<T>& in) {
   const int64_t edges = in.num_edges, triangles = in.num_triangles, points = in.num_points;
   return edges <= kMostScanned && triangles <= kMostScanned &&
-         in.scenes * (points * (triangles + kWarp) + edges * (edges / 2 + kWarp)) <= kMostCompared;  // a warp at least
+         in.scenes * (points * (triangles + kWarp) + edges * (edges / 2 + kWarp)) <=
+             kMostCompared;  // at least a warp each
 }
 
-// A warp for each query: it looks at what it finds as soon as there is some for each of its threads.
+// A warp for each query: it examines leaves as soon as each of its threads has one.
 template <class T, bool listing>
 __global__ void __launch_bounds__(kThreads)
     scan_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity, int64_t queries) {
@@ -335,7 +335,7 @@ __global__ void __launch_bounds__(kThreads)
   const Search<T, listing> search{in, work, capacity};
   const auto q = search.query(i);
   if (is_empty(q.box)) {
-    if (!listing && q.kind == kPointTriangle && lane == 0) search.meet_nothing();
+    if (!listing && q.kind == kPointTriangle && lane == 0) search.count_nonfinite();
     return;
   }
   const typename Search<T, listing>::Near near(search, q);
@@ -365,7 +365,7 @@ void launch_scan(const Surfaces<T>& in, const Workspace<T>& work, int64_t capaci
   launch_planes<T, listing>(in, work, capacity, stream);
 }
 
-constexpr int64_t kMostCounted = 20480;  // pairs that fit, mostly twice as many as there are
+constexpr int64_t kMostCounted = 20480;  // capacity, mostly twice the number of pairs
 constexpr int64_t kMostPoints = 2048;    // corner points of all scenes
 constexpr unsigned kRankBlocks = 264;
 
@@ -374,14 +374,14 @@ bool is_counted(const Surfaces<T>& in, int64_t capacity) {
   return 0 < capacity && capacity <= kMostCounted && in.scenes * in.corners <= kMostPoints;
 }
 
-// Pairs in the list, of those that it needs.
+// Pairs in the list.
 template <class T>
 __device__ int32_t pairs_of(const Workspace<T>& work, const Detected<T>& out) {
   const auto needed = static_cast<int64_t>(*work.listed);
   return static_cast<int32_t>(needed < out.capacity ? needed : out.capacity);
 }
 
-// Rows of the list: a warp for each key.
+// Rows of the list, a warp for each key.
 template <class T>
 __global__ void __launch_bounds__(kThreads) rank_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
   const int32_t count = pairs_of(work, out), lane = threadIdx.x % kWarp;
@@ -400,8 +400,8 @@ __global__ void __launch_bounds__(kThreads) rank_kernel(const Surfaces<T> in, Wo
   }
 }
 
-// Calls f(pair, its four corner points among those of all scenes) for the pairs [first, last), one for each lane of a
-// warp; the points are -1 where a lane has none.
+// Calls f(pair, four corner points among those of all scenes) for the pairs [first, last), one for each lane of a warp;
+// -1 where a lane has none.
 template <class T, class F>
 __device__ void each_pair(const Surfaces<T>& in, const Detected<T>& out, int32_t first, int32_t last, const F& f) {
   const int32_t lane = threadIdx.x % kWarp;
@@ -414,8 +414,8 @@ __device__ void each_pair(const Surfaces<T>& in, const Detected<T>& out, int32_t
   }
 }
 
-// ptr and entries of a corner point, by a block, each warp of which looks at a part of the list: how many entries those
-// before it have, and its own.
+// ptr and entries of a corner point, by a block whose warps search one part of the list each: number of entries of
+// earlier points, and own entries.
 template <class T>
 __device__ void list_entries(const Surfaces<T>& in, const Detected<T>& out, int64_t point, int32_t count) {
   constexpr int warps = kThreads / kWarp;
@@ -467,10 +467,9 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
   }
 }
 
-// --- results
-// ----------------------------------------------------------------------------------------------------------
+// --- results ---
 
-// Rows of the list; the corner points of its pairs to be sorted.
+// Rows of the list, and their corner points for the sort.
 template <class T>
 __global__ void list_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
   const int64_t i = own_item();
@@ -487,7 +486,7 @@ __global__ void list_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T>
   }
 }
 
-// The near pair of a corner point, and the smallest gap of its scene.
+// Near pair of a corner point, and smallest gap of its scene.
 template <class T>
 __device__ void store_corner(const Surfaces<T>& in, const Workspace<T>& work, const Detected<T>& out, int64_t point) {
   const int64_t scene = point / in.corners;
@@ -496,7 +495,7 @@ __device__ void store_corner(const Surfaces<T>& in, const Workspace<T>& work, co
   lower(work.smallest + scene, work.near_gap[point]);
 }
 
-// ptr, by bisection of the sorted corner points; near pairs; smallest gaps.
+// ptr by bisection of the sorted corner points, near pairs, and smallest gaps.
 template <class T>
 __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
   const int64_t i = own_item(), rows = in.scenes * in.corners;
@@ -514,15 +513,15 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
   if (i < rows) store_corner(in, work, out, i);
 }
 
-// Of few pairs: what corner_kernel() does, and the entries, by a block for each corner point.
+// The same and the entries for few pairs, a block for each corner point.
 template <class T>
 __global__ void __launch_bounds__(kThreads) entry_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
-  const int64_t i = blockIdx.x;  // up to the number of points, which belongs to none
+  const int64_t i = blockIdx.x;  // the last block only closes ptr
   list_entries(in, out, i, pairs_of(work, out));
   if (i < in.scenes * in.corners && threadIdx.x == 0) store_corner(in, work, out, i);
 }
 
-// What a pair's neighbourhood suggests, once the near pairs are there.
+// Hints from the neighbourhood of a pair, once near pairs are known.
 template <class T>
 __global__ void hint_kernel(const Surfaces<T> in, Detected<T> out) {
   const int64_t i = own_item();
@@ -538,7 +537,7 @@ __global__ void finish_kernel(int64_t scenes, Workspace<T> work, Detected<T> out
   out.counts[2] = static_cast<int64_t>(work.touching[1]), out.counts[3] = 0;  // kNoKey is -1
 }
 
-// Rows and entries of many pairs, sorted; what each corner point has.
+// Sorted rows and entries of many pairs, and ptr.
 template <class T>
 cudaError_t sort_list(const Surfaces<T>& in, const Workspace<T>& work, const Detected<T>& out, cudaStream_t stream) {
   const int64_t rows = in.scenes * in.corners, capacity = out.capacity;

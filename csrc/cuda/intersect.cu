@@ -7,7 +7,7 @@ namespace {
 
 using namespace contact;
 
-// Views of the workspace; without memory, its size.
+// Parts of the workspace; without memory, its size.
 struct Workspace {
   Forest forest{};
   unsigned long long (*first)[2];          // [B] smallest key of a crossing, and of a point behind a plane
@@ -34,7 +34,7 @@ __device__ __forceinline__ unsigned long long* count_of(const Intersections& out
   return reinterpret_cast<unsigned long long*>(out.counts + 2 * scene + kind);
 }
 
-// unused: the key of rows that no crossing fills, above those of all crossings
+// unused: key of empty rows, above those of all crossings.
 static __global__ void start_intersections(Workspace work, Intersections out, int64_t scenes, uint64_t unused) {
   const int64_t i = own_item();
   if (i < out.capacity) work.keys[i] = unused;

@@ -8,13 +8,13 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr int kThreads = 128;
-constexpr int kShortList = 24;  // neighbors of a point that are sorted in its thread's own memory
+constexpr int kShortList = 24;  // neighbors of a point that a thread sorts in its own memory
 
-// Views of the workspace; without memory, its size.
+// Parts of the workspace; without memory, its size.
 template <class T>
 struct Workspace {
   int32_t* start;  // of each bucket
-  int64_t* first;  // of the pairs of each row; until they are summed, their number
+  int64_t* first;  // of the pairs of each row; before the sum, their number
   int32_t* rank;   // of each row among those of its bucket
   uint32_t* bucket;
   GridPoint<T>* sorted;
@@ -47,7 +47,7 @@ __global__ void count_buckets(const T* points, int32_t n, int64_t rows, HashGrid
   if (!isfinite(p[0]) || !isfinite(p[1]) || !isfinite(p[2])) *work.infinite = 1;
   const uint32_t bucket = grid.bucket(p, static_cast<uint32_t>(row / n));
   work.bucket[row] = bucket;
-  // In no fixed order; the list of each point is sorted in the end.
+  // In any order; the list of each point is sorted in the end.
   work.rank[row] = atomicAdd(&work.start[bucket], 1);
 }
 
@@ -59,7 +59,7 @@ __global__ void sort_points(const T* points, int64_t rows, Workspace<T> work) {
   work.sorted[work.start[work.bucket[row]] + work.rank[row]] = {p[0], p[1], p[2], static_cast<int32_t>(row)};
 }
 
-// visit(row) for each later neighbor of a point in its scene.
+// Calls visit(row) for each later neighbor of a point in its scene.
 template <class T, class F>
 __device__ __forceinline__ void each_later_neighbor(const GridPoint<T>& p, int32_t n, T squared, const HashGrid& grid,
                                                     const Workspace<T>& work, const F& visit) {
@@ -72,7 +72,7 @@ __device__ __forceinline__ void each_later_neighbor(const GridPoint<T>& p, int32
   });
 }
 
-// One thread for a point, in sorted order: neighboring threads read the same memory.
+// A thread for each point in sorted order: neighboring threads read the same memory.
 template <class T>
 __global__ void count_pairs(int32_t n, int64_t rows, T squared, HashGrid grid, Workspace<T> work) {
   const int64_t at = own_item();
@@ -147,7 +147,7 @@ template <class T>
 cudaError_t neighbor_pairs(const T* points, int64_t scenes, int64_t n, double radius, int32_t* pairs, int64_t max_pairs,
                            int64_t* count, void* workspace, cudaStream_t stream) {
   const int64_t rows = scenes * n;
-  const auto of_scene = static_cast<int32_t>(n);  // as rows fit, and 32-bit division is the faster
+  const auto of_scene = static_cast<int32_t>(n);  // rows fit, and 32-bit division is faster
   const HashGrid grid(radius, rows);
   Workspace<T> work(grid, rows, workspace);
   const T squared = static_cast<T>(radius) * static_cast<T>(radius);

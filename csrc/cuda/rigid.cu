@@ -6,7 +6,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-// What a kernel does to a body: the correction, or its transpose.
+// Actions of the kernels on a body: the correction and its transpose.
 template <class T, bool energies>
 struct Forward {
   static constexpr bool keeps_record = false, computes = energies;
@@ -72,7 +72,7 @@ namespace {
 using coarse::kBlockTets, coarse::kDegree, coarse::RiseInputs;
 using rigid::Body, rigid::Vector;
 
-// The tet of a lane of a block: h^2 times the coefficients of its energy along the way.
+// Coefficients of h^2 times the energy of a lane's tet along the displacement.
 template <class T>
 __device__ void tet_line(const RiseInputs<T>& in, int64_t scene, int64_t block, int lane, double (&c)[kDegree]) {
   constexpr int kRest = kRestScalars, kMaterial = kTetScalars;
@@ -92,9 +92,9 @@ __device__ void tet_line(const RiseInputs<T>& in, int64_t scene, int64_t block, 
   for (double& power : c) power *= in.bodies.time_step * in.bodies.time_step;
 }
 
-// A thread for each tet, then for each listed vertex: rise and size of each block of tets, and of each vertex.
+// Increase and magnitude of each block of tets and of each listed vertex, a thread for each tet and vertex.
 template <class T>
-__global__ void __launch_bounds__(kThreads) rise_of_parts(const __grid_constant__ RiseInputs<T> in, double* parts) {
+__global__ void __launch_bounds__(kThreads) increase_of_parts(const __grid_constant__ RiseInputs<T> in, double* parts) {
   const int64_t item = own_item(kThreads);
   const int64_t tets = in.bodies.scenes * in.blocks * kBlockTets, rows = in.blocks + in.listed;
   if (item < tets) {
@@ -102,7 +102,7 @@ __global__ void __launch_bounds__(kThreads) rise_of_parts(const __grid_constant_
     const int lane = static_cast<int>(item % kBlockTets);
     double c[kDegree] = {};
     tet_line(in, scene, block, lane, c);
-    // blocks begin at multiples of kBlockTets: all lanes of one are here
+    // blocks begin at multiples of kBlockTets: all their lanes are here
     const unsigned mask = ((1u << kBlockTets) - 1) << (threadIdx.x % 32 / kBlockTets * kBlockTets);
     butterfly<kDegree, kBlockTets>(mask, c);
     if (lane != 0) return;
@@ -114,7 +114,7 @@ __global__ void __launch_bounds__(kThreads) rise_of_parts(const __grid_constant_
   const int64_t row = item - tets;
   if (row >= in.bodies.scenes * in.listed) return;
   const int64_t scene = row / in.listed, place = row % in.listed;
-  const Body<T> all{in.bodies, scene, 0};  // which body it is of does not matter here
+  const Body<T> all{in.bodies, scene, 0};  // any body will do
   const int32_t v = in.bodies.order[place];
   double sum[3] = {0, 0, 0};
   rigid::add_rise(all, v, Body<T>::at(in.to + 3 * all.row(v)), sum);
@@ -125,7 +125,7 @@ __global__ void __launch_bounds__(kThreads) rise_of_parts(const __grid_constant_
 // A block for each body of each scene.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    rise_of_bodies(const __grid_constant__ RiseInputs<T> in, const double* parts, double* out) {
+    increase_of_bodies(const __grid_constant__ RiseInputs<T> in, const double* parts, double* out) {
   __shared__ double part[kWarps][kMostSums];
   const int32_t n = in.bodies.bodies, k = static_cast<int32_t>(blockIdx.x % n);
   const double* own = parts + 2 * (blockIdx.x / n) * (in.blocks + in.listed);
@@ -142,17 +142,17 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class T>
-cudaError_t potential_rise(const RiseInputs<T>& in, double* workspace, double* out, cudaStream_t stream) {
+cudaError_t energy_increase(const RiseInputs<T>& in, double* workspace, double* out, cudaStream_t stream) {
   const int64_t bodies = in.bodies.scenes * in.bodies.bodies;
   if (bodies == 0) return cudaSuccess;
   const int64_t items = in.bodies.scenes * (in.blocks * kBlockTets + in.listed);
   if (items > 0) {
-    rise_of_parts<T><<<blocks_for(items, kThreads), kThreads, 0, stream>>>(in, workspace);
+    increase_of_parts<T><<<blocks_for(items, kThreads), kThreads, 0, stream>>>(in, workspace);
   }
-  rise_of_bodies<T><<<static_cast<unsigned>(bodies), kThreads, 0, stream>>>(in, workspace, out);
+  increase_of_bodies<T><<<static_cast<unsigned>(bodies), kThreads, 0, stream>>>(in, workspace, out);
   return cudaGetLastError();
 }
 
-DIFFVBD_INSTANTIATE(potential_rise)
+DIFFVBD_INSTANTIATE(energy_increase)
 
 }  // namespace diffvbd::cuda

@@ -10,8 +10,8 @@
 
 namespace diffvbd::cuda {
 
-// To be called by all threads, before they read what an earlier kernel may write and before any of them ends. Then two
-// kernels at most are on the device at once: what was written before the one before is there in any case.
+// Waits for the previous kernel. All threads must call it before they read what an earlier kernel may write and before
+// any of them ends. At most two kernels are then on the device, so the writes of earlier ones are visible.
 __device__ __forceinline__ void wait_for_previous() {
 #if __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.wait;" ::: "memory");
@@ -19,9 +19,9 @@ __device__ __forceinline__ void wait_for_previous() {
 #endif
 }
 
-// Whether a kernel that calls it may follow another: it waits where it was compiled for such a device, as are then all
-// kernels that were compiled with it. Older drivers cannot capture such launches.
-inline bool can_follow(const void* kernel) {
+// Whether a kernel that calls it may be a dependent launch: it waits where it was compiled for such a device, and so do
+// all kernels compiled with it. Older drivers cannot capture such launches.
+inline bool can_depend(const void* kernel) {
   constexpr int kCaptured = 12030;  // CUDA 12.3
   cudaFuncAttributes of{};
   int driver = 0;
@@ -30,20 +30,19 @@ inline bool can_follow(const void* kernel) {
 }
 
 inline cudaError_t launch(const void* kernel, unsigned blocks, dim3 threads, void** arguments, size_t shared,
-                          cudaStream_t stream, bool follows) {
+                          cudaStream_t stream, bool dependent) {
   cudaLaunchAttribute attribute{};
   attribute.id = cudaLaunchAttributeProgrammaticStreamSerialization;
   attribute.val.programmaticStreamSerializationAllowed = 1;
   cudaLaunchConfig_t config{};
   config.gridDim = dim3(blocks), config.blockDim = threads;
   config.dynamicSmemBytes = shared, config.stream = stream;
-  config.attrs = &attribute, config.numAttrs = follows ? 1 : 0;
+  config.attrs = &attribute, config.numAttrs = dependent ? 1 : 0;
   return cudaLaunchKernelExC(&config, kernel, arguments);
 }
 
-// All threads of a cooperative launch wait for each other; `turn` counts the meetings. The arrival releases what the
-// block wrote; no acquire follows, which would empty the L1 cache of the mesh's data too: what other blocks write is
-// read from the L2 cache alone (load_state).
+// Barrier of a cooperative launch; `turn` counts arrivals. The arrival releases the block's writes. No acquire follows,
+// which would flush mesh data from the L1 cache: values of other blocks are read from the L2 cache only (load_state).
 __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) {
   __syncthreads();
   turn += gridDim.x;
@@ -57,7 +56,7 @@ __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) 
   __syncthreads();
 }
 
-// Calls visit(scene, sweep, block, part, begin, end) for the warps' share of each color, whose blocks are [begin, end),
+// Calls visit(scene, sweep, block, part, begin, end) for the warps' part of each color, whose blocks are [begin, end),
 // with barriers between colors.
 template <class T, int lanes_, class Visit>
 __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& range, bool backward, Visit&& visit) {
@@ -89,9 +88,8 @@ __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& ra
   }
 }
 
-// The same where a block has a vertex at a time: visit(scene, sweep, block, part, begin, end) of all of a color, and
-// then(...) of all, unless `twice` is false. All threads of a block call them together. Where launches have a color
-// each, then() has one to itself.
+// The same for a block per vertex: visit(...) of all of a color, then then(...) of all unless `twice` is false. All
+// threads of a block call them together. Launches of one color leave then() to a launch of its own.
 template <class T, class Visit, class Then>
 __device__ __forceinline__ void each_color_by_blocks(const StepView<T>& s, const Range& range, bool backward,
                                                      const Visit& visit, const Then& then, bool twice = true) {

@@ -5,7 +5,7 @@
 namespace diffvbd::cuda {
 
 constexpr int kWarp = 32, kMostThreads = 1024;
-constexpr int kVertices = 4;  // of a body on average that a thread looks at before the block becomes larger
+constexpr int kVertices = 4;  // average vertices per thread above which the block becomes larger
 
 // A power of two.
 inline int threads_for(int64_t vertices, int64_t bodies) {
@@ -14,7 +14,7 @@ inline int threads_for(int64_t vertices, int64_t bodies) {
   return threads;
 }
 
-// The team of such a block, for up to kSums numbers at once.
+// Team of a block, for up to kSums numbers at once.
 struct BodyBlock {
   static constexpr int kSums = 8;
   double (*part)[kSums];  // [kMostThreads / kWarp], shared
@@ -46,7 +46,7 @@ struct BodyBlock {
     __syncthreads();
     return own;
   }
-  // The numbers of each warp, once all are there.
+  // Sums of all warps, in shared memory.
   template <int n>
   __device__ void share(const double* own) const {
     static_assert(n <= kSums);

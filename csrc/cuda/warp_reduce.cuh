@@ -7,9 +7,8 @@ namespace diffvbd::cuda {
 
 constexpr unsigned kWholeWarp = 0xffffffffu;
 
-// Adds to each of n numbers that of the lane whose number differs in one bit, `offset`. All at once: shuffles stay in
-// the order in which they are written, and with one number after another each round would wait for the one before.
-// `mask` has, with each lane, the one that it adds from.
+// Adds to each of n numbers that of the lane at distance `offset` (exclusive or). All shuffles come first: they keep
+// the written order, and each addition in between would wait. mask: has both lanes.
 template <int n, class T>
 __device__ __forceinline__ void add_from(T (&a)[n], int offset, unsigned mask = kWholeWarp) {
   T other[n];
@@ -19,7 +18,7 @@ __device__ __forceinline__ void add_from(T (&a)[n], int offset, unsigned mask = 
   for (int k = 0; k < n; ++k) a[k] = a[k] + other[k];
 }
 
-// Makes part[0] the sum of part [threads] in a fixed order: of a block, thread 0 may read it then.
+// Makes part[0] the sum of part [threads] in a fixed order; thread 0 may read it.
 template <int threads, class Term, class Add>
 __device__ __forceinline__ void reduce_block(Term* part, const Add& add) {
   for (int half = threads / 2; half > 0; half /= 2) {
@@ -28,7 +27,7 @@ __device__ __forceinline__ void reduce_block(Term* part, const Add& add) {
   }
 }
 
-// Sum of what the threads of a block have, at thread 0, always in the same order.
+// Sum over the threads of a block in a fixed order, valid at thread 0.
 template <class Term, class Add>
 __device__ Term block_sum(Term own, Term* part, const Add& add) {
   const unsigned t = threadIdx.x;

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from diffvbd.ops import contact_start
 
-# pairs, room for them, corner points of all scenes; on CUDA short lists go another way (csrc/cuda/keep.cu)
+# pairs, room for them, corner points of all scenes; on CUDA short lists go another way (csrc/cuda/compact_list.cu)
 SIZES = {"none": (0, 0, 7), "empty": (0, 200, 7), "few": (300, 300, 40), "room": (2_900, 5_000, 900),
          "limit": (32_768, 32_768, 4_096), "pairs": (33_000, 40_000, 900), "corners": (300, 400, 4_097)}  # fmt: skip
 

@@ -31,7 +31,7 @@ Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time
     const int64_t b = in.scenes, edge = cuda::kEdge;
     const Tensor inverse = empty(x_prev, {b, int64_t{9} * p.cells});
     const auto doubles = [&](int64_t count) { return empty(x_prev, {count}, ScalarType::Double); };
-    const Tensor turn = doubles(b * p.groups * cuda::kTurn), sums = doubles(b * 9 * p.cells),
+    const Tensor turn = doubles(b * p.groups * cuda::kGroupScalars), sums = doubles(b * 9 * p.cells),
                  panel = doubles(b * 6 * p.functions * edge), block = doubles(b * p.bodies * edge * edge);
     check(
         cuda::coarse_inverse<T>(in, {data<double>(turn), data<double>(sums), data<double>(panel), data<double>(block)},
@@ -54,7 +54,7 @@ std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) co
     const Tensor x_bar = empty(x_prev, {in.scenes, in.vertices, 3}),
                  stiffness_bar = empty(x_prev, {stiffnesses, p.groups, 3, 3, p.width, p.width}),
                  mass_bar = empty(x_prev, {in.scenes, p.cells}),
-                 turn = empty(x_prev, {in.scenes * p.groups * cuda::kTurn}, ScalarType::Double);
+                 turn = empty(x_prev, {in.scenes * p.groups * cuda::kGroupScalars}, ScalarType::Double);
     check(cuda::coarse_inverse_vjp<T>(in, data<const T>(bar), data<double>(turn), data<T>(x_bar),
                                       data<T>(stiffness_bar), data<T>(mass_bar), current_stream(x_prev)),
           "the adjoint of the matrices of a coarse space");

@@ -58,8 +58,8 @@ std::tuple<Tensor, Tensor> contact_rubbing(const Tensor& x, const Tensor& origin
     const auto by = diffvbd::lag_coefficients<T>(friction, damping, x);
     Tensor lag = empty(x, {pairs.size(0), contact::kLagScalars}), push = empty(x, {x.size(0), in.corners, 3});
     const Tensor slots = empty(x, {pairs.size(0), cuda::kLagSlots});
-    check(cuda::rubbing<T>(in, by, data<const T>(x), x.size(0), pairs.size(0), data<T>(lag), data<T>(slots),
-                           data<T>(push), current_stream(x)),
+    check(cuda::lagged_friction<T>(in, by, data<const T>(x), x.size(0), pairs.size(0), data<T>(lag), data<T>(slots),
+                                   data<T>(push), current_stream(x)),
           "the lag of pairs");
     return std::make_tuple(lag, push);
   });
@@ -82,8 +82,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rubbing_backward(const Tensor
     Tensor friction_bar = empty(x, {friction.numel() ? b : 0}), damping_bar = empty(x, {damping.numel() ? b : 0});
     const auto wanted = [](Tensor& t) { return t.numel() ? data<T>(t) : nullptr; };
     const Tensor slots = empty(x, {pairs.size(0), cuda::kLagSlots});
-    check(cuda::rubbing_backward<T>(in, by, given, data<const T>(x), b, pairs.size(0), data<T>(slots), data<T>(points),
-                                    data<T>(kappa_bar), wanted(friction_bar), wanted(damping_bar), current_stream(x)),
+    check(cuda::lagged_friction_backward<T>(in, by, given, data<const T>(x), b, pairs.size(0), data<T>(slots),
+                                            data<T>(points), data<T>(kappa_bar), wanted(friction_bar),
+                                            wanted(damping_bar), current_stream(x)),
           "the lag of pairs");
     return std::make_tuple(points, kappa_bar, friction_bar, damping_bar);
   });

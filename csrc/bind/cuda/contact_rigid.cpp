@@ -20,7 +20,7 @@ using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-cuda::PairRoom room_of(const TouchingFields& f) {
+cuda::PairCapacity room_of(const TouchingFields& f) {
   return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
 }
 

@@ -90,7 +90,7 @@ Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& colli
     using T = decltype(scalar);
     const auto in = diffvbd::narrow_inputs<T>(x, origin, collider, room, pairs, constants, ptr);
     Tensor out = empty(x, {pairs.size(0), contact::kConstants});
-    check(cuda::narrow<T>(in, pairs.size(0), data<T>(out), current_stream(x)), "what a list can still reach");
+    check(cuda::refresh_gaps<T>(in, pairs.size(0), data<T>(out), current_stream(x)), "what a list can still reach");
     return out;
   });
 }
@@ -105,8 +105,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_keep(const Tensor& ke
     const diffvbd::KeptLists lists(
         ptr, constants.scalar_type(), in.count,
         [&](const std::vector<int64_t>& shape, ScalarType dtype) { return empty(constants, shape, dtype); });
-    const Tensor work = empty(constants, {cuda::keep_bytes(in)}, ScalarType::Byte);
-    check(cuda::keep<T>(in, lists.pointers<T>(), work.data_ptr(), current_stream(constants)), "a part of a list");
+    const Tensor work = empty(constants, {cuda::compact_list_bytes(in)}, ScalarType::Byte);
+    check(cuda::compact_list<T>(in, lists.pointers<T>(), work.data_ptr(), current_stream(constants)),
+          "a part of a list");
     return lists.tensors();
   });
 }

@@ -103,7 +103,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
                                 {dhat, share, least, self_contact});
     const auto bytes = static_cast<int64_t>(cuda::islands_workspace_bytes<T>(islands));
     const Tensor work = empty(x, {bytes}, ScalarType::Byte);
-    check(cuda::find_rooms<T>(in, out.pointers<T>(in), work.data_ptr(), current_stream(x)), "rooms of bodies");
+    check(cuda::find_trust_radii<T>(in, out.pointers<T>(in), work.data_ptr(), current_stream(x)), "rooms of bodies");
     return out.tensors();
   });
 }

@@ -27,8 +27,8 @@ Tensor potential_rise(const Tensor& x, const Tensor& to, const Tensor& x_prev, c
     const auto in = diffvbd::rise_inputs<T>({x, x_prev, y, mass, energy_data, origin, order, ptr, order, other}, to,
                                             material, rest, corner, block_ptr, data_count, time_step);
     const Tensor out = cuda::empty(x, {in.bodies.scenes, in.bodies.bodies, 2}, ScalarType::Double);
-    const Tensor work = cuda::empty(x, {cuda::rise_workspace(in)}, ScalarType::Double);
-    cuda::check(cuda::potential_rise(in, data<double>(work), data<double>(out), cuda::current_stream(x)),
+    const Tensor work = cuda::empty(x, {cuda::energy_increase_workspace(in)}, ScalarType::Double);
+    cuda::check(cuda::energy_increase(in, data<double>(work), data<double>(out), cuda::current_stream(x)),
                 "the rise of potentials");
     return out;
   });
