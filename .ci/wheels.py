@@ -11,6 +11,7 @@ that the wheel runs on; it follows from the system that builds, so releases are 
 
 import argparse
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -109,7 +110,7 @@ def check_sdist(path: Path) -> None:
         described = archive.extractfile(f"{top}/PKG-INFO").read().decode()
     wanted = {file.relative_to(ROOT).as_posix() for file in (ROOT / "csrc").rglob("*") if file.is_file()}
     wanted |= {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
-    wanted |= {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "setup.py", "pyproject.toml"}
+    wanted |= {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "setup.py", "pyproject.toml", "diffvbd/py.typed"}
     demand(not wanted - names, f"{path.name} lacks {sorted(wanted - names)}")
     relative = re.findall(r"\]\((?![a-z]+:)[^)]*\)", described)
     demand(not relative, f"{path.name}: its description has links that lead nowhere on a package index: {relative}")
@@ -126,14 +127,16 @@ def check_wheel(path: Path, cuda: bool) -> None:
     sources = {f"diffvbd/{file.relative_to(ROOT).as_posix()}" for file in (ROOT / "csrc").rglob("*") if file.is_file()}
     # messages name these
     sources |= {f"diffvbd/docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
+    sources.add("diffvbd/py.typed")
     demand(sources <= set(names), f"{path.name} lacks {sorted(sources - set(names))}")
     for end in ("licenses/LICENSE", "entry_points.txt"):
         demand(any(name.endswith(end) for name in names), f"{path.name} lacks {end}")
 
 
 def try_all(pythons: list[str], torches: list[str], job: list[str]) -> None:
-    wheels = [path for path in DIST.glob("*.whl") if "+" not in path.name]
-    demand(len(wheels) == 1, f"expected one CPU wheel in {DIST}, found {[path.name for path in wheels]}")
+    machine = platform.machine()
+    wheels = [path for path in DIST.glob(f"*_{machine}.whl") if "+" not in path.name]
+    demand(len(wheels) == 1, f"expected one CPU wheel for {machine} in {DIST}, found {[path.name for path in wheels]}")
     rows = [try_one(python, torch, wheels[0], job) for python in pythons for torch in torches]
     print("\n| Python | torch | result | job | import |\n|---|---|---|---|---|")
     for row in rows:

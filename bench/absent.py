@@ -73,7 +73,6 @@ class Feature:
 FLOOR, PAIRS = dv.FloorBarrier(height=-50.0), dv.PairBarrier(self_contact=False)
 FEATURES: dict[str, Feature] = {
     "coarse corrections": Feature(model={"coarse": "auto"}),
-    "acceleration": Feature(model={"acceleration": dv.Anderson(5)}),
     "SDIRK2": Feature(step={"integrator": dv.SDIRK2()}),
     "BDF2": Feature(step={"integrator": dv.BDF2()}),
     "rigid correction": Feature(pinned=False),

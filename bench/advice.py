@@ -22,7 +22,7 @@ from bench import common
 from bench.advice_fit import fit
 from bench.advice_scenes import Scene, drawn
 from bench.common import markdown_table
-from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, pilots_of
+from diffvbd.rollout.tune import FRAMES, Pilot, Pilots, pilots_of
 
 ERRORS = (0.1, 0.01, 0.001)
 SCENES, GRADIENTS, EXHAUSTIVE = 30, 12, 12  # of the drawn scenes, from the first

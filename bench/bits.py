@@ -37,7 +37,7 @@ def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
     for name, make in ({} if quick else contact_scenes.SCENES).items():
         for tape in ("full", "compact"):
             scene = make()
-            found, _ = contact_scenes.compiled(scene, STEPS, SWEEPS, tape, scene.model.to(device))
+            found, _ = contact_scenes.compiled(scene, STEPS, scene.solver(SWEEPS, tape=tape), scene.model.to(device))
             rows[f"contact: {name}, {tape} tape"] = digest(found)
     rows |= {name: of_solver(make, device) for name, make in ({} if quick else SOLVERS).items()}
     rollouts = bits_rollouts.rows(device).items()
@@ -48,14 +48,14 @@ def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
 def of_case(name: str, device: str, dtype: torch.dtype = torch.float64, tape: str = "full") -> str:
     """The hash of one case of `testing.CASES` on the mesh with shuffled vertices."""
     scene = testing.build_scene(name, "random", "small")
-    model = scene.model(device).to(dtype=dtype)
+    model, solver = scene.model(device).to(dtype=dtype), scene.solver(SWEEPS, tape=tape)
 
     def rollout(x: Tensor, v: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
         for _ in range(STEPS):
-            x, v = dv.step(model, x, v, sweeps=SWEEPS, adjoint=dv.ReverseSweep(tape=tape), **options)
+            x, v = dv.step(model, x, v, solver, **options)
         return x, v
 
-    return digest(testing.evaluate(rollout, scene.inputs(dtype, device)))
+    return digest(testing.evaluate(rollout, scene.inputs(dtype, device), solver.time_step))
 
 
 def of_vertices(device: str) -> str:
@@ -64,8 +64,8 @@ def of_vertices(device: str) -> str:
     near = dv.FloorBarrier(height=-0.01, kappa=2e4, dhat=0.05)
     model = dv.Model(box, energies=(near, dv.Anchor(50.0)), device=device)
     x = model.rest_points
-    inputs = {"x": x + 0.004 * torch.sin(9 * x.flip(-1)), "v": torch.cos(7 * x), "time_step": 1 / 60}
-    return digest(testing.evaluate(lambda **given: dv.step(model, mu=1e4, lam=1e4, sweeps=SWEEPS, **given), inputs))
+    inputs, solver = {"x": x + 0.004 * torch.sin(9 * x.flip(-1)), "v": torch.cos(7 * x)}, dv.VBD(1 / 60, SWEEPS)
+    return digest(testing.evaluate(lambda **given: dv.step(model, solver=solver, **given), inputs, solver.time_step))
 
 
 def of_solver(make: Callable[..., Any], device: str) -> str:
@@ -73,7 +73,7 @@ def of_solver(make: Callable[..., Any], device: str) -> str:
     mesh = dv.mesh.box((3, 4, 3), (0.2, 0.3, 0.2), split="kuhn")
     solver = make(mesh, pinned=mesh.points[:, 1] < 0.01, device=device)
     inputs = testing.on_device(generality.scene(mesh, make(mesh, pinned=mesh.points[:, 1] < 0.01)), device)
-    return digest(testing.evaluate(lambda **given: solver.step(**given, sweeps=SWEEPS), inputs))
+    return digest(testing.evaluate(lambda **given: solver.step(**given, sweeps=SWEEPS), inputs, inputs["time_step"]))
 
 
 def digest(values: dict[str, Tensor]) -> str:

@@ -14,10 +14,12 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import testing
+from diffvbd.checks import input_name
 from diffvbd.testing import contact_scenes
 from diffvbd.testing.contact_scenes import noise
 
 Values = dict[str, Tensor]
+STEP = 0.01  # [s]
 SPACE = dv.CoarseSpace(functions=6, groups=2, every=2)
 NEAR = dv.FloorBarrier(height=-0.012, kappa=3e4, dhat=0.02, damping=2.0)
 TOUCHING = (NEAR, dv.PairBarrier(kappa=3e4, dhat=0.02, damping=2.0), dv.Friction(0.4, 0.05))
@@ -28,36 +30,35 @@ def rows(device: str) -> dict[str, Callable[[], Values]]:
     """What each row computes. On CUDA there are some more: of steps captured as a graph."""
     euler, sdirk2, bdf2 = dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2()
     bar, three = partial(beam, device), partial(bodies, device)
-    corrected = {"coarse": "auto", "relaxation": 1.5}
+    corrected = {"subspace": "coarse", "relaxation": 1.5}
     low = {"dtype": torch.float32}
     out: dict[str, Callable[[], Values]] = {
-        "coarse": lambda: end(bar(**corrected)),
-        "coarse, one modulus": lambda: end(bar(**corrected), of_one=True),
-        "coarse, compact tape": lambda: end(bar(**corrected), adjoint=dv.ReverseSweep(tape="compact")),
-        "coarse, float32": lambda: end(bar(**corrected, **low)),
-        "coarse, three bodies over a floor": lambda: end(three(coarse=SPACE, energies=(NEAR,))),
-        "coarse, a batch": lambda: end(three(coarse=SPACE), batch=(2,)),
-        "coarse and acceleration": lambda: end(bar(**corrected, acceleration=dv.Anderson(2)), sweeps=9),
+        "coarse": lambda: end(bar(), **corrected),
+        "coarse, one modulus": lambda: end(bar(), of_one=True, **corrected),
+        "coarse, compact tape": lambda: end(bar(), tape="compact", **corrected),
+        "coarse, float32": lambda: end(bar(**low), **corrected),
+        "coarse, three bodies over a floor": lambda: end(three(energies=(NEAR,)), subspace=SPACE),
+        "coarse, a batch": lambda: end(three(), batch=(2,), subspace=SPACE),
         "SDIRK2": lambda: end(bar(), sweeps=8, integrator=sdirk2),
-        "SDIRK2, coarse": lambda: end(bar(**corrected), sweeps=12, integrator=sdirk2),
+        "SDIRK2, coarse": lambda: end(bar(), sweeps=12, integrator=sdirk2, **corrected),
         "SDIRK2, pairs": lambda: end(three(energies=TOUCHING), sweeps=8, integrator=sdirk2),
         "BDF2": lambda: end(bar(), steps=4, integrator=bdf2),
-        "BDF2, coarse": lambda: end(bar(**corrected), steps=4, sweeps=8, integrator=bdf2),
+        "BDF2, coarse": lambda: end(bar(), steps=4, sweeps=8, integrator=bdf2, **corrected),
         "BDF2, pairs": lambda: end(three(energies=TOUCHING), steps=3, integrator=bdf2),
         "checkpoints": lambda: end(bar(), steps=5, checkpoint_every=2),
         "checkpoints, BDF2, coarse": lambda: end(
-            bar(**corrected), steps=5, sweeps=8, integrator=bdf2, checkpoint_every=2
+            bar(), steps=5, sweeps=8, integrator=bdf2, checkpoint_every=2, **corrected
         ),
         "checkpoints, pairs": lambda: end(three(energies=TOUCHING), steps=4, checkpoint_every=2),
         "binomial checkpoints": lambda: end(bar(), steps=6, checkpoint_every=dv.BinomialCheckpoints(2)),
         "inputs of each step": lambda: driven(bar()),
         "a pile of five": lambda: end(pile(device)),
-        "a pile of five, coarse": lambda: end(pile(device, coarse=SPACE)),
-        "a pile of five, coarse, float32": lambda: end(pile(device, coarse=SPACE, **low)),
-        "two sheets, coarse": lambda: end(sheets(device, coarse="auto")),
+        "a pile of five, coarse": lambda: end(pile(device), subspace=SPACE),
+        "a pile of five, coarse, float32": lambda: end(pile(device, **low), subspace=SPACE),
+        "two sheets, coarse": lambda: end(sheets(device), subspace="coarse"),
         "solve": lambda: solved(bar()),
         "solve, executed sweeps": lambda: solved(bar(), adjoint=dv.ReverseSweep()),
-        "solve, coarse": lambda: solved(bar(**corrected)),
+        "solve, coarse": lambda: solved(bar(), **corrected),
         "solve, SDIRK2": lambda: solved(bar(), integrator=sdirk2),
         "solve, pairs": lambda: solved(three(energies=TOUCHING), tolerance=1e-3, adjoint=dv.ReverseSweep()),
         "global adjoint": lambda: end(bar(), sweeps=60, integrator=euler, adjoint=dv.GlobalAdjoint()),
@@ -68,9 +69,9 @@ def rows(device: str) -> dict[str, Callable[[], Values]]:
         out[f"contact: {name}, coarse"] = partial(of_contact, name, device, torch.float64, SPACE)
     if torch.device(device).type == "cuda":
         out["captured"] = lambda: captured(bar())
-        out["captured, coarse"] = lambda: captured(bar(**corrected))
+        out["captured, coarse"] = lambda: captured(bar(), **corrected)
         out["captured, pairs"] = lambda: captured(three(energies=TOUCHING))
-        out["captured, pairs, coarse"] = lambda: captured(three(energies=TOUCHING, coarse=SPACE))
+        out["captured, pairs, coarse"] = lambda: captured(three(energies=TOUCHING), subspace=SPACE)
     return out
 
 
@@ -124,28 +125,21 @@ def inputs_of(model: dv.Model, batch: tuple[int, ...] = (), *, of_one: bool = Fa
     else:
         density = 1000 * torch.exp(noise("bits", "density", shape=per_tet[-1:], size=0.1))
         values |= {**ranged, "density": density, "rest_points": rest}
-    parameters = {f"{e.name}.{k}": t for e in model.parametric_energies for k, t in model.constants(e).items()}
-    parameters = {k: t for k, t in parameters.items() if k.endswith((".kappa", ".damping", ".coefficient"))}
-    if parameters:
-        values["parameters"] = parameters
-
-    def cast(value: Any) -> Any:
-        return (
-            {k: cast(t) for k, t in value.items()} if isinstance(value, dict) else value.to(model.device, model.dtype)
-        )
-
-    return cast(values) | {"time_step": 0.01}
+    constants = {input_name(e, k): t for e in model.parametric_energies for k, t in model.constants(e).items()}
+    values |= {k: t for k, t in constants.items() if k == "friction" or k.endswith(("_kappa", "_damping"))}
+    return {name: value.to(model.device, model.dtype) for name, value in values.items()}
 
 
 def end(model: dv.Model, *, steps: int = 2, sweeps: int = 5, batch: tuple[int, ...] = (), of_one: bool = False,
-        **options: Any) -> Values:  # fmt: skip
-    """Of a rollout."""
+        adjoint: Any = None, checkpoint_every: Any = "auto", **options: Any) -> Values:  # fmt: skip
+    """Of a rollout; options are those of the solver."""
 
     def rolled(**given: Any) -> tuple[Tensor, Tensor]:
-        motion = dv.rollout(model, steps=steps, sweeps=sweeps, save="last", check_start=False, **given, **options)
+        motion = dv.rollout(model, solver=dv.VBD(STEP, sweeps, **options), steps=steps, save="last", adjoint=adjoint,
+                            checkpoint_every=checkpoint_every, checks=dv.Checks(start=False), **given)  # fmt: skip
         return motion.x[-1], motion.v[-1]
 
-    return testing.evaluate(rolled, inputs_of(model, batch, of_one=of_one))
+    return testing.evaluate(rolled, inputs_of(model, batch, of_one=of_one), STEP)
 
 
 def driven(model: dv.Model, steps: int = 4) -> Values:
@@ -155,33 +149,34 @@ def driven(model: dv.Model, steps: int = 4) -> Values:
     inputs["mu"], inputs["force"] = (factors.reshape(-1, *[1] * inputs[k].dim()) * inputs[k] for k in ("mu", "force"))
 
     def rolled(*, mu: Tensor, force: Tensor, prescribed: Tensor, **given: Any) -> tuple[Tensor, Tensor]:
-        motion = dv.rollout(model, steps=steps, sweeps=4, checkpoint_every=2, mu=dv.per_step(mu),
+        motion = dv.rollout(model, solver=dv.VBD(STEP, 4), steps=steps, checkpoint_every=2, mu=dv.per_step(mu),
                             force=dv.per_step(force), prescribed=lambda step, x, v: prescribed + 1e-4 * step,
                             **given)  # fmt: skip
         return motion.x[-1], motion.v[-1]
 
-    return testing.evaluate(rolled, inputs)
+    return testing.evaluate(rolled, inputs, STEP)
 
 
-def solved(model: dv.Model, **options: Any) -> Values:
+def solved(model: dv.Model, *, adjoint: Any = None, tolerance: float = 1e-8, **options: Any) -> Values:
     """Of a converged step."""
 
     def run(**given: Any) -> tuple[Tensor, Tensor]:
-        found = dv.solve(model, **{"tolerance": 1e-8, **options}, **given)
+        found = dv.solve(model, solver=dv.VBD(STEP, 1, **options), tolerance=tolerance, adjoint=adjoint, **given)
         return found.x, found.v
 
-    return testing.evaluate(run, inputs_of(model))
+    return testing.evaluate(run, inputs_of(model), STEP)
 
 
-def of_contact(name: str, device: str, dtype: torch.dtype, coarse: Any = None) -> Values:
+def of_contact(name: str, device: str, dtype: torch.dtype, subspace: Any = "rigid") -> Values:
     """Of a scene of the tests."""
     scene = contact_scenes.SCENES[name]()
     m = scene.model
-    model = dv.Model(m.mesh, energies=m.energies, pinned=m.pinned, colliders=m.colliders, coarse=coarse)
-    return contact_scenes.compiled(replace(scene, model=model), 2, 6, "full", model.to(device, dtype))[0]
+    model = dv.Model(m.mesh, energies=m.energies, pinned=m.pinned, colliders=m.colliders)
+    solver = scene.solver(6, tape="full", subspace=subspace)
+    return contact_scenes.compiled(replace(scene, model=model), 2, solver, model.to(device, dtype))[0]
 
 
-def captured(model: dv.Model) -> Values:
+def captured(model: dv.Model, **options: Any) -> Values:
     """Of two steps whose forward and backward are one CUDA graph, replayed twice."""
     inputs = inputs_of(model)
     side = torch.cuda.Stream()
@@ -190,16 +185,15 @@ def captured(model: dv.Model) -> Values:
     def rolled(**given: Any) -> tuple[Tensor, Tensor]:
         x, v = given.pop("x"), given.pop("v")
         for _ in range(2):
-            x, v = dv.step(model, x, v, sweeps=5, **given)
+            x, v = dv.step(model, x, v, dv.VBD(STEP, 5, **options), **given)
         return x, v
 
-    leaves = {name: t.clone().requires_grad_() for name, t in inputs.items() if isinstance(t, Tensor)}
-    constant = {name: value for name, value in inputs.items() if name not in leaves}
+    leaves = {name: t.clone().requires_grad_() for name, t in inputs.items()}
     weights = torch.cos(torch.arange(leaves["x"].numel(), device=model.device, dtype=model.dtype))
     weights = weights.reshape(leaves["x"].shape)
 
     def run() -> tuple[Tensor, ...]:
-        x, v = rolled(**leaves, **constant)
+        x, v = rolled(**leaves)
         return x, v, *torch.autograd.grad((weights * (x + 0.01 * v)).sum(), list(leaves.values()))
 
     with torch.cuda.stream(side):

@@ -54,7 +54,6 @@ GROUPS: dict[str, Group] = {
     "grip": lambda quick, device: [piles.grip(20, seconds=0.15, device=device)] if quick else [
         *(piles.grip(k, device=device) for k in (20, 40, 100, 400)),
         *(piles.grip(k, device=device, faster={"coarse": "auto"}) for k in (8, 20, 40)),
-        *(piles.grip(k, device=device, faster={"acceleration": dv.Anderson(5)}) for k in (20, 40)),
     ],
     "gradient": lambda quick, device: [
         scenes.slide_gradient(surface, speed, device=device)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bench import paper
 from bench.common import markdown_table
-from diffvbd.tasks import Problem, Settings, Stage, cube_bounce, solve
+from diffvbd.tasks import Problem, Settings, Stage, bounce, solve
 from diffvbd.tasks.bounce import Bounce
 
 SWEEPS = (5, 20, 100)
@@ -51,7 +51,7 @@ def study(sweeps: int, starts: int, iterations: int, converged: int) -> dict[str
     """The task from its own start and from others, all in one batch: scenes over one mesh never mix."""
     with tempfile.TemporaryDirectory() as folder:
         settings = Settings(Path(folder))
-        scene, judge = (cube_bounce.scene(settings, k) for k in (sweeps, converged))
+        scene, judge = (bounce.scene(settings, k) for k in (sweeps, converged))
         batch = Batch(scene, first_states(starts))
         history = solve(batch.problem(iterations), settings).history
     with torch.no_grad():
@@ -75,7 +75,7 @@ def study(sweeps: int, starts: int, iterations: int, converged: int) -> dict[str
 
 def first_states(starts: int) -> Tensor:
     """Offsets [m] and velocities [m/s], shape [1 + starts, 2, 3]: the task's own, then jittered ones."""
-    own = torch.tensor([(0.0, cube_bounce.HEIGHT, 0.0), cube_bounce.VELOCITY], dtype=torch.float64)
+    own = torch.tensor([(0.0, bounce.HEIGHT, 0.0), bounce.VELOCITY], dtype=torch.float64)
     noise = torch.randn((starts, 2, 3), generator=torch.Generator().manual_seed(SEED), dtype=torch.float64)
     states = torch.cat([own[None], own * (1 + JITTER * noise)])
     states[:, 0] -= own[0]
@@ -93,7 +93,7 @@ class Batch:
 
     def loss(self) -> Tensor:
         # Adam treats each number alone, but Stage.clip would scale all scenes by one number
-        states = clipped(self.states, cube_bounce.CLIP)
+        states = clipped(self.states, bounce.CLIP)
         squared = self.scene.squared_miss(*states.unbind(1))
         self.distances = squared.detach().sqrt()
         better = self.distances < self.least
@@ -102,7 +102,7 @@ class Batch:
         return squared.sum()
 
     def problem(self, iterations: int) -> Problem:
-        stage = Stage(loss=self.loss, iterations=iterations, learning_rate=cube_bounce.LEARNING_RATE, refinable=False)
+        stage = Stage(loss=self.loss, iterations=iterations, learning_rate=bounce.LEARNING_RATE, refinable=False)
         return Problem(
             name=f"cube-bounce, {self.scene.sweeps} sweeps",
             parameters={"states": self.states},

@@ -1,6 +1,6 @@
 """Extreme inputs, of what is beside the elastic solver: is a rollout finite, does it gain energy, is it said where so?
 
-Rollouts of 20 steps with coarse corrections, Anderson acceleration, integrators, floors, colliders, pairs and friction,
+Rollouts of 20 steps with coarse corrections, integrators, floors, colliders, pairs and friction,
 each over the extremes of `AXES`. Nothing drives them but gravity, so none may gain energy. A case is *silent* where its
 end is of no use - not finite, with more than 5 % more energy, a gradient that is not finite - and nothing was raised
 and nothing warned of. The gradient of a loss of the end, along a random direction of velocity and stiffness, is held
@@ -85,8 +85,6 @@ FEATURES: dict[str, tuple[str, dict[str, Any], Any]] = {
     "plain, free": ("free", {}, None),
     "coarse, pinned": ("pinned", {"coarse": "auto"}, None),
     "coarse, free": ("free", {"coarse": "auto", "relaxation": 1.5}, None),
-    "Anderson, pinned": ("pinned", {"acceleration": dv.Anderson(5)}, None),
-    "coarse and Anderson, free": ("free", {"coarse": "auto", "acceleration": dv.Anderson(5)}, None),
     "SDIRK2, pinned": ("pinned", {}, dv.SDIRK2()),
     "SDIRK2, free": ("free", {}, dv.SDIRK2()),
     "BDF2, pinned": ("pinned", {}, dv.BDF2()),
@@ -100,8 +98,7 @@ FEATURES: dict[str, tuple[str, dict[str, Any], Any]] = {
     "obstacle, friction": ("obstacle", {"friction": 0.5}, None),
     "pairs": ("pairs", {}, None),
     "pairs, friction": ("pairs", {"friction": 0.5}, None),
-    "pairs, friction, coarse, Anderson": ("pairs", {"friction": 0.5, "coarse": "auto", "acceleration": dv.Anderson(5)},
-                                          None),
+    "pairs, friction, coarse": ("pairs", {"friction": 0.5, "coarse": "auto"}, None),
     "pairs, SDIRK2": ("pairs", {}, dv.SDIRK2()),
     "pairs, BDF2": ("pairs", {}, dv.BDF2()),
     "self-contact": ("horseshoe", {}, None),

@@ -19,7 +19,7 @@ import torch
 import diffvbd as dv
 from bench.common import RESULTS
 from diffvbd import losses, viz
-from diffvbd.tasks import TASKS, Settings, beam_mu, dress, solve
+from diffvbd.tasks import TASKS, Settings, beam, dress, solve
 from diffvbd.viz.motion import load_motions
 
 FOLDER = RESULTS.parents[1] / "docs" / "images" / "gallery"
@@ -52,17 +52,17 @@ def still(model: dv.Model) -> tuple[torch.Tensor, torch.Tensor]:
 
 def twisted_beam(path: Path) -> None:
     """A twisted beam with the first guess of its shear modulus, the observed one and the identified one."""
-    mesh = dv.mesh.beam(17, 6, 6, size=beam_mu.SIZE, split="kuhn")
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=beam_mu.RELAXATION, coarse="auto")
-    x = beam_mu.twisted(model.rest_points, beam_mu.TWIST)
+    mesh = dv.mesh.beam(17, 6, 6, size=beam.SIZE, split="kuhn")
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=beam.RELAXATION, coarse="auto")
+    x = beam.twisted(model.rest_points, beam.TWIST)
 
     def simulate(mu: torch.Tensor) -> torch.Tensor:
-        return dv.rollout(model, x, torch.zeros_like(x), steps=80, mu=mu, lam=beam_mu.LAM, gravity=(0.0, 0.0, 0.0),
-                          time_step=beam_mu.TIME_STEP, sweeps=beam_mu.SWEEPS).x  # fmt: skip
+        return dv.rollout(model, x, torch.zeros_like(x), steps=80, mu=mu, lam=beam.LAM, gravity=(0.0, 0.0, 0.0),
+                          time_step=beam.TIME_STEP, sweeps=beam.SWEEPS).x  # fmt: skip
 
     with torch.no_grad():
-        start, true = (simulate(torch.tensor(mu, dtype=x.dtype)) for mu in (beam_mu.START_MU, beam_mu.TRUE_MU))
-    log_mu = torch.tensor(beam_mu.START_MU, dtype=x.dtype).log().requires_grad_()
+        start, true = (simulate(torch.tensor(mu, dtype=x.dtype)) for mu in (beam.START_MU, beam.TRUE_MU))
+    log_mu = torch.tensor(beam.START_MU, dtype=x.dtype).log().requires_grad_()
     optimizer = torch.optim.Adam([log_mu], 0.3, betas=(0.7, 0.9), eps=1e-20)
     for _ in range(20):
         optimizer.zero_grad()

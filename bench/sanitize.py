@@ -87,7 +87,6 @@ SCENES: dict[str, Scene] = {
     "floor, thread": _free("thread", (FLOOR,)),
     "floor and friction": _free("color", (FLOOR, FRICTION)),
     "coarse": _free(None, coarse="auto", relaxation=1.5),
-    "Anderson": _free(None, acceleration=dv.Anderson(2)),
     "pairs": _touching(1),
     "pairs, friction, a collider": _touching(2, FRICTION, colliders=(PLANE,)),
     "pairs, floor, float32": _touching(2, FLOOR, dtype=torch.float32),

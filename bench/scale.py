@@ -26,7 +26,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench.common import markdown_table
 from diffvbd.tasks import Settings, million_cubes
-from diffvbd.tasks.capture import captured
+from diffvbd.tasks.runner import captured
 
 DEVICE = "cuda"
 RANKS = (1, 2)

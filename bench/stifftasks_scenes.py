@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.tasks import Settings, beam_mu, beam_mu_lam, cape_mu, cape_wind, fit_real_mesh, flag_wind
+from diffvbd.tasks import Settings, beam, cape_mu, cape_wind, fit_real_mesh, flag_wind
 from diffvbd.tasks.cloth import hanging
 
 NONE = (0.0, 0.0, 0.0)
@@ -80,22 +80,22 @@ class Motion:
 
 def twisted_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
-    truth = {"mu": beam_mu.TRUE_MU, "lam": beam_mu.LAM}
-    return Motion("beam-mu", mesh, clamped, beam_mu.DENSITY, 0.2, (truth, {**truth, "mu": beam_mu.START_MU}), 100,
-                  x=beam_mu.twisted(torch.from_numpy(mesh.points.copy()), beam_mu.TWIST))  # fmt: skip
+    truth = {"mu": beam.TRUE_MU, "lam": beam.LAM}
+    return Motion("beam-mu", mesh, clamped, beam.DENSITY, 0.2, (truth, {**truth, "mu": beam.START_MU}), 100,
+                  x=beam.twisted(torch.from_numpy(mesh.points.copy()), beam.TWIST))  # fmt: skip
 
 
 def kicked_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
-    v = beam_mu_lam.kicked(torch.from_numpy(mesh.points.copy()), beam_mu_lam.KICK / 0.2)
+    v = beam.kicked(torch.from_numpy(mesh.points.copy()), beam.KICK / 0.2)
     v[torch.from_numpy(clamped)] = 0
-    first: dict[str, Any] = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
-    return Motion("beam-mu-lam", mesh, clamped, beam_mu_lam.DENSITY, 0.2, (beam_mu_lam.TRUTH, first), 100,
+    first: dict[str, Any] = dict(zip(("mu", "lam"), beam.START, strict=True))
+    return Motion("beam-mu-lam", mesh, clamped, beam.DENSITY, 0.2, (beam.TRUTH, first), 100,
                   v=v)  # fmt: skip
 
 
 def _beam(quick: bool) -> tuple[dv.TetMesh, np.ndarray]:
-    mesh = dv.mesh.beam(*((6, 3, 3) if quick else (21, 7, 7)), size=beam_mu.SIZE, split="kuhn")
+    mesh = dv.mesh.beam(*((6, 3, 3) if quick else (21, 7, 7)), size=beam.SIZE, split="kuhn")
     return mesh, mesh.points[:, 0] < 1e-9
 
 

@@ -24,8 +24,8 @@ from bench.advice_scenes import Scene
 from bench.common import digits, markdown_table
 from bench.tradeoff_peers import peers
 from bench.tradeoff_scenes import SCENES, gripper, pile
-from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, converted, pilots_of
-from diffvbd.rollout.search import start_of
+from diffvbd.rollout.tune import FRAMES, Pilot, Pilots, converted, pilots_of
+from diffvbd.rollout.tune import start_of
 
 LONGEST = 1 / 30  # [s], the first step
 ERRORS = (0.1, 0.01, 0.001)
@@ -69,7 +69,6 @@ WAYS = [
     Way("implicit Euler, relaxation 1.6", _plain(relaxation=1.6), (20, 80), contact=False),
     Way("implicit Euler, start at y", _plain(), (20,), (("start", "predictor"),)),
     Way("implicit Euler, start at x + h v", _plain(), (20,), (("start", "inertia"),)),
-    Way("implicit Euler, Anderson(5)", _plain(acceleration=dv.Anderson(5)), (20,)),
     Way("implicit Euler, coarse", _plain(**COARSE), (2, 8)),
     Way("implicit Euler, block of the paper", _plain(block="paper"), (20,)),
     Way("SDIRK2", _plain(integrator=SDIRK2), (5, 20, 80)),

@@ -18,7 +18,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench import newton
 from bench.advice_scenes import Scene
-from diffvbd.rollout.pilots import FRAMES
+from diffvbd.rollout.tune import FRAMES
 from diffvbd.solvers import XPBD, ProjectiveDynamics
 
 Row = dict[str, Any]

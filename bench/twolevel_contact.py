@@ -30,11 +30,8 @@ BARRIER_CURVATURE = 6.4  # of the barrier at half of dhat, over kappa
 METHODS: dict[str, dict[str, Any]] = {
     "plain": {},
     "plain, relaxation 1.5": {"relaxation": 1.5},
-    "Anderson": {"acceleration": dv.Anderson(5)},
     "coarse": {"coarse": "auto"},
     "coarse, relaxation 1.5": {"coarse": "auto", "relaxation": 1.5},
-    "coarse and Anderson": {"coarse": "auto", "acceleration": dv.Anderson(2)},
-    "coarse and Anderson, relaxation 1.5": {"coarse": "auto", "relaxation": 1.5, "acceleration": dv.Anderson(2)},
 }
 
 

@@ -161,8 +161,12 @@ def refuse_gradient(name: str, value: Any, instead: str = "") -> None:
 def refuse_gradients(energy: Any) -> None:
     """Raises where a parameter of an energy is a tensor that requires grad: it is copied, a step takes it elsewhere."""
     for key in energy.parameters:
-        instead = f'pass parameters={{"{energy.name}.{key}": ...}} to a step or a rollout'
-        refuse_gradient(key, getattr(energy, key), instead)
+        refuse_gradient(key, getattr(energy, key), f"pass {input_name(energy, key)}= to a step or a rollout")
+
+
+def input_name(energy: Any, key: str) -> str:
+    """The keyword by which a step takes a parameter of an energy: floor_kappa, pair_damping, friction."""
+    return energy.name if key == "coefficient" else f"{energy.name}_{key}"
 
 
 def check_number(

@@ -1,10 +1,12 @@
 """The command line: `diffvbd` or `python -m diffvbd`."""
 
 import argparse
+import contextlib
 import re
 import sys
+import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,18 @@ import numpy as np
 import torch
 
 import diffvbd as dv
-from diffvbd import cli_mesh, cli_scene, cli_view
-from diffvbd.mesh.series import EXTENSIONS, check_extension
-from diffvbd.rollout.search import ERROR, PATIENCE
+from diffvbd.mesh.motions import EXTENSIONS, check_extension
 from diffvbd.said import PAGES
+from diffvbd.scopes import record_to
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
-from diffvbd.tasks.problem import Result, check_device
-from diffvbd.tasks.progress import Row, versions
-from diffvbd.tasks.ranks import joined
-from diffvbd.tasks.scene import MOST_STEPS, Observation, Scene
+from diffvbd.tasks.folder import joined
+from diffvbd.tasks.problem import Result, Row, check_device
+from diffvbd.tasks.report import versions
+from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
+from diffvbd.viz.server import require_viser
+from diffvbd.viz.values import QUANTITIES
+
+from .rollout.tune import ERROR, PATIENCE
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
@@ -38,13 +43,13 @@ EXAMPLES = """examples:
   diffvbd identify part.msh target.npz --start 1e4 1e4
                                                    recover (mu, lam) from the observed motion
   diffvbd advise part.msh --pin x- --duration 0.5 --error 0.01
-                                                   time step, sweeps and the like that keep an error of 1 %
+                                                   solver (time step, sweeps, ...) that stays within an error of 1 %
 
 `diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. `identify` ends with status 1
-where it stalled, and warns wherever it did not converge; `advise` where the error cannot be had. An interrupted `run`
+where it stalled, and warns wherever it did not converge; `advise` where the error cannot be reached. An interrupted `run`
 or `identify` continues where it stopped when the same command is given again.
 """
-ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "coarse")  # what advise chooses
+ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "subspace")  # what advise chooses
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
   x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
   steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...; where the file has a time_step,
@@ -52,7 +57,7 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
   x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
   pinned     vertices that are held, bool, shape [V]; default none
   time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation,
-             integrator, coarse (0 or 1)
+             integrator, subspace
   mu, lam    the true material [Pa], if known: only used to report the error
 `diffvbd simulate --save-target TARGET.npz` writes such a file.
 """
@@ -98,14 +103,14 @@ def _parser() -> argparse.ArgumentParser:
     for name, texts in sorted(_task_options().items()):
         run.add_argument(f"--{name}", help="; ".join(texts))
     run.add_argument("--view", action="store_true", help="show the run in the browser while it goes on; extra [viz]")
-    cli_view.add_server(run)
+    _add_server(run)
     run.set_defaults(command=_run)
 
     listing = commands.add_parser("list", help="list the shipped inverse problems")
     listing.set_defaults(command=lambda options: print(_task_list()))
 
-    cli_mesh.add(commands)
-    cli_view.add(commands)
+    _add_mesh(commands)
+    _add_view(commands)
 
     simulate = commands.add_parser("simulate", help="simulate a mesh and write its motion")
     simulate.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra (.msh, .vtu, .vtk, ...)")
@@ -117,19 +122,21 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--stride", type=int, default=1, help="write every n-th frame (default 1)")
     simulate.add_argument("--device", default="cpu", help="torch device (default cpu)")
     simulate.add_argument("--save-target", type=Path, metavar="FILE.npz", help="also write what `identify` reads")
-    cli_scene.add_material(simulate)
-    cli_scene.add_options(simulate)
+    _add_material(simulate)
+    _add_scene(simulate)
     simulate.set_defaults(command=_simulate)
 
-    advice = commands.add_parser("advise", help="find time step, sweeps and the like that keep a wanted error")
+    advice = commands.add_parser("advise", help="find a solver that stays within a wanted error")
     advice.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     advice.add_argument("--duration", type=float, required=True, help="of the motion [s]")
-    advice.add_argument("--error", type=float, default=ERROR, help=f"share of the motion, below 1 (default {ERROR:g})")
+    advice.add_argument(
+        "--error", type=float, default=ERROR, help=f"fraction of the motion, below 1 (default {ERROR:g})"
+    )
     advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
-    advice.add_argument("--patience", type=float, default=PATIENCE, help=f"pilots may run so long [s] ({PATIENCE:g})")
+    advice.add_argument("--time-budget", type=float, default=PATIENCE, help=f"of trial runs [s] (default {PATIENCE:g})")
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
-    cli_scene.add_material(advice)
-    cli_scene.add_options(advice, ADVISED)
+    _add_material(advice)
+    _add_scene(advice, ADVISED)
     advice.set_defaults(command=_advise)
 
     identification = commands.add_parser(
@@ -149,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
     identification.add_argument("--iterations", type=int, default=100, help="at most so many (default 100)")
     identification.add_argument("--steps", type=int, help="time steps that led to the shape, if x is one shape")
-    cli_scene.add_options(identification)
+    _add_scene(identification)
     _add_run_options(identification, "runs/identify")
     identification.set_defaults(command=_identify)
 
@@ -172,7 +179,7 @@ def _run(options: argparse.Namespace) -> None:
     given = task.chosen(given)
     with joined(options.device, task.splits):
         check_device(options.device)
-        with cli_view.watched(options.host, options.port) if options.view else nullcontext() as watch:
+        with _watched(options.host, options.port) if options.view else nullcontext() as watch:
             _solve(task.build(settings, **given), settings, watch)
 
 
@@ -197,14 +204,13 @@ def _simulate(options: argparse.Namespace) -> None:
     _check_steps(options.steps)
     check_device(options.device)
     mesh = _mesh(options)
-    mu, lam = cli_scene.material(options)
-    scene = cli_scene.scene(options, mesh)
+    mu, lam = _material(options)
+    scene = _scene(options, mesh)
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
-        said_below = False if options.stride == 1 else None
-        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress,
-                                check_contact=said_below)  # fmt: skip
+        checks = dv.Checks(contact=False if options.stride == 1 else None)  # which diagnose looks at below
+        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress, checks=checks)
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
     count = int(scene.pinned.sum())
@@ -215,8 +221,8 @@ def _simulate(options: argparse.Namespace) -> None:
         )
     if len(steps) > 1 and options.stride == 1:
         previous = (motion.x[-2], motion.v[-2]) if scene.integrator == Scene.integrator else None
-        found = dv.diagnose(model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous,
-                            gravity=scene.gravity, warn=False)  # fmt: skip
+        found = dv.diagnose(model, motion.x[-1], scene.solver, previous=previous, warn=False, mu=mu, lam=lam,
+                            gravity=scene.gravity)  # fmt: skip
         for message in found.messages:
             print(f"warning: {message}", file=sys.stderr)
     if options.save_target:
@@ -230,24 +236,26 @@ def _advise(options: argparse.Namespace) -> int:
             raise ValueError(f"--{name.replace('_', '-')}: expected none, since it is what advise chooses")
     check_device(options.device)
     mesh = _mesh(options)
-    mu, lam = cli_scene.material(options)
-    scene = cli_scene.scene(options, mesh)
+    mu, lam = _material(options)
+    scene = _scene(options, mesh)
     model = scene.model(options.device)
     x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (scene.x0, scene.v0))
-    settings = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
-                         patience=options.patience, mu=mu, lam=lam, gravity=scene.gravity)  # fmt: skip
-    print(settings)
-    print(f"\nin Python: settings=dv.Settings({_in_python(settings)})")
-    return 0 if settings.predicted is not None and settings.predicted.reached else 1
+    solver = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
+                       time_budget=options.time_budget, mu=mu, lam=lam, gravity=scene.gravity)  # fmt: skip
+    print(solver)
+    print(f"\nin Python: dv.VBD({_in_python(solver)})")
+    return 0 if solver.prediction is not None and solver.prediction.reached else 1
 
 
-def _in_python(settings: dv.Settings) -> str:
-    """The arguments of dv.Settings that are not left at their defaults."""
-    given = [f"{settings.time_step!r}, {settings.sweeps}, dv.{settings.integrator!r}"]
-    given += [f"relaxation={settings.relaxation!r}"] if settings.relaxation != 1 else []
-    given += [f"coarse={settings.coarse!r}"] if settings.coarse is not None else []
-    given += [f"acceleration=dv.{settings.acceleration!r}"] if settings.acceleration is not None else []
-    return ", ".join(given)
+def _in_python(solver: dv.VBD) -> str:
+    """Arguments of a dv.VBD that are not left at their defaults."""
+    plain = dv.VBD(solver.time_step, solver.sweeps)
+    names = ("relaxation", "integrator", "subspace")
+    changed = {name: getattr(solver, name) for name in names if getattr(solver, name) != getattr(plain, name)}
+    words = {name: f"dv.{value!r}" if name == "integrator" else repr(value) for name, value in changed.items()}
+    if solver.coarse == dv.CoarseSpace():
+        words["subspace"] = '"coarse"'
+    return ", ".join([f"{solver.time_step!r}, {solver.sweeps}", *(f"{name}={word}" for name, word in words.items())])
 
 
 def _make_place(options: argparse.Namespace) -> None:
@@ -294,7 +302,7 @@ def _identify(options: argparse.Namespace) -> int:
     start = _start(options)
     check_device(options.device)
     mesh = _mesh(options)
-    given = cli_scene.given(options, mesh) | {"steps": options.steps}
+    given = _given(options, mesh) | {"steps": options.steps}
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
     problem = identify.problem(observation, settings, start, options.fixed_lam, options.iterations)
@@ -330,3 +338,224 @@ def _task_options() -> dict[str, list[str]]:
 
 def _task_list() -> str:
     return "\n".join(f"{name:16} {task.summary}" for name, task in sorted(TASKS.items()))
+
+
+def _add_material(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--velocity", type=float, nargs=3, metavar=("VX", "VY", "VZ"), help="initial velocity [m/s]")
+    material = parser.add_argument_group("material (default: mu = lam = 1e5 Pa)")
+    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
+        material.add_argument(f"--{name}", type=float, help=text)
+    material.add_argument("--young", type=float, help="Young's modulus [Pa], together with --poisson")
+    material.add_argument("--poisson", type=float, help="Poisson's ratio, below 0.5")
+
+
+def _add_scene(parser: argparse.ArgumentParser, chosen: tuple[str, ...] = ()) -> None:
+    """``chosen``: what the command chooses itself: such options are known, to say so, and not shown."""
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="metres per unit of the file, 0.001 for mm (default 1)"
+    )
+    # No defaults: identify must know which options were given, and Scene has the defaults.
+    scene = parser.add_argument_group("scene")
+
+    def shown(name: str, text: str) -> str:
+        return argparse.SUPPRESS if name in chosen else text
+
+    scene.add_argument("--time-step", type=float, help=shown("time_step", f"[s] (default {Scene.time_step:.4g})"))
+    scene.add_argument("--sweeps", type=int, help=shown("sweeps", f"sweeps per step (default {Scene.sweeps})"))
+    scene.add_argument("--density", type=float, help=f"[kg/m^3] (default {Scene.density:g})")
+    scene.add_argument("--gravity", type=float, nargs=3, metavar=("GX", "GY", "GZ"), help="[m/s^2] (default 0 -9.81 0)")
+    scene.add_argument("--floor", type=float, metavar="HEIGHT", help="height of a floor [m] (default: none)")
+    scene.add_argument("--kappa", type=float, help=f"stiffness of the floor's barrier (default {Scene.kappa:g})")
+    scene.add_argument("--dhat", type=float, help=f"distance where the barrier begins [m] (default {Scene.dhat:g})")
+    scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
+    text = "1.5 to 1.7 needs fewer sweeps (default 1; not with friction)"
+    scene.add_argument("--relaxation", type=float, help=shown("relaxation", text))
+    text = (
+        f"corrections between the sweeps (default {Scene.subspace}); coarse: for what is stiff, long or finely meshed"
+    )
+    scene.add_argument("--subspace", choices=[*SUBSPACES], help=shown("subspace", text))
+    scene.add_argument("--integrator", choices=[*INTEGRATORS],
+                       help=shown("integrator", f"of time (default {Scene.integrator})"))  # fmt: skip
+    scene.add_argument(
+        "--pin",
+        action="append",
+        metavar="SIDE[:FRACTION]",
+        help="hold the vertices at a side of the bounding box: x-, x+, y-, y+, z- or z+; up to this fraction of its "
+        "extent (default 0.001), for example y+:0.05 for a round body; may be repeated",
+    )
+
+
+def _material(options: argparse.Namespace) -> tuple[float, float]:
+    """mu and lam [Pa] from either pair of options."""
+    young, poisson = options.young, options.poisson
+    if young is None and poisson is None:
+        return (1e5 if options.mu is None else options.mu), (1e5 if options.lam is None else options.lam)
+    if young is None or poisson is None or options.mu is not None or options.lam is not None:
+        raise ValueError("material: give --mu and --lam, or --young and --poisson")
+    try:
+        return dv.lame(young, poisson)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from None
+
+
+def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
+    """The scene of a mesh that the options describe."""
+    v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
+    values = _given(options, mesh)
+    for name in ("kappa", "dhat", "friction"):
+        if name in values and "floor" not in values:
+            raise ValueError(f"--{name}: expected --floor beside it, got none")
+    pinned = values.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
+    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **values)
+
+
+def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
+    """What was given of a Scene, the others have defaults; `pinned` [V] of --pin."""
+    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
+             "integrator", "subspace")  # fmt: skip
+    values = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    for name, value in values.items():
+        if not isinstance(value, (str, int)) and not np.isfinite(value).all():
+            raise ValueError(f"--{name.replace('_', '-')}: expected finite numbers, got {value}")
+    if options.pin:
+        values["pinned"] = np.logical_or.reduce([side(mesh.points, text) for text in options.pin])
+    return values
+
+
+def _add_mesh(commands: Any) -> None:
+    """Add the command to those of `diffvbd`."""
+    parser = commands.add_parser(
+        "mesh", help="repair a surface (.ply, .stl, .obj, ...) and fill it with tets; needs the extra [mesh]"
+    )
+    parser.add_argument("surface", type=Path, metavar="SURFACE", help="a file with triangles")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="PART.msh", help="the file to write")
+    parser.add_argument("--force", action="store_true", help="overwrite it if it is there")
+    unit = parser.add_mutually_exclusive_group()
+    unit.add_argument("--size", type=float, help="the largest extent that it shall have [m]")
+    unit.add_argument("--scale", type=float, help="metres per unit of the file, 0.001 for mm (default 1)")
+    parser.add_argument(
+        "--up",
+        default="y",
+        choices=["x", "y", "z", "-x", "-y", "-z"],
+        help="the file's axis that points up, for example z; --up=-z for a minus (default y)",
+    )
+    parser.add_argument("--edge", type=float, help="wanted edge length [m] (default: 1/20 of the diagonal)")
+    parser.add_argument("--epsilon", type=float, help="tets may miss the surface by so much [m] (default: edge / 20)")
+    parser.add_argument(
+        "--max-triangles", type=int, default=3000, help="larger surfaces are decimated to so many first (default 3000)"
+    )
+    parser.set_defaults(command=_run_mesh)
+
+
+def _run_mesh(options: argparse.Namespace) -> None:
+    """Repair, fill, write, and show what each of them found."""
+    out = options.out
+    if out.exists() and out.resolve() == options.surface.resolve():
+        raise ValueError(f"--out: expected another file than {options.surface}")
+    if out.exists() and not options.force:
+        raise ValueError(f"--out: {out} would be overwritten; give --force, or another name")
+    if out.suffix.lower() not in WRITTEN:
+        raise ValueError(f"--out: expected a name that ends in {', '.join(WRITTEN)}, got {out}")
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"directory {out.parent} does not exist")
+    repaired = dv.mesh.repair(options.surface, options.size, options.scale, options.up)
+    print(repaired)
+    if len(repaired.triangles) > options.max_triangles:
+        print(f"{'decimated':9} to {options.max_triangles} triangles; --max-triangles keeps more, and takes longer")
+    start = time.perf_counter()
+    mesh = dv.mesh.tetrahedralize(repaired.surface, options.edge, options.epsilon, options.max_triangles)
+    print(mesh_report(mesh, repaired.volume, time.perf_counter() - start))
+    mesh.save(out)
+    print(f"wrote {out}")
+
+
+# Formats of meshio that hold tets and need no further package.
+WRITTEN = (".msh", ".vtu", ".vtk", ".mesh", ".inp")
+POOR = 0.1  # a mean ratio below which a tet is stiffer than its material
+
+
+def mesh_report(mesh: dv.mesh.TetMesh, enclosed: float, seconds: float) -> str:
+    """Size, volume beside that of the surface [m^3] and quality of tets, as rows of text."""
+    quality, extent = mesh.quality, np.ptp(mesh.points, axis=0)
+    volume = mesh.volume.sum()
+    beside = f" ({volume / enclosed - 1:+.2%} of the surface's)" if enclosed > 0 else ""
+    shares = np.quantile(quality, [0.0, 0.05, 0.5])
+    rows = {
+        "mesh": f"{mesh.num_vertices} vertices, {mesh.num_tets} tets, in {seconds:.1f} s",
+        "extent": " x ".join(f"{length:.4g}" for length in extent) + " m",
+        "volume": f"{volume:.6g} m^3{beside}",
+        "quality": "mean ratio (1 is regular, 0 is flat): "
+        + ", ".join(f"{name} {share:.3f}" for name, share in zip(("least", "5 %", "median"), shares, strict=True))
+        + f"; {int((quality < POOR).sum())} tets below {POOR}",
+    }
+    return "\n".join(f"{name:9} {text}" for name, text in rows.items())
+
+
+PORT = 8080
+
+
+def _add_view(commands: Any) -> None:
+    """Add the command to those of `diffvbd`."""
+    parser = commands.add_parser("view", help="show a motion, a mesh or a run in the browser; needs the extra [viz]")
+    parser.add_argument(
+        "path", type=Path, metavar="FILE|RUN", help="a .pvd, a mesh with tets, or the folder of a `diffvbd run`"
+    )
+    parser.add_argument("--color", choices=[*QUANTITIES], default="body", help="of the triangles (default body)")
+    parser.add_argument("--time-step", type=float, help="between frames [s] (default: what the file says)")
+    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
+        parser.add_argument(f"--{name}", type=float, help=f"{text}, for stress and stiffness")
+    _add_server(parser)
+    parser.add_argument("--open", action="store_true", help="open the page in the system's browser")
+    parser.set_defaults(command=_view)
+
+
+def _add_server(parser: argparse.ArgumentParser) -> None:
+    """Options of the server."""
+    parser.add_argument("--host", default="127.0.0.1", help="network interface of the page (default 127.0.0.1)")
+    parser.add_argument("--port", type=int, default=PORT, help=f"of the page; the next free one is taken ({PORT})")
+
+
+def _view(options: argparse.Namespace) -> None:
+    """Show a file until Ctrl+C."""
+    viewer = dv.viz.live(options.path, color=options.color, time_step=options.time_step, mu=options.mu, lam=options.lam,
+                         host=options.host, port=options.port, browser=options.open)  # fmt: skip
+    with viewer:
+        print(f"{options.path} at {viewer.url}; Ctrl+C ends", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            viewer.wait()
+
+
+@contextlib.contextmanager
+def _watched(host: str, port: int) -> Iterator[Callable[[dict[str, float]], None]]:
+    """A function that shows a row of a run's history with the latest rollout of this thread; what opens at the first.
+
+    The page stays after the run for as long as a browser shows it.
+    """
+    require_viser()
+    heard: list[Any] = []
+    viewer: dv.viz.Viewer | None = None
+
+    def show(row: dict[str, float]) -> None:
+        nonlocal viewer
+        if viewer is None:
+            if not heard:
+                return
+            viewer = dv.viz.live(heard[0][0], host=host, port=port)
+            print(f"live view at {viewer.url}", file=sys.stderr, flush=True)
+        if heard:
+            viewer.update_model(heard[0][0])
+        x = heard[0][1] if heard else None
+        heard.clear()
+        others = {key: value for key, value in row.items() if key not in ("iteration", "loss", "seconds")}
+        viewer.update(x, loss=row["loss"], **others)
+
+    try:
+        with record_to(heard, "rollout"):
+            yield show
+        if viewer is not None and viewer.watched:
+            print(f"the run has ended; its view stays at {viewer.url} until the page is closed", file=sys.stderr)
+            with contextlib.suppress(KeyboardInterrupt):
+                viewer.wait(unwatched=False)
+    finally:
+        if viewer is not None:
+            viewer.stop()

@@ -1,8 +1,8 @@
 """Energies of a scene: one dataclass for each header in csrc/energies.
 
 A Model's tuple of energies selects the compiled variant; what is absent costs nothing. The numbers of an energy are
-constants of the Model unless a step overrides them through ``parameters={"floor_barrier.kappa": tensor}``, in which
-case they are differentiable.
+constants of the Model unless a step takes them as inputs, such as ``floor_kappa=tensor``, in which case they are
+differentiable.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from .checks import (
     check_positive,
     check_readable,
     fail,
-    is_word,
     mask_or_indices,
     refuse_gradients,
     vertex_mask,
 )
-from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
+from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT
 
 MAX_PLANES = 8
 FADE = 0.1  # of kappa dhat: the normal force from which a contact has half of its damping; twins in csrc and reference
@@ -54,24 +53,13 @@ def _numbers(name: str, value: Any) -> Tensor:
 class StableNeoHookean:
     """Stable Neo-Hookean tets, P = mu F + (lb (J - 1) - mu) cof F with lb = mu + lam.
 
-    Args:
-        block: ``"exact"`` uses the exact 3x3 block of a vertex (lam + mu along dJ/dx_i): with it every update minimises
-            the incremental potential in its vertex. ``"paper"`` uses lam there, the paper's choice, which
-            guarantees descent only where lam >= mu.
+    Inputs: ``mu`` and ``lam``, or ``young`` and ``poisson``.
 
     Source: Smith, de Goes, Kim (2018); paper, appendix on closed forms; docs/method.md, section 2.
     """
 
     name: ClassVar[str] = "stable_neo_hookean"
-    block: str = "exact"
-
-    def __post_init__(self) -> None:
-        if not is_word(self.block, "exact", "paper"):
-            fail("block", '"exact" or "paper"', self.block)
-
-    @property
-    def bit(self) -> int:
-        return EXACT_BLOCK if self.block == "exact" else PAPER_BLOCK
+    bit: ClassVar[int] = EXACT_BLOCK
 
 
 class VertexEnergy:
@@ -81,6 +69,7 @@ class VertexEnergy:
     bit: ClassVar[int]  # in a scene's mask; follows from the position in VERTEX_ENERGIES
     per_vertex: ClassVar[bool]
     parameters: ClassVar[dict[str, int]]  # differentiable parameters and their number of own dimensions
+    units: ClassVar[dict[str, str]] = {}  # of the parameters, as "N/m"
 
     def detached(self) -> VertexEnergy:
         """A copy whose tensors are detached constants."""
@@ -173,7 +162,7 @@ class FloorBarrier(VertexEnergy):
             with the normal force N of the plane there, by N / (N + kappa dhat / 10), lest a motion jump where a vertex
             comes to be that close one step sooner.
 
-    Differentiable as ``floor_barrier.kappa``, ``.dhat``, ``.damping`` (scalars), ``.height`` [planes] and ``.normal``
+    Inputs: ``floor_kappa``, ``floor_dhat``, ``floor_damping`` (scalars), ``floor_height`` [planes] and ``floor_normal``
     [planes, 3].
 
     Raises:
@@ -184,9 +173,10 @@ class FloorBarrier(VertexEnergy):
     Source: Li et al. (2020); paper, appendix on implementation details; docs/method.md, section 6.
     """
 
-    name: ClassVar[str] = "floor_barrier"
+    name: ClassVar[str] = "floor"
     per_vertex: ClassVar[bool] = False
     parameters: ClassVar[dict[str, int]] = {"normal": 2, "height": 1, "kappa": 0, "dhat": 0, "damping": 0}
+    units: ClassVar[dict[str, str]] = {"normal": "-", "height": "m", "kappa": "N/m", "dhat": "m", "damping": "N s/m"}
 
     height: float | Sequence[float] = 0.0
     normal: Sequence[float] | Sequence[Sequence[float]] = (0.0, 1.0, 0.0)
@@ -295,7 +285,7 @@ class Anchor(VertexEnergy):
         points: a [m], shape [V, 3]; None anchors at the rest points.
         vertices: Which vertices, a bool mask [V] or indices; None anchors all.
 
-    Differentiable as ``anchor.stiffness`` (scalar or [V]) and ``anchor.points`` [V, 3].
+    Inputs: ``anchor_stiffness`` (scalar or [V]) and ``anchor_points`` [V, 3].
 
     Raises:
         ValueError: A stiffness < 0, what is not finite; in the Model, shapes or indices that do not fit its mesh.
@@ -305,6 +295,7 @@ class Anchor(VertexEnergy):
     name: ClassVar[str] = "anchor"
     per_vertex: ClassVar[bool] = True
     parameters: ClassVar[dict[str, int]] = {"stiffness": 1, "points": 2}
+    units: ClassVar[dict[str, str]] = {"stiffness": "N/m", "points": "m"}
 
     stiffness: float | Tensor = 1.0
     points: Tensor | None = None

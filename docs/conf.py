@@ -1,6 +1,7 @@
 """The site, built by `make docs`: Sphinx with the theme furo; pages in Markdown and notebooks are read by MyST-NB."""
 
 import json
+import os
 import re
 from typing import Any
 
@@ -15,13 +16,24 @@ version = release = diffvbd.__version__
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
+    "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "sphinx_design",
 ]
 exclude_patterns = ["images/**"]
+# Links to the types of other projects need the internet at each build: DIFFVBD_INTERSPHINX=1 asks for them.
+intersphinx_mapping = (
+    {
+        "python": ("https://docs.python.org/3", None),
+        "numpy": ("https://numpy.org/doc/stable", None),
+        "torch": ("https://docs.pytorch.org/docs/stable", None),
+    }
+    if os.environ.get("DIFFVBD_INTERSPHINX")
+    else {}
+)
 nitpicky = True
-# Other projects' types: their inventories would need the internet at each build. And what is no public name.
+# Types of other projects, and what is no public name.
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|numpy|collections|pathlib|typing)\..*"),
     ("py:.*", r"diffvbd\.\w+\.\w+\.\w+"),

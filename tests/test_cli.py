@@ -16,7 +16,7 @@ import torch
 import diffvbd as dv
 from diffvbd import cli
 from diffvbd.cli import main
-from diffvbd.tasks import archive
+from diffvbd.tasks import folder as archive
 from diffvbd.tasks.folder import alone_in
 from diffvbd.tasks.scene import Observation
 from diffvbd.testing import tolerance

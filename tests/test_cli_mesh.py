@@ -8,7 +8,7 @@ import meshio
 import numpy as np
 import pytest
 
-from diffvbd import cli_mesh
+from diffvbd import cli
 from diffvbd import mesh as dm
 from diffvbd.cli import main
 from diffvbd.testing import tolerance
@@ -68,7 +68,7 @@ def test_a_scan_without_its_unit_is_warned_of(scan: Path, monkeypatch: pytest.Mo
 
 
 def test_quality_is_shown() -> None:
-    text = cli_mesh.report(dm.cube(3), 2 * dm.cube(3).volume.sum(), 1.0)
+    text = cli.mesh_report(dm.cube(3), 2 * dm.cube(3).volume.sum(), 1.0)
     assert "27 vertices" in text and "(-50.00% of the surface's)" in text and "0 tets below 0.1" in text
 
 
@@ -98,7 +98,7 @@ def test_simulate_writes_gltf_and_says_early_what_usd_needs(
     assert run(*common, "--out", tmp_path / "part.glb") == 0
     assert (tmp_path / "part.glb").read_bytes()[:4] == b"glTF"
     monkeypatch.setitem(sys.modules, "pxr", None)
-    monkeypatch.setattr("diffvbd.cli_scene.scene", lambda *_: pytest.fail("simulated first"))
+    monkeypatch.setattr("diffvbd.cli._scene", lambda *_: pytest.fail("simulated first"))
     assert run(*common, "--out", tmp_path / "part.usdc") == 2
     assert "pip install 'diffvbd[exchange]'" in capsys.readouterr().err
     assert run(*common, "--out", tmp_path / "part.avi") == 2

@@ -67,5 +67,5 @@ def test_a_run_that_is_viewed_finds_the_same(
     plain, viewed = (json.loads((tmp_path / name / "log.json").read_text())["history"] for name in ("plain", "viewed"))
     assert [row | {"seconds": 0} for row in plain] == [row | {"seconds": 0} for row in viewed]
     assert len(shown) == len(viewed) and shown[0] == ((16, 54, 3), viewed[0]["loss"], "gradient_norm", "mu")
-    names = [*dv.viz.opened.opened(tmp_path / "viewed").motions]  # pyright: ignore[reportAttributeAccessIssue]
+    names = [*dv.viz.motion.opened(tmp_path / "viewed").motions]  # pyright: ignore[reportAttributeAccessIssue]
     assert names == ["initial", "target", "recovered"]

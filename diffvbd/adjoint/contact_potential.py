@@ -23,8 +23,9 @@ from ..contact.pair_forces import (
     lagged_stiffness,
     near_pairs,
 )
-from ..model.model import Model
-from ..reference.friction import smoothed
+from ..model.inputs import parameter_of
+from ..model.system import System
+from ..reference.energies import smoothed
 from .potential import IncrementalPotential
 
 
@@ -64,7 +65,7 @@ class StepContact:
             that there is neither damping nor friction.
     """
 
-    def __init__(self, model: Model, data: Tensor, parameters: dict[str, Tensor], colliders: Tensor, before: Tensor,
+    def __init__(self, model: System, data: Tensor, parameters: dict[str, Tensor], colliders: Tensor, before: Tensor,
                  x_prev: Tensor | None, origin: Tensor | None, time_step: float) -> None:  # fmt: skip
         self.model, self.parameters, self.origin, self.h = model, parameters, origin, time_step
         self.colliders, self.x_prev = colliders, x_prev
@@ -77,17 +78,12 @@ class StepContact:
         if x_prev is not None and self.start is not None and surface is not None and barrier is not None:
             first = before + (colliders - before) / (barrier.detections or 1)
             near = near_pairs(x_prev, origin, before, first, surface, barrier)
-            self.lag = lag_of(near, self.start, self._number("pair_barrier.kappa"))
+            self.lag = lag_of(near, self.start, self._number("pair_kappa"))
 
     def _number(self, name: str) -> Tensor:
         """A parameter [1 | B]; zero where its energy is absent."""
-        if name in self.parameters:
-            return self.parameters[name].double()
-        owner, key = name.split(".")
-        energy = next((e for e in self.model.parametric_energies if e.name == owner), None)
-        if energy is None:
-            return self.colliders.new_zeros((1,), dtype=torch.float64)
-        return self.model.constants(energy)[key][None].double()
+        value = parameter_of(self.model, self.parameters, name)
+        return self.colliders.new_zeros((1,), dtype=torch.float64) if value is None else value.double()
 
     def at(self, x: Tensor) -> ContactState:
         """Forces at x [B, V, 3].
@@ -101,11 +97,11 @@ class StepContact:
             pairs = _no_pairs(points)
         else:
             pairs = near_pairs(x, self.origin, self.colliders, self.colliders, surface, barrier)
-        pushes = barrier_forces(pairs, points, self._number("pair_barrier.kappa"))
+        pushes = barrier_forces(pairs, points, self._number("pair_kappa"))
         damping = friction = points.new_zeros((0, 4, 3))
         if self.lag is not None:
-            damping, friction = lagged_forces(self.lag, points, self._number("pair_barrier.damping"),
-                                              self._number("friction.coefficient"), self.h, self.reach)  # fmt: skip
+            damping, friction = lagged_forces(self.lag, points, self._number("pair_damping"),
+                                              self._number("friction"), self.h, self.reach)  # fmt: skip
         lagged = None if self.lag is None else self.lag.pairs
         return ContactState(points, pairs, pushes, lagged, damping, friction, *self._floor(points[:, : x.shape[1]]))
 
@@ -130,7 +126,7 @@ class StepContact:
         assert floor is not None and start is not None and self.planes is not None
         start = start[:, : x.shape[1]]
         force, normal = floor.normal_force(start, self.planes, None)
-        lagged = self._number("friction.coefficient")[:, None, None] * force
+        lagged = self._number("friction")[:, None, None] * force
         travel = (x - start)[:, :, None]
         slip = travel - (travel * normal).sum(-1, keepdim=True) * normal
         return lagged, slip, smoothed(slip.movedim(-1, -2), self.reach)[1]
@@ -138,10 +134,10 @@ class StepContact:
     def stiffness(self, forces: ContactState) -> Tensor:
         """Trace of the contact's part of each vertex's block [N/m], [B, V]; of planes their friction alone."""
         points, count = forces.points, forces.floor.shape[1]
-        total = barrier_stiffness(forces.pairs, points, self._number("pair_barrier.kappa"))
+        total = barrier_stiffness(forces.pairs, points, self._number("pair_kappa"))
         if self.lag is not None:
-            total = total + lagged_stiffness(self.lag, points, self._number("pair_barrier.damping"),
-                                             self._number("friction.coefficient"), self.h, self.reach)  # fmt: skip
+            total = total + lagged_stiffness(self.lag, points, self._number("pair_damping"),
+                                             self._number("friction"), self.h, self.reach)  # fmt: skip
         total = total[:, :count]
         if self.model.friction is not None and self.start is not None and self.planes is not None:
             lagged, _, factor = self._floor_slip(points[:, :count])
@@ -157,7 +153,7 @@ def _no_pairs(points: Tensor) -> NearPairs:
 class ContactPotential(IncrementalPotential):
     """The incremental potential at x with pairs and friction. Its Hessian is that without them."""
 
-    def __init__(self, model: Model, x: Tensor, fields: ops.SweepFields, contact: StepContact) -> None:
+    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, contact: StepContact) -> None:
         super().__init__(model, x, fields, contact.h)
         self.step_contact = contact
 

@@ -20,13 +20,13 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..model.model import Model
+from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
 from ..said import warn
 from ..scopes import is_captured
-from .anderson import run_sweeps
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
+from .sweep import sweep
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
@@ -37,7 +37,7 @@ _FIELDS = _DIFFERENTIABLE + 1  # and the origin
 
 
 def global_sweep(
-    model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
+    model: System, fields: ops.SweepFields, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
     then: Callable[[Tensor], Tensor] = lambda x: x,
 ) -> Tensor:  # fmt: skip
     """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``fields``: without contact."""
@@ -50,7 +50,8 @@ class _GlobalSweep(Function):
     def forward(ctx: Any, *args: Any) -> Tensor:
         others, model, settings, adjoint, debug_step = args[_FIELDS:-1]
         fields = ops.SweepFields(*args[:_FIELDS], *others)
-        x = run_sweeps(model, fields, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step).x
+        x, _, _ = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE,
+                        debug_step=debug_step)  # fmt: skip
         x = args[-1](x)
         ctx.save_for_backward(*fields[:_FIELDS], x)
         ctx.model, ctx.h, ctx.adjoint = model, settings.numbers.time_step, adjoint
@@ -222,7 +223,7 @@ class _Structure(NamedTuple):
     free: Tensor  # [free]
 
 
-def _structure(model: Model) -> _Structure:
+def _structure(model: System) -> _Structure:
     count, tets, free = model.num_vertices, model._topology[0], ~model._pinned
     a, b = (list(corners) for corners in zip(*PAIRS, strict=True))
     rows, columns = tets[:, a + b].reshape(-1), tets[:, b + a].reshape(-1)

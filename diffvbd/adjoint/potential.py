@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..model.model import Model
+from ..model.system import System
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
@@ -41,7 +41,7 @@ class IncrementalPotential:
     Per tet, arrays are [3 edges, 3 components, B, T]: rows of whole meshes, which elementwise operations want.
     """
 
-    def __init__(self, model: Model, x: Tensor, fields: ops.SweepFields, time_step: float) -> None:
+    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, time_step: float) -> None:
         """fields: of the step; where its sweeps start does not enter."""
         self.model, self.x, self.h = model, x, time_step
         self.x_prev, self.y, self.data = fields.x_prev, fields.y, fields.energy_data

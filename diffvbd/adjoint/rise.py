@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..model.anderson import MovingBodies
-from ..model.model import Model
-from ..ops.anderson import potential_rise
+from ..model.moving import MovingBodies
+from ..model.system import System
+from ..ops.rise import potential_rise
 
 ROUNDINGS = 8  # ulps of the terms by which a sum may rise all the same; twin of kRounding in csrc/coarse/length.h
 
@@ -18,7 +18,7 @@ ROUNDINGS = 8  # ulps of the terms by which a sum may rise all the same; twin of
 class RiseParts(NamedTuple):
     """What comparisons of the potential in one step have in common."""
 
-    model: Model
+    model: System
     fields: ops.SweepFields  # detached; where the sweeps start does not enter
     material: Tensor  # [1 | B, blocks, 2, 8], mu and lam of the tets by body [Pa]
     rest: Tensor  # [1 | B, blocks, 7, 8]
@@ -43,7 +43,7 @@ class RiseParts(NamedTuple):
         return moves > admitted[:, of]  # moves and not admitted, in one launch
 
 
-def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseParts:
+def rise_parts(model: System, fields: ops.SweepFields, time_step: float) -> RiseParts:
     """fields: of the step's sweeps."""
     # contiguous: a state may be expanded over scenes
     fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore

@@ -27,23 +27,17 @@ def full_tape_limit(device: torch.device) -> int:
 class ReverseSweep:
     """The executed sweeps backwards: exact for every number of sweeps, without a global system. Recommended.
 
-    Args:
-        tape: What a step keeps for its backward, per active vertex and sweep (float64):
-            ``"full"`` 72 bytes, raw update and factored block (104 with a floor, whose gaps must come back to the bit);
-            ``"compact"`` 24 bytes, raw update, or with a floor 32, the old position; blocks are assembled again;
-            ``"recompute"`` nothing; the backward runs the step again;
-            ``"auto"`` full while a step's full tape fits 256 MiB, or on CUDA 1/256 of the device's memory if that is
-            more, compact beyond; a rollout that keeps all its tapes decides by their sum against 2 GiB, one with
-            checkpoints keeps the tapes of some steps at a time.
+    What a step keeps for it is said by ``VBD(tape=)``.
 
     Source: paper, section 3; docs/method.md, sections 3 and 7.
     """
 
-    tape: Literal["auto", "full", "compact", "recompute"] = "auto"
 
-    def __post_init__(self) -> None:
-        if not is_word(self.tape, "auto", "full", "compact", "recompute"):
-            fail("tape", '"auto", "full", "compact" or "recompute"', repr(self.tape))
+@dataclass(frozen=True)
+class TapedSweep(ReverseSweep):
+    """ReverseSweep with the tape of a solver: see :class:`diffvbd.VBD`."""
+
+    tape: str = "auto"
 
     def policy(self, scalars_per_row: int, itemsize: int, energies: int, device: torch.device) -> int:
         """The tape policy of ops.fields for a step of scalars_per_row = scenes x sweeps x active vertices."""
@@ -126,11 +120,13 @@ class GlobalAdjoint:
 Adjoint = ReverseSweep | Unrolled | GlobalAdjoint
 
 
-def check_adjoint(adjoint: Adjoint | None) -> Adjoint:
-    """The route to take; None is the default one."""
-    if adjoint is None:
-        return ReverseSweep()
-    if not isinstance(adjoint, (ReverseSweep, Unrolled, GlobalAdjoint)):
+def check_adjoint(adjoint: Adjoint | None, tape: str = "auto") -> Adjoint:
+    """The route to take, with the tape of the solver; None is the default one."""
+    if isinstance(adjoint, TapedSweep):
+        return adjoint
+    if adjoint is None or isinstance(adjoint, ReverseSweep):
+        return TapedSweep(tape)
+    if not isinstance(adjoint, (Unrolled, GlobalAdjoint)):
         kinds = "diffvbd.ReverseSweep, Unrolled or GlobalAdjoint"
         got = f"the class {adjoint.__name__}" if isinstance(adjoint, type) else type(adjoint).__name__
         raise TypeError(f"adjoint: expected a {kinds}, got {got}")

@@ -41,7 +41,7 @@ def backward_memory(x: Tensor, settings: ops.SweepSettings, tape_policy: int) ->
         native = f" ({error})" if x.is_cuda else ""
         raise torch.OutOfMemoryError(
             f"{x.device.type.upper()} out of memory in the backward of a step{bytes_wanted}{native}: use fewer sweeps "
-            'or scenes, a smaller tape (ReverseSweep(tape="compact"), then "recompute") or more checkpoints'
+            'or scenes, a smaller tape (VBD(tape="compact"), then "recompute") or more checkpoints'
         ) from error
 
 

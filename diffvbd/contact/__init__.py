@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         center_of_mass_penalty,
         forces,
         intersections,
-        record,
         reserve,
         status,
     )
@@ -30,7 +29,6 @@ __all__ = [
     "center_of_mass_penalty",
     "forces",
     "intersections",
-    "record",
     "reserve",
     "status",
 ]

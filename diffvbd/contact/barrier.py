@@ -49,7 +49,7 @@ class PairBarrier:
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
 
-    Differentiable as ``pair_barrier.kappa`` and ``pair_barrier.damping`` (scalars).
+    Inputs: ``pair_kappa`` and ``pair_damping`` (scalars).
 
     Raises:
         ValueError, TypeError: For numbers out of range.
@@ -58,9 +58,10 @@ class PairBarrier:
     docs/method.md, section 12.
     """
 
-    name: ClassVar[str] = "pair_barrier"
+    name: ClassVar[str] = "pair"
     bit: ClassVar[int] = CONTACT
     parameters: ClassVar[dict[str, int]] = {"kappa": 0, "damping": 0}
+    units: ClassVar[dict[str, str]] = {"kappa": "N/m", "damping": "N s/m"}
 
     kappa: float = 400.0
     dhat: float = 0.02
@@ -106,7 +107,7 @@ class Friction:
         coefficient: mu_f >= 0.
         velocity: eps_v > 0 [m/s].
 
-    Differentiable as ``friction.coefficient`` (scalar).
+    Input: ``friction`` (scalar), the coefficient.
 
     Raises:
         ValueError: A coefficient < 0 or not finite, a velocity below 1e-12 m/s.
@@ -118,6 +119,7 @@ class Friction:
     name: ClassVar[str] = "friction"
     bit: ClassVar[int] = CONTACT
     parameters: ClassVar[dict[str, int]] = {"coefficient": 0}
+    units: ClassVar[dict[str, str]] = {"coefficient": "-"}
 
     coefficient: float = 0.5
     velocity: float = 1e-3

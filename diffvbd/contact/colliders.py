@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..checks import check_positive, fail
 from ..mesh.arrays import float_array, int_array
+from ..mesh.surfaces import surface_arrays
 
 MOST_LENGTH = 1e9  # [m] of coordinates and radii: fourth powers of distances must be numbers in float32
 
@@ -123,15 +124,20 @@ class Obstacle:
     """A triangle mesh, open or closed; both sides collide.
 
     Args:
-        points: [n, 3] [m].  triangles: Indices [F, 3].
+        points: [n, 3] [m].  triangles: Indices [F, 3]. Or ``points`` alone: the file of a surface in metres, or a mesh
+            of trimesh or pyvista.
     """
 
     points: Any = None
     triangles: Any = None
 
     def corners(self) -> Corners:
-        points = _place("points", self.points, (None, 3))
-        triangles = int_array("triangles", self.triangles, (None, 3))
+        if self.triangles is None and self.points is not None:
+            points, triangles = surface_arrays(self.points)
+            points = _place("points", points, (None, 3))
+        else:
+            points = _place("points", self.points, (None, 3))
+            triangles = int_array("triangles", self.triangles, (None, 3))
         if triangles.size == 0:
             fail("triangles", "at least one", 0)
         if triangles.min() < 0 or triangles.max() >= len(points):

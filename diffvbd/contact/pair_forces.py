@@ -15,7 +15,7 @@ from torch import Tensor
 from ..checks import fail
 from ..energies import damped_share
 from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from ..reference.friction import smoothed
+from ..reference.energies import smoothed
 from .barrier import PairBarrier
 from .detection import detect
 from .surface import LEAST_CAPACITY, ContactSurface

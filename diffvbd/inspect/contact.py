@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,7 +13,6 @@ from ..contact.barrier import PairBarrier
 from ..contact.detection import intersections as find
 from ..contact.surface import build_surface
 from ..model.model import Model
-from ..scopes import record_to
 from ..step.met import Detection, outcomes
 from .forces import ForceParts, Forces, forces
 from .penalty import Bodies, center_of_mass_penalty
@@ -29,7 +26,6 @@ __all__ = [
     "center_of_mass_penalty",
     "forces",
     "intersections",
-    "record",
     "reserve",
     "status",
 ]
@@ -97,26 +93,15 @@ def reserve(model: Model, pairs: int) -> None:
     if surface is None or model.contact is None:
         fail("model", "a PairBarrier among its energies", "none")
     pairs = check_count("pairs", pairs, 1, 2**26)
-    for other in model._derived.values():  # what runs in its place with settings
-        if isinstance(other, Model) and other.contact is not None:
-            reserve(other, pairs)
     model.surface_of_contact = replace(surface, capacity=pairs)
     if model.contact.capacity is None:  # it still grows by itself
         return
     barrier = replace(model.contact, capacity=pairs)
     model._set_energies(tuple(barrier if e is model.contact else e for e in model.energies))
+    for name in [name for name, value in model._derived.items() if isinstance(value, Model)]:
+        del model._derived[name]  # Systems of the old barrier
     for energy in model.parametric_energies:  # here, so that a step that is captured copies nothing from the host
         model.constants(energy)
-
-
-@contextlib.contextmanager
-def record() -> Iterator[list[Detection]]:
-    """Inside, the detections of all steps (those that a checkpointed backward runs again, too) are appended to the list
-    that it gives: which pairs were near, for looking at and for comparing with ``diffvbd.reference.contact_step``.
-    Steps of other threads and tasks are not recorded, those under torch.compile are."""
-    found: list[Detection] = []
-    with record_to(found):
-        yield found
 
 
 def intersections(model: Model, x: Tensor) -> Tensor:

@@ -3,7 +3,6 @@ where the error of the step is asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,18 +10,25 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from ..checks import check_bool, check_broadcast, check_positive, check_tensor, fail, name_value
+from ..checks import check_bool, check_broadcast, check_tensor, name_value
+from ..mask import ELASTIC
+from ..model.inputs import LOADS, MODULI, Given
+from ..model.material import moduli_of
 from ..model.model import Model
-from ..model.moduli import moduli_of
+from ..model.solver import VBD, ImplicitEuler
+from ..model.system import System, system_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
 from ..said import percent
 from ..said import warn as say
-from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, refuse_non_finite
-from ..step.balance import (
+from ..step.arguments import acceleration_of, check_prescribed, check_state, given_of, prepare, refuse_non_finite
+from ..step.predict import begin
+from ..step.residual import (
     UNBALANCED,
     UNBALANCED_FRICTION,
+    ErrorEstimate,
     Norm,
     contact_of_step,
+    error_of,
     friction_left_over,
     left_over,
     of_bodies,
@@ -31,8 +37,6 @@ from ..step.balance import (
     rounding,
     share,
 )
-from ..step.estimate import ErrorEstimate, check_estimable, error_of
-from ..step.predict import begin
 from .wide import check_previous, wide, widen
 
 # Limits with their measurements in docs/numerics.md
@@ -65,7 +69,7 @@ class Diagnosis:
         residuals: The same for each body of ``model.body``, shape [..., bodies].
         friction_residuals: Of a Model with Friction, what is left over along the contact of each body, over the most
             that friction can bear there [-], shape [..., bodies]; of forces summed where friction acts.
-        errors: Estimate for each body, shapes [..., bodies], where ``sweeps`` was given.
+        errors: Estimate for each body, shapes [..., bodies], of a step without contact and friction.
         relative_error: The largest estimated error over motion [-], of bodies whose error is no rounding; NaN where a
             step has too few sweeps to tell.
     """
@@ -112,21 +116,11 @@ class Diagnosis:
 def diagnose(
     model: Model,
     x: Tensor,
+    solver: VBD | None = None,
     *,
-    mu: float | Tensor | None = None,
-    lam: float | Tensor | None = None,
-    young: float | Tensor | None = None,
-    poisson: float | Tensor | None = None,
-    time_step: float | None = None,
     previous: tuple[Tensor, Tensor] | None = None,
-    force: Tensor | None = None,
-    gravity: Sequence[float] | Tensor = GRAVITY,
-    prescribed: Tensor | None = None,
-    colliders: Tensor | None = None,
-    colliders_before: Tensor | None = None,
-    parameters: dict[str, Any] | None = None,
-    sweeps: int | None = None,
     warn: bool = True,
+    **inputs: Any,
 ) -> Diagnosis:
     """Looks for what makes a result unreliable: collapsed or inverted tets, lost digits, safeguards out of scale, too
     few sweeps. Not differentiable; call it on a first and a last frame, not in every step.
@@ -134,47 +128,41 @@ def diagnose(
     Args:
         model: The scene.
         x: Positions [m], shape [..., V, 3].
-        mu, lam, young, poisson: Material, as in :func:`diffvbd.step`.
-        time_step: h [s]; needed for the Courant number, the stiffness and the left-over force.
-        previous: State (x, v) from which one step led to ``x``; needed for the left-over force. force [N],
-            gravity [m/s^2], prescribed [m], colliders [m], colliders_before [m] and parameters are then those of that
-            step.
-        sweeps: K of that step: gives an estimate of its error, for which the step is swept again. Needs ``previous``.
+        solver: Of the scene, or of the step that led to ``x``; needed for the Courant number, the stiffness and what
+            follows from ``previous``.
+        previous: State (x, v) from which one step led to ``x``; needed for the left-over force and, without contact and
+            friction, for an estimate of the step's error, for which it is swept again.
+        inputs: As in :func:`diffvbd.step`, those of that step.
         warn: Also emit each message as a UserWarning.
 
     Returns:
         A :class:`Diagnosis`; print it for a table.
 
     Raises:
-        ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without ``time_step``,
-            and for ``sweeps`` without ``previous``.
-        NotImplementedError: ``sweeps`` with contact or friction.
+        ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without a solver.
 
     The F = 0 well: with s* the root of s^3 + s^2 + s = mu / (mu + lam), the elastic stress pulls every F with
     |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
     """
     lead = check_state(model, x, x)
     check_bool("warn", warn)
-    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    system = system_of(model, VBD(1.0, 0) if solver is None else solver)
+    given = given_of(model, inputs)
+    mu, lam, young, poisson = (given.material[name] for name in MODULI)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson) if model.energy_mask & ELASTIC else (0.0, 0.0)
     for name, value in (("mu", mu), ("lam", lam)):
         value = check_broadcast(name, check_tensor(name, value, model._mass), (*lead, model.num_tets), len(lead))
         name_value(name, "finite values", value, torch.isfinite(value))
-    check_previous(model, previous, x, time_step)
+    check_previous(model, previous, x, solver)
     errors = unbalanced = residuals = friction = None
-    if previous is None and sweeps is not None:
-        fail("sweeps", "the previous state beside it", "none")
-    if previous is not None:
-        check_prescribed(model, prescribed, previous[0])
-        loads = {"force": force, "gravity": gravity, "prescribed": prescribed}
-        refuse_non_finite(model, loads)
-        where = {"colliders": colliders, "colliders_before": colliders_before}
-        material = {"mu": mu, "lam": lam, "parameters": parameters}
-        unbalanced, residuals, friction = _balance(model, x, previous, time_step, loads, where, material)
-    if previous is not None and sweeps is not None and time_step is not None:
-        check_estimable(model, "sweeps")
-        prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=None,
-                           density=None, parameters=parameters)  # fmt: skip
-        errors = error_of(model, *previous, prepared, force=force, gravity=gravity, prescribed=prescribed)
+    if previous is not None and solver is not None:
+        check_prescribed(system, given.loads["prescribed"], previous[0])
+        loads = {name: given.loads[name] for name in LOADS}
+        refuse_non_finite(system, loads)
+        unbalanced, residuals, friction = _balance(model, x, previous, solver, given)
+        if not model.touches and solver.sweeps and isinstance(solver.integrator, ImplicitEuler):
+            prepared = prepare(system, lead, given, time_step=solver.time_step, sweeps=solver.sweeps)
+            errors = error_of(system, *previous, prepared, **loads)
     state = x.detach().to(torch.float64)
     mu, lam = (_as(a, state) for a in (mu, lam))
     points = torch.from_numpy(model.mesh.points.copy()).to(state)
@@ -189,8 +177,8 @@ def diagnose(
     margin = norm / (3**0.5 * critical)
     edge = _edge_lengths(points, model.tets)
     courant = stiffness = None
-    if time_step is not None:
-        h = check_positive("time_step", time_step, "s")
+    if solver is not None:
+        h = solver.time_step
         stiffness = _largest(h * h * _block_ratio(model, gradients, volume, mu, lam))
         speed = ((lam + 2 * mu) / model.density.to(state)).clamp(min=0).sqrt()
         height = 1 / gradients.square().sum(-1).amax(-1).sqrt()  # the shortest of a tet's four
@@ -213,8 +201,8 @@ def diagnose(
         errors=errors,
         relative_error=None if errors is None else _largest(_relative(errors, edge)),
     )
-    result.messages.extend(_state_messages(model, result) + _error_messages(model, result, edge))
-    result.messages.extend(_setting_messages(model, mu, lam, edge))
+    result.messages.extend(_state_messages(system, result) + _error_messages(system, result, edge))
+    result.messages.extend(_setting_messages(system, mu, lam, edge))
     if warn:
         for message in result.messages:
             say(f"diffvbd: {message}")
@@ -260,16 +248,10 @@ def _block_ratio(model: Model, gradients: Tensor, volume: Tensor, mu: Tensor, la
 
 
 def _balance(
-    model: Model,
-    x: Tensor,
-    previous: tuple[Tensor, Tensor],
-    time_step: float | None,
-    loads: dict[str, Any],
-    where: dict[str, Any],
-    material: dict[str, Any],
+    model: Model, x: Tensor, previous: tuple[Tensor, Tensor], solver: VBD, inputs: Given
 ) -> tuple[float, Tensor, Tensor | None]:
     """``unbalanced``, ``residuals`` and ``friction_residuals`` of a :class:`Diagnosis`."""
-    given = widen(model, x, time_step, *where.values(), **material)
+    given = widen(model, x, solver, inputs)
     double, prepared = given.model, given.prepared
     norm, lead = of_bodies(double), x.shape[:-2]
     if not all(bool(torch.isfinite(t).all()) for t in (x, *previous)):
@@ -278,7 +260,7 @@ def _balance(
         return float("nan"), unknown, None
     with torch.no_grad():
         x0, v0 = (t.detach().double() for t in previous)
-        force, gravity, prescribed = (wide(value) for value in loads.values())
+        force, gravity, prescribed = (wide(inputs.loads[name]) for name in LOADS)
         begun = begin(double, x0, v0, prepared, force, acceleration_of(gravity, x0), prescribed)
         contact = contact_of_step(double, begun, prepared, (given.before, given.colliders) if model.touches else None)
         at = potential_of_step(double, x.detach().double().reshape(begun.y.shape), begun, prepared, contact)
@@ -313,7 +295,7 @@ def _place(values: Tensor) -> str:
     return f"body {body}" + (f" of scene {scene}" if scene else "")
 
 
-def _state_messages(model: Model, result: Diagnosis) -> list[str]:
+def _state_messages(model: System, result: Diagnosis) -> list[str]:
     out = []
     if bool(result.nonfinite.any()):
         first = result.nonfinite.nonzero()[0].tolist()
@@ -343,7 +325,7 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
                    f"smaller time step{faster}")  # fmt: skip
     slip = result.friction_residuals
     if slip is not None and not _largest(slip) <= UNBALANCED_FRICTION:
-        faster = ', coarse="auto"' if model.coarse is None else ""
+        faster = ', subspace="coarse"' if model.coarse is None else ""
         out.append(f"friction has not converged: {percent(_largest(slip))} of what it can bear on {_place(slip)} is "
                    f"not balanced; take more sweeps, a smaller time step{faster} or a larger "
                    "Friction(velocity=)")  # fmt: skip
@@ -356,7 +338,7 @@ def _relative(errors: ErrorEstimate, edge: Tensor) -> Tensor:
     return torch.where(errors.error <= least, 0, errors.relative)
 
 
-def _error_messages(model: Model, result: Diagnosis, edge: Tensor) -> list[str]:
+def _error_messages(model: System, result: Diagnosis, edge: Tensor) -> list[str]:
     if result.errors is None:
         return []
     relative = _relative(result.errors, edge)
@@ -365,14 +347,14 @@ def _error_messages(model: Model, result: Diagnosis, edge: Tensor) -> list[str]:
         return []
     *scene, body = torch.where(wrong, relative, 0).eq(relative[wrong].max()).nonzero()[0].tolist()
     where = f"body {body}" + (f" of scene {scene}" if scene else "")
-    coarse = ', or coarse="auto"' if model.coarse is None else ""
+    coarse = ', or subspace="coarse"' if model.coarse is None else ""
     return [f"the step ends about {percent(float(relative[(*scene, body)]))} of its motion from where it would "
             f"converge, in {where}; often three times as much: take more sweeps{coarse}"]  # fmt: skip
 
 
-def _setting_messages(model: Model, mu: Tensor, lam: Tensor, edge: Tensor) -> list[str]:
+def _setting_messages(model: System, mu: Tensor, lam: Tensor, edge: Tensor) -> list[str]:
     out = []
-    paper = any(getattr(e, "block", "") == "paper" for e in model.energies)
+    paper = model.block == "paper"
     if bool((3 * lam + 2 * mu < 0).any()):
         out.append("lam < -2/3 mu: the bulk modulus is negative and the rest state unstable")
     if paper and model.saturation is None and bool((lam < mu).any()):

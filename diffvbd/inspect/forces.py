@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -17,10 +16,19 @@ from ..adjoint.potential import IncrementalPotential
 from ..checks import fail, name_value
 from ..contact.pair_forces import NearPairs
 from ..energies import StableNeoHookean
+from ..model.inputs import COLLIDERS, Given
+from ..model.material import shape_gradients
 from ..model.model import Model
-from ..model.rest import shape_gradients
+from ..model.solver import VBD
 from ..scopes import looks_at
-from ..step.arguments import GRAVITY, acceleration_of, broadcastable, check_state, refuse_non_finite
+from ..step.arguments import (
+    acceleration_of,
+    broadcastable,
+    check_state,
+    given_of,
+    material_of,
+    refuse_non_finite,
+)
 from .wide import Wide, check_previous, wide, widen
 
 # --- contact ----------------------------------------------------------------------------------------------------------
@@ -79,45 +87,39 @@ class Forces:
 
 
 def forces(
-    model: Model,
-    x: Tensor,
-    *,
-    previous: tuple[Tensor, Tensor] | None = None,
-    time_step: float | None = None,
-    colliders: Tensor | None = None,
-    colliders_before: Tensor | None = None,
-    parameters: dict[str, Any] | None = None,
+    model: Model, x: Tensor, solver: VBD | None = None, *, previous: tuple[Tensor, Tensor] | None = None, **inputs: Any
 ) -> Forces:
     """Forces that pairs, colliders and floors exert at x, by vertex, by two bodies, by collider and by plane.
 
     The barrier's forces are those at x. Damping and friction are those of a step: they follow from its start and from
-    its motion, so they need ``previous`` and ``time_step``; without these x is at rest and they are zero. Which
+    its motion, so they need ``previous`` and ``solver``; without these x is at rest and they are zero. Which
     pairs are near has no derivative; all else is differentiable by autograd. Computed in float64.
 
     Args:
         model: The scene; a FloorBarrier or a PairBarrier exerts the forces.
         x: Positions [m], shape [..., V, 3].
+        solver: That of the step, whose time step is read.
         previous: State (x, v) from which one step led to ``x``, of x's shape; v is not read.
-        time_step: h of that step [s].
-        colliders: Collider points [m] where x is, broadcasts to x.shape[:-2] + (Vc, 3). None: the Model's.
-        colliders_before: The same at the start of the step. None: they rest.
-        parameters: As in :func:`diffvbd.step`, as {"friction.coefficient": tensor}.
+        inputs: As in :func:`diffvbd.step`; those of the barriers, friction, colliders and colliders_before are read.
 
     Returns:
         A :class:`Forces`, of x's dtype.
 
     Raises:
         ValueError, TypeError: As :func:`diffvbd.step`; also where surfaces touch, for vertices on or below a floor, and
-            for ``previous`` without ``time_step``.
+            for ``previous`` without a solver.
 
     Source: Li et al. (2020); docs/method.md, sections 6 and 12.
     """
     check_state(model, x, x)
-    check_previous(model, previous, x, time_step)
+    check_previous(model, previous, x, solver)
+    given_inputs = given_of(model, inputs)
     start = None if previous is None else previous[0]
-    _refuse_non_finite(model, {"x": x, "previous: x": start, "colliders": colliders,
-                               "colliders_before": colliders_before})  # fmt: skip
-    given = widen(model, x, time_step, colliders, colliders_before, mu=0.0, lam=0.0, parameters=parameters)
+    _refuse_non_finite(model, {"x": x, "previous: x": start,
+                               **{name: given_inputs.loads[name] for name in COLLIDERS}})  # fmt: skip
+    given = widen(
+        model, x, solver, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, given_inputs.loads)
+    )
     _refuse_below(given, {"x": x, "previous: x": start})
     state = _contact_at(given, x, previous)
     lead, dtype = x.shape[:-2], x.dtype
@@ -225,22 +227,7 @@ class _OfBodies:
 
 
 def reactions(
-    model: Model,
-    x: Tensor,
-    *,
-    mu: float | Tensor | None = None,
-    lam: float | Tensor | None = None,
-    young: float | Tensor | None = None,
-    poisson: float | Tensor | None = None,
-    previous: tuple[Tensor, Tensor] | None = None,
-    time_step: float | None = None,
-    force: Tensor | None = None,
-    gravity: Sequence[float] | Tensor = GRAVITY,
-    colliders: Tensor | None = None,
-    colliders_before: Tensor | None = None,
-    rest_points: Tensor | None = None,
-    density: float | Tensor | None = None,
-    parameters: dict[str, Any] | None = None,
+    model: Model, x: Tensor, solver: VBD | None = None, *, previous: tuple[Tensor, Tensor] | None = None, **inputs: Any
 ) -> Tensor:
     """Forces that hold the pinned vertices where they are: what a support must bear, with the opposite sign.
 
@@ -249,10 +236,9 @@ def reactions(
     in float64.
 
     Args:
-        model, mu, lam, young, poisson, force, gravity, rest_points, density, parameters: As in :func:`diffvbd.step`.
-            A force on a pinned vertex goes into its support.
+        model, inputs: As in :func:`diffvbd.step`. A force on a pinned vertex goes into its support.
         x: Positions [m], shape [..., V, 3].
-        previous, time_step, colliders, colliders_before: As in :func:`diffvbd.contact.forces`; v is read.
+        solver, previous: As in :func:`diffvbd.contact.forces`; v is read.
 
     Returns:
         Reactions [N], x's shape and dtype; zero at vertices that are not pinned.
@@ -263,13 +249,14 @@ def reactions(
     Source: docs/method.md, sections 1, 2 and 12.
     """
     check_state(model, x, x)
-    check_previous(model, previous, x, time_step)
+    check_previous(model, previous, x, solver)
+    given_inputs = given_of(model, inputs)
+    loads = given_inputs.loads
     state = {} if previous is None else {"previous: x": previous[0], "previous: v": previous[1]}
-    pull = acceleration_of(gravity, x)
-    _refuse_non_finite(model, {"x": x, **state, "colliders": colliders, "colliders_before": colliders_before,
-                               "force": force, "gravity": pull})  # fmt: skip
-    given = widen(model, x, time_step, colliders, colliders_before, mu=mu, lam=lam, young=young, poisson=poisson,
-                  rest_points=rest_points, density=density, parameters=parameters)  # fmt: skip
+    pull, force = acceleration_of(loads["gravity"], x), loads["force"]
+    _refuse_non_finite(model, {"x": x, **state, **{name: loads[name] for name in COLLIDERS}, "force": force,
+                               "gravity": pull})  # fmt: skip
+    given = widen(model, x, solver, given_inputs)
     _refuse_moduli(given.prepared.mu, given.prepared.lam)
     _refuse_below(given, {"x": x})
     prepared, h = given.prepared, given.prepared.settings.numbers.time_step
@@ -301,16 +288,7 @@ class Stress(NamedTuple):
     von_mises: Tensor
 
 
-def stress(
-    model: Model,
-    x: Tensor,
-    mu: float | Tensor | None = None,
-    lam: float | Tensor | None = None,
-    *,
-    young: float | Tensor | None = None,
-    poisson: float | Tensor | None = None,
-    rest_points: Tensor | None = None,
-) -> Stress:
+def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     """Cauchy stress of each tet and the von Mises stress that follows from it.
 
         cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
@@ -318,7 +296,7 @@ def stress(
     Args:
         model: A scene with StableNeoHookean tets.
         x: Positions [m], shape [..., V, 3].
-        mu, lam, young, poisson, rest_points: As in :func:`diffvbd.step`.
+        inputs: As in :func:`diffvbd.step`; moduli and rest_points are read.
 
     Returns:
         A :class:`Stress` of x's dtype, differentiable by autograd in every tensor; the derivative of a von Mises stress
@@ -333,7 +311,9 @@ def stress(
     lead = x.shape[:-2]
     if not any(isinstance(energy, StableNeoHookean) for energy in model.energies):
         fail("model", "StableNeoHookean among its energies", "none")
-    given = widen(model, x, None, None, None, mu=mu, lam=lam, young=young, poisson=poisson, rest_points=rest_points)
+    given_inputs = given_of(model, inputs)
+    rest_points = given_inputs.material["rest_points"]
+    given = widen(model, x, None, Given(given_inputs.material, {}, {}))
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)
     gradients, _ = shape_gradients(points.expand(x.shape)[..., tets, :])

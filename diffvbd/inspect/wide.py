@@ -7,19 +7,20 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_kind, fail
+from ..model.inputs import Given
 from ..model.model import Model
+from ..model.solver import VBD
+from ..model.system import System, system_of
 from ..step.arguments import Prepared, check_state, collider_state, prepare
 from ..step.predict import energy_data
-
-_MATERIAL = ("mu", "lam", "young", "poisson", "rest_points", "density", "parameters")
 
 
 class Wide(NamedTuple):
     """A Model in float64, what does not depend on the state, and collider points at the start and the end of a step
     [B, Vc, 3]."""
 
-    model: Model
+    model: System
     prepared: Prepared
     before: Tensor
     colliders: Tensor
@@ -29,20 +30,20 @@ class Wide(NamedTuple):
         return energy_data(self.model, self.prepared, None)
 
 
-def widen(model: Model, x: Tensor, time_step: float | None, colliders: Any, colliders_before: Any, **material: Any
-          ) -> Wide:  # fmt: skip
-    """Arguments checked as those of a step; ``material``: those of ``mu`` to ``parameters`` that there are."""
+def widen(model: Model, x: Tensor, solver: VBD | None, given: Given) -> Wide:
+    """Inputs checked as those of a step; loads but colliders are not read. Without a solver the time step is 1 s."""
     lead = check_state(model, x, x)
-    options: dict[str, Any] = dict.fromkeys(_MATERIAL) | material
-    options |= {"time_step": 1.0 if time_step is None else time_step, "sweeps": 0}
-    prepared, where = prepare(model, lead, **options), collider_state(model, x, colliders, colliders_before)
+    solver = VBD(1.0, 0) if solver is None else solver
+    system, options = system_of(model, solver), {"time_step": solver.time_step, "sweeps": 0}
+    prepared = prepare(system, lead, given, **options)
+    where = collider_state(system, x, given.loads.get("colliders"), given.loads.get("colliders_before"))
     if where is None:
         none = x.new_zeros((x.shape[:-2].numel(), 0, 3))
         where = none, none
     if model.dtype == torch.float64:
-        return Wide(model, prepared, *where)
-    double = model.derived("in_float64", lambda: model.to(dtype=torch.float64))
-    prepared = prepare(double, lead, **{name: wide(value) for name, value in options.items()})
+        return Wide(system, prepared, *where)
+    double = system.derived("in_float64", lambda: system.to(dtype=torch.float64))
+    prepared = prepare(double, lead, Given(*(wide(part) for part in given)), **options)
     return Wide(double, prepared, wide(where[0]), wide(where[1]))
 
 
@@ -55,8 +56,10 @@ def wide(value: Any) -> Any:
     return type(value)(wide(each) for each in value) if isinstance(value, (tuple, list)) else value
 
 
-def check_previous(model: Model, previous: Any, x: Tensor, time_step: Any) -> None:
-    """Raises where ``previous`` is no state (x, v) beside a time step."""
+def check_previous(model: Model, previous: Any, x: Tensor, solver: Any) -> None:
+    """Raises where ``previous`` is no state (x, v) with a solver of the step from it."""
+    if solver is not None:
+        check_kind("solver", solver, VBD)
     if previous is None:
         return
     if not (isinstance(previous, (tuple, list)) and len(previous) == 2):
@@ -66,7 +69,7 @@ def check_previous(model: Model, previous: Any, x: Tensor, time_step: Any) -> No
         check_state(model, *previous)
     except (ValueError, TypeError) as error:
         raise type(error)(f"previous: {error}") from None
-    if time_step is None:
-        fail("time_step", "a number in [s] where previous is given", None)
+    if solver is None:
+        fail("solver", "that of the step where previous is given", None)
     if previous[0].shape != x.shape:
         fail("previous", f"x's shape {list(x.shape)}", f"shape {list(previous[0].shape)}")

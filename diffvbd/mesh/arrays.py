@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-
+MOST = 10**6  # vertices in a row
 _PACKAGE = str(Path(__file__).parents[1]) + os.sep
 
 
@@ -97,3 +97,35 @@ def listed(ids: IntArray, noun: str) -> str:
     """'3 tets: 1, 5, 9', at most five of them."""
     shown = ", ".join(map(str, ids[:5])) + (", ..." if len(ids) > 5 else "")
     return f"{len(ids)} {noun}{'' if len(ids) == 1 else 's'}: {shown}"
+
+
+def count(name: str, value: Any, least: int) -> int:
+    """`value` as an int of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name}: expected an integer, got {value!r}")
+    if not least <= value <= MOST:
+        bound = f"at least {least}" if value < least else f"at most {MOST}"
+        raise ValueError(f"{name}: expected {bound}, got {value}")
+    return int(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """`value` as a positive, finite float."""
+    number = float(float_array(name, value, ()))
+    if number <= 0:
+        raise ValueError(f"{name}: expected a positive length, got {number:.6g}")
+    return number
+
+
+def connected(cells: IntArray, count: int) -> IntArray:
+    """The lowest vertex of the connected cells [C, N] that each of `count` vertices is in, shape [count]."""
+    label = np.arange(count)
+    while True:  # each vertex takes the lowest label of its cells, and that label's own: paths halve each time
+        lowest = label[cells].min(axis=1)
+        new = label.copy()
+        for corner in cells.T:
+            np.minimum.at(new, corner, lowest)
+        new = new[new]
+        if np.array_equal(new, label):
+            return label
+        label = new

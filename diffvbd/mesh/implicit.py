@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, float_array
-from diffvbd.mesh.shapes import positive
+from diffvbd.mesh.arrays import FloatArray, IntArray, connected, float_array, positive
 from diffvbd.mesh.tet_mesh import TET_FACES, TetMesh, oriented
 
 ImplicitFunction = Callable[[FloatArray], FloatArray]
@@ -196,14 +195,7 @@ def _largest_piece(tets: IntArray) -> IntArray:
     order = np.lexsort(faces.T)
     same = np.nonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))[0]
     left, right = order[same] // 4, order[same + 1] // 4
-    label = np.arange(len(tets))
-    while True:
-        before = label.copy()
-        np.minimum.at(label, left, label[right])
-        np.minimum.at(label, right, label[left])
-        label = label[label]
-        if np.array_equal(label, before):
-            break
+    label = connected(np.stack([left, right], axis=1), len(tets))
     return tets[label == np.bincount(label).argmax()]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, overload
@@ -10,20 +11,18 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh import cells
-from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, float_array, listed, to_path, warn
-from diffvbd.mesh.pieces import connected, together
-from diffvbd.mesh.read import SURFACES, read_cells, read_surface
-from diffvbd.mesh.shapes import positive
+from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, connected, float_array, listed, positive, warn
+from diffvbd.mesh.read import SURFACES, Tets, kind_of, listed_kinds, read_cells, tets_of, triangles_of
 from diffvbd.mesh.tet_mesh import TetMesh, oriented, signed_volume
 
+Source = str | PathLike[str] | Any  # a path, or a mesh of trimesh, pyvista or meshio
 # Cell data that may hold body labels: ours, and the integer labels of Gmsh and Medit files.
 _BODY_DATA = ("body", "gmsh:physical", "medit:ref")
 
 
 @overload
 def load(
-    path: str | PathLike[str],
+    source: Source,
     *,
     orient: bool = True,
     return_vertices: Literal[False] = False,
@@ -31,24 +30,25 @@ def load(
 ) -> TetMesh: ...
 @overload
 def load(
-    path: str | PathLike[str], *, orient: bool = True, return_vertices: Literal[True], weld: float | None = None
+    source: Source, *, orient: bool = True, return_vertices: Literal[True], weld: float | None = None
 ) -> tuple[TetMesh, IntArray]: ...
 
 
 def load(
-    path: str | PathLike[str], *, orient: bool = True, return_vertices: bool = False, weld: float | None = None
+    source: Source, *, orient: bool = True, return_vertices: bool = False, weld: float | None = None
 ) -> TetMesh | tuple[TetMesh, IntArray]:
-    """Read the tets of a mesh file: Gmsh, VTK, VTU, Medit, Abaqus, TetGen, XDMF and whatever else meshio reads.
+    """Tets of a mesh file: Gmsh, VTK, VTU, Medit, Abaqus, TetGen, XDMF and whatever else meshio reads.
 
-    All volume cells are taken, in the order of the file; of cells of higher order the corners. Hexahedra, wedges and
-    pyramids are cut into tets, with a UserWarning. Faces and lines are ignored and vertices without tets dropped.
-    A UserWarning says what else of a file is not in the mesh.
+    All volume cells are taken, in the order of the file. Hexahedra, wedges and pyramids are cut into tets. Cells of
+    higher order keep their corners; the nodes between these are left out. Faces and lines are ignored and vertices
+    without tets dropped. A UserWarning says what of a file is not in the mesh, or was cut.
 
     Cell data `body`, or the labels of Gmsh and Medit files, become `TetMesh.body` where there are at least two and no
     vertex is shared between them. Otherwise each connected piece is a body.
 
     Args:
-        path: The file; its extension tells the format. Coordinates are taken as metres.
+        source: The file; its extension tells the format. Or a mesh of pyvista (`UnstructuredGrid`) or meshio.
+            Coordinates are taken as metres.
         orient: Exchange two vertices of every tet of negative volume: files often mix orientations.
         return_vertices: Also return the index in the file of each vertex of the mesh, shape [V].
         weld: Vertices that are at most so far apart become one [m]: where two parts were meshed each for itself, they
@@ -56,14 +56,14 @@ def load(
             does the same without it.
 
     Raises:
-        TypeError: no path.
+        TypeError: neither a path nor a mesh of such a library.
         FileNotFoundError: no such file.
         ValueError: unreadable or truncated file, unknown format, one of which not all nodes arrive, no tets in it, or
             tets that TetMesh refuses, also once they are welded; hexahedra that are too distorted to be cut.
         ImportError: the format needs a package that is not installed.
     """
     check_flag("return_vertices", return_vertices)
-    found = _read_tets(to_path("path", path), orient, weld)
+    found = _read_tets(source, orient, weld)
     return (found.mesh, found.vertices) if return_vertices else found.mesh
 
 
@@ -75,14 +75,14 @@ class Fields(NamedTuple):
     cell_data: dict[str, NDArray[Any]]
 
 
-def load_fields(path: str | PathLike[str], *, orient: bool = True, weld: float | None = None) -> Fields:
-    """Read the tets of a mesh file and the values that it has for vertices and tets, as `save` writes them.
+def load_fields(source: Source, *, orient: bool = True, weld: float | None = None) -> Fields:
+    """Tets of a mesh file and the values that it has for vertices and tets, as `save` writes them.
 
     Rows follow the vertices and tets of the mesh: values of dropped vertices and of other cells are left out. Units are
     those of the file. Cell data `body` is not repeated here where it has become `TetMesh.body`.
 
     Args:
-        path, orient, weld: As in `load`. A tet cut out of a cell has the values of the cell, a welded vertex those of
+        source, orient, weld: As in `load`. A tet cut out of a cell has the values of the cell, a welded vertex those of
             the first one in its place.
 
     Returns:
@@ -92,27 +92,26 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True, weld: float |
         TypeError, FileNotFoundError, ImportError: As `load`.
         ValueError: As `load`, and for values of another number of rows, or that are no numbers.
     """
-    path = to_path("path", path)
-    content, mesh, vertices, rows, labels = _read_tets(path, orient, weld)
+    content, mesh, vertices, rows, labels = _read_tets(source, orient, weld)
     points: dict[str, NDArray[Any]] = {}
     for name, values in content.point_data.items():
         if name == "gmsh:dim_tags":  # bookkeeping of meshio, which .msh files have always
             continue
-        points[name] = _rows(path, f"point_data[{name!r}]", values, len(content.points))[vertices]
+        points[name] = _rows(source, f"point_data[{name!r}]", values, len(content.points))[vertices]
     of_tets: dict[str, NDArray[Any]] = {}
     for name, values in content.cell_data.items():
         if name != labels or name != "body":
             label = f"cell_data[{name!r}]"
-            found = [_rows(path, label, values[k], len(content.cells[k].data))[parents] for k, parents in rows]
+            found = [_rows(source, label, values[k], len(content.cells[k].data))[parents] for k, parents in rows]
             of_tets[name] = np.concatenate(found)
     return Fields(mesh, points, of_tets)
 
 
-def _rows(path: Path, label: str, values: Any, rows: int) -> NDArray[Any]:
+def _rows(source: Source, label: str, values: Any, rows: int) -> NDArray[Any]:
     array = np.asarray(values)
     if array.dtype.kind not in "iuf" or array.ndim == 0 or len(array) != rows:
         got = f"shape {list(array.shape)} of dtype {array.dtype}"
-        raise ValueError(f"mesh file {path}: {label}: expected {rows} rows of numbers, got {got}")
+        raise ValueError(f"{name_of(source)}: {label}: expected {rows} rows of numbers, got {got}")
     # torch takes no numbers in the byte order of .vtk files
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
@@ -128,25 +127,33 @@ class _Found(NamedTuple):
     labels: str
 
 
-def _read_tets(path: Path, orient: bool, weld: float | None) -> _Found:
+def name_of(source: Source) -> str:
+    """A source as messages name it: the file, or the kind of object."""
+    return f"mesh file {source}" if isinstance(source, (str, PathLike)) else f"mesh of type {type(source).__name__}"
+
+
+def _read_tets(source: Source, orient: bool, weld: float | None) -> _Found:
     check_flag("orient", orient)
     distance = positive("weld", weld) if weld else weld
-    if path.suffix.lower() in SURFACES and path.is_file():
-        raise ValueError(f"mesh file {path} has no tets: {path.suffix} files hold surfaces, which {_FILLED}")
-    content, notes = read_cells(path)
-    found = cells.tets_of(content)
+    name = name_of(source)
+    if isinstance(source, (str, PathLike)) and (path := Path(source)).suffix.lower() in SURFACES and path.is_file():
+        raise ValueError(f"{name} has no tets: {path.suffix} files hold surfaces; {_FILL}")
+    content, notes = read_cells(source)
+    found = tets_of(content)
     if len(found.tets) == 0:
         others = ", ".join(sorted({block.type for block in content.cells})) or "no cells at all"
-        surface = len(cells.triangles_of(content)) > 0 and not found.left_out
-        raise ValueError(f"mesh file {path} has no tets (it has {others}){f': a surface {_FILLED}' if surface else ''}")
+        surface = len(triangles_of(content)) > 0 and not found.left_out
+        raise ValueError(f"{name} has no tets (it has {others}){f'; {_FILL}' if surface else ''}")
     if found.cut:
-        notes.append(f"{cells.listed_kinds(found.cut)} cells are cut into tets")
+        notes.append(f"{listed_kinds(found.cut)} cells are cut into tets")
+    if found.curved:
+        notes.append(f"{listed_kinds(found.curved)} cells keep their corners alone, without the nodes between these")
     if found.left_out:
-        notes.append(f"{cells.listed_kinds(found.left_out)} cells are left out")
+        notes.append(f"{listed_kinds(found.left_out)} cells are left out")
     try:
         mesh, vertices, labels, doubled = _mesh_of(content, found, orient, distance)
     except (TypeError, ValueError) as failure:
-        raise ValueError(f"mesh file {path}: {failure}") from None
+        raise ValueError(f"{name}: {failure}") from None
     if doubled and distance is None:
         step = float(f"{1e-6 * np.linalg.norm(np.ptp(mesh.points, axis=0)):.1g}")
         notes.append(
@@ -154,25 +161,24 @@ def _read_tets(path: Path, orient: bool, weld: float | None) -> _Found:
             "joins those that are closer than that [m], weld=0 keeps them"
         )
     for note in notes:
-        warn(f"mesh file {path}: {note}")
+        warn(f"{name}: {note}")
     return _Found(content, mesh, vertices, found.rows, labels)
 
 
-_FILLED = "is filled by `diffvbd mesh` or dv.mesh.tetrahedralize"
+_FILL = "`diffvbd mesh` or dv.mesh.tetrahedralize fill a surface with tets"
 
 
-def read_triangles(path: Path) -> tuple[NDArray[Any], IntArray]:
-    """Points and triangles of a surface file; faces of more corners are cut. Raises as `load` does."""
-    if path.suffix.lower() in SURFACES:
-        points, triangles = read_surface(path)
-    else:
-        content, notes = read_cells(path)
-        points, triangles = content.points, cells.triangles_of(content)
-        for note in notes:
-            warn(f"surface file {path}: {note}")
+def read_triangles(source: Source) -> tuple[NDArray[Any], IntArray]:
+    """Points and triangles of a surface; faces of more corners are cut. Raises as `load` does."""
+    content, notes = read_cells(source)
+    triangles = triangles_of(content)
+    for note in notes:
+        warn(f"{name_of(source)}: {note}")
     if len(triangles) == 0:
-        raise ValueError(f"surface file {path} has no triangles")
-    return points, triangles
+        tets = len(tets_of(content).tets)
+        hint = f"; it has {tets} tets, which dv.mesh.load reads" if tets else ""
+        raise ValueError(f"{name_of(source)} has no triangles{hint}")
+    return content.points, triangles
 
 
 def read_points(path: Path) -> NDArray[Any]:
@@ -184,9 +190,7 @@ def read_points(path: Path) -> NDArray[Any]:
         raise ValueError(f"mesh file {path}: {failure}") from None
 
 
-def _mesh_of(
-    content: meshio.Mesh, found: cells.Tets, orient: bool, weld: float | None
-) -> tuple[TetMesh, IntArray, str, int]:
+def _mesh_of(content: meshio.Mesh, found: Tets, orient: bool, weld: float | None) -> tuple[TetMesh, IntArray, str, int]:
     """The mesh, the index in the file of each of its vertices, the name of the cell data that its labels are from, and
     how many vertices lie where another one does."""
     tets = found.tets
@@ -222,12 +226,12 @@ def _used(tets: IntArray) -> tuple[IntArray, IntArray]:
     return np.flatnonzero(used), (np.cumsum(used) - 1)[tets]
 
 
-def _check_cut(points: FloatArray, tets: IntArray, content: meshio.Mesh, found: cells.Tets) -> None:
+def _check_cut(points: FloatArray, tets: IntArray, content: meshio.Mesh, found: Tets) -> None:
     """Raises where a cell is cut into tets that do not lie side by side: some would be turned and overlap."""
     start = 0
     for k, parents in found.rows:
         part, start = tets[start : start + len(parents)], start + len(parents)
-        kind = cells.kind_of(content.cells[k])
+        kind = kind_of(content.cells[k])
         if kind in found.cut:
             volume, _ = signed_volume(points, part)
             cell_volume = np.bincount(parents, volume)
@@ -260,3 +264,19 @@ def _labels(content: meshio.Mesh, name: str, rows: list[tuple[int, IntArray]]) -
     with np.errstate(invalid="ignore"):
         whole = labels.astype(np.int64)
     return whole if np.array_equal(whole, labels) else None
+
+
+def together(points: FloatArray, distance: float) -> IntArray:
+    """The lowest of the points [V, 3] that each is joined with, by steps of at most `distance` [m], shape [V]."""
+    # along a direction that no plane of a mesh is likely to be normal to, few points are as close as that
+    along = points @ np.array([0.5257311, 0.3090170, 0.7925580])
+    order = np.argsort(along, kind="stable")
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    for step in itertools.count(1):
+        near = np.flatnonzero(along[order[step:]] - along[order[:-step]] <= distance)
+        if len(near) == 0:
+            return connected(np.concatenate(pairs), len(points))
+        found = np.stack([order[near], order[near + step]], axis=1)
+        gap = points[found[:, 0]] - points[found[:, 1]]
+        pairs.append(found[np.einsum("ni,ni->n", gap, gap) <= distance**2])
+    raise AssertionError("unreachable")

@@ -9,24 +9,42 @@ from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Protocol, TypeVar
 from xml.sax.saxutils import escape
 
 import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, check_mesh, listed, to_numpy, to_path
-
-if TYPE_CHECKING:
-    from diffvbd.mesh.tet_mesh import TetMesh
+from diffvbd.mesh.arrays import FloatArray, IntArray, check_mesh, float_array, listed, to_numpy, to_path
 
 Result = TypeVar("Result")
 
+
+class Mesh(Protocol):
+    """Attributes of a TetMesh, which knows this file and not the other way round."""
+
+    @property
+    def points(self) -> FloatArray: ...
+    @property
+    def tets(self) -> IntArray: ...
+    @property
+    def body(self) -> IntArray: ...
+    @property
+    def surface(self) -> IntArray: ...
+    @property
+    def num_vertices(self) -> int: ...
+    @property
+    def num_tets(self) -> int: ...
+    @property
+    def num_bodies(self) -> int: ...
+
+
 # meshio would take the extension .msh for a Fluent file first.
 PREFERRED_FORMAT = {".msh": "gmsh"}
+_SURFACES = (".obj", ".ply", ".stl")  # which get the boundary
 # meshio would write these without a word, and without the tets.
-_NO_TETS = (".obj", ".off", ".ply", ".stl", ".svg", ".wkt")
+_NO_TETS = (".off", ".svg", ".wkt")
 # meshio writes another file beside these, whose name follows from theirs.
 _OF_TWO_FILES = (".xdmf", ".xmf", ".node", ".ele")
 # What meshio writes values per vertex and per tet to. Into other formats it would write the mesh without them.
@@ -37,28 +55,32 @@ _COLUMNS = {".msh": (1, 3, 9), ".vtk": (1, 3, 4, 5, 6, 7, 8, 9)}
 
 def save(
     path: str | PathLike[str],
-    mesh: TetMesh,
+    mesh: Mesh,
     point_data: Mapping[str, Any] | None = None,
     cell_data: Mapping[str, Any] | None = None,
+    *,
+    points: Any = None,
 ) -> None:
     """Write a mesh through meshio; the extension tells the format (.vtu, .vtk, .msh, .mesh, .inp, .xdmf, ...).
 
-    With more than one body the label of each tet is written as cell data `body`, in formats that hold cell data.
-    `load_fields` reads point_data and cell_data back.
+    In .stl, .obj and .ply the boundary is written: triangles whose normals point outwards. With more than one body the
+    label of each tet is written as cell data `body`, in formats that hold cell data. `load_fields` reads point_data and
+    cell_data back.
 
     Args:
         path: The file.
-        mesh: What to write.
+        mesh: The TetMesh.
         point_data: Values of vertices by name, shape [V] or [V, C], in any unit; arrays or tensors, numbers or bool
             (written as 0 and 1). Only .vtu, .vtk, .msh and .xdmf hold them. In .msh all become float64 and C is 1, 3 or
             9; in .vtk C is 1 or 3 to 9.
         cell_data: The same for tets, shape [T] or [T, C].
+        points: Positions of the vertices [m], shape [V, 3], an array or a tensor; default those of the mesh.
 
     Raises:
-        TypeError: no path or no TetMesh; values that are no real numbers, or have no names.
-        ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values of
-            another shape, NaN or Inf among them, a name that is empty, not printable or none in this format (in .vtk
-            with spaces, in .msh with quotes), cell data `body` beside labels, or meshio fails.
+        TypeError: no path or no TetMesh; values or positions that are no real numbers, values that have no names.
+        ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values or
+            positions of another shape or not finite, a name that is empty, not printable or none in this format (in
+            .vtk with spaces, in .msh with quotes), cell data `body` beside labels, or meshio fails.
         ImportError: the format needs a package that is not installed (h5py for .xdmf and .med).
         FileNotFoundError: the directory does not exist.
     """
@@ -66,7 +88,8 @@ def save(
     check_mesh(mesh)
     extension = path.suffix.lower()
     if extension in _NO_TETS:
-        raise ValueError(f"cannot write {path}: {path.suffix} files hold no tets; use .vtu, .msh, ...")
+        raise ValueError(f"cannot write {path}: {path.suffix} files hold no tets; use .vtu, .msh, .stl, ...")
+    positions = mesh.points if points is None else float_array("points", to_numpy("points", points), mesh.points.shape)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"directory {path.parent} does not exist")
     given = {"point_data": (point_data, mesh.num_vertices), "cell_data": (cell_data, mesh.num_tets)}
@@ -82,10 +105,14 @@ def save(
             raise ValueError(f"{kind}: expected names without quotes in a .msh file, got {quoted[0]!r}")
         if extension == ".vtu":
             fields[kind] = vtu_names(values)
-    content = content_of(mesh, mesh.points, **fields)
+    content = content_of(mesh, positions, **fields)
+    if extension in _SURFACES:
+        used, triangles = np.unique(mesh.surface, return_inverse=True)
+        content = meshio.Mesh(positions[used], [("triangle", triangles.reshape(-1, 3))])
 
     def write(new: Path) -> None:
-        content.write(new, file_format=PREFERRED_FORMAT.get(extension))
+        options = {"binary": True} if extension == ".stl" else {}
+        content.write(new, file_format=PREFERRED_FORMAT.get(extension), **options)
 
     quiet(lambda: write(path) if extension in _OF_TWO_FILES else replace(path, write), f"write {path}")
 
@@ -114,7 +141,7 @@ def replace(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def content_of(
-    mesh: TetMesh,
+    mesh: Mesh,
     points: FloatArray,
     point_data: Mapping[str, NDArray[Any]] | None = None,
     cell_data: Mapping[str, NDArray[Any]] | None = None,

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_positive, check_readable, fail, is_word, refuse_gradient, to_float
+from ..checks import check_readable, fail, refuse_gradient, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
-from .anderson import Anderson
-from .coarse import CoarseSpace
+from ..mesh import TetMesh
+from ..said import warn
 
+LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
 
 
@@ -87,67 +89,42 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
     return density.expand(num_tets).clone()
 
 
-def checked_steps(
-    relaxation: Any, rigid: Any, start: Any, coarse: Any, acceleration: Any, energies: tuple[Energy, ...],
-    saturation: float | None,
-) -> tuple[float, bool, str, CoarseSpace | None, Anderson | None]:  # fmt: skip
-    """What steps do besides plain sweeps: the relaxation, whether free bodies are corrected, where the sweeps of the
-    others start, the coarse space and the acceleration."""
-    rigid, start = checked_correction(rigid, start, energies)
-    coarse = checked_coarse(coarse, energies, saturation)
-    acceleration = checked_acceleration(acceleration, energies, saturation)
-    return checked_relaxation(relaxation), rigid, start, coarse, acceleration
+def warn_of(mesh: TetMesh, given: Any, pinned: Tensor, energies: tuple[Energy, ...]) -> None:
+    """Warns (UserWarning) of what is legal and seldom meant. ``given``: pinned as it was given."""
+    if size := _size_message(mesh):
+        warn(size)
+    if given is not None and mesh.num_vertices and not bool(pinned.any()):
+        warn(f"pinned: none of {mesh.num_vertices} vertices is pinned, so all are free, as with pinned=None")
+    if mesh.num_vertices and bool(pinned.all()):
+        warn(f"pinned: all {mesh.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
+    if not any(isinstance(e, StableNeoHookean) for e in energies) and mesh.num_tets:
+        warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
 
 
-def checked_relaxation(relaxation: Any) -> float:
-    number = check_positive("relaxation", relaxation)
-    if number >= 2:
-        fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
-    return number
+def _size_message(mesh: TetMesh) -> str:
+    size = _largest_body(mesh)
+    if size > LARGE_BODY:
+        return (
+            f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs "
+            "mesh.transform(1e-3 * numpy.eye(3)), or --scale 0.001 on the command line"
+        )
+    if 0 < size < SMALL_BODY:
+        return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
+    return ""
 
 
-def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:
-    """Whether free bodies are corrected, and where the sweeps of the others start."""
-    touches = any(isinstance(e, (PairBarrier, Friction)) for e in energies)
-    if not is_word(start, "auto", "predictor", "inertia"):
-        fail("start", '"auto", "predictor" or "inertia"', repr(start))
-    if start == "inertia" and any(isinstance(e, PairBarrier) for e in energies):
-        fail("start", '"auto" or "predictor" beside a PairBarrier, whose steps go to y in parts', '"inertia"')
-    if rigid is None:  # tets without stiffness are no body
-        return not touches and any(isinstance(e, StableNeoHookean) for e in energies), start
-    if not isinstance(rigid, bool):
-        raise TypeError(f"rigid: expected True, False or None, got {type(rigid).__name__}")
-    if rigid and touches:
-        fail("rigid", "False beside a PairBarrier or Friction, which the correction does not see", "True")
-    return rigid, start
-
-
-def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float | None) -> CoarseSpace | None:
-    """The coarse space, where it is one that the other arguments allow."""
-    if coarse is None:
-        return None
-    if is_word(coarse, "auto"):
-        coarse = CoarseSpace()
-    if not isinstance(coarse, CoarseSpace):
-        raise TypeError(f'coarse: expected a diffvbd.CoarseSpace, "auto" or None, got {coarse!r}')
-    elastic = next((e for e in energies if isinstance(e, StableNeoHookean)), None)
-    if elastic is None or elastic.block != "exact":
-        fail("coarse", "None without StableNeoHookean and its exact block", repr(coarse))
-    if ops.TET_READS_X_PREV:
-        fail("coarse", "None with a law of tets that reads where a step began", repr(coarse))
-    if saturation is not None:
-        fail("coarse", "None with saturation, which a correction would go around", repr(coarse))
-    return coarse
-
-
-def checked_acceleration(acceleration: Any, energies: tuple[Energy, ...], saturation: float | None) -> Anderson | None:
-    """Anderson's method, where the other arguments allow it."""
-    if acceleration is None:
-        return None
-    if not isinstance(acceleration, Anderson):
-        raise TypeError(f"acceleration: expected a diffvbd.Anderson or None, got {acceleration!r}")
-    if any(isinstance(e, StableNeoHookean) and e.block != "exact" for e in energies):
-        fail("acceleration", "None without the exact block", repr(acceleration))
-    if saturation is not None:
-        fail("acceleration", "None with saturation, which an accelerated iterate would go around", repr(acceleration))
-    return acceleration
+def _largest_body(mesh: TetMesh) -> float:
+    """Longest side of the bounding box of a body [m]."""
+    if not mesh.num_tets:
+        return 0.0
+    total = float(np.ptp(mesh.points, axis=0).max())
+    if total < SMALL_BODY:
+        return total
+    # a tet is never longer than its body, and most bodies are neither large nor small: no need to know them exactly
+    if total <= LARGE_BODY and float(np.ptp(mesh.points[mesh.tets[:100]], axis=1).max()) >= SMALL_BODY:
+        return total
+    order = np.argsort(mesh.body, kind="stable")
+    first = np.unique(mesh.body[order], return_index=True)[1]
+    points = mesh.points[order]
+    high, low = np.maximum.reduceat(points, first), np.minimum.reduceat(points, first)
+    return float((high - low).max())

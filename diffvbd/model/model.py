@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_dtype, check_held, check_kind, check_number, check_positive, fail, vertex_mask
+from ..checks import check_dtype, check_held, check_kind, fail, vertex_mask
 from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import Collider
 from ..contact.surface import ContactSurface, build_surface, check_colliders
 from ..energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
 from ..lasting import lasting, lasting_tensors
-from ..mask import CONTACT, ELASTIC
+from ..mask import CONTACT
 from ..mesh import TetMesh
-from ..ops import regimes
-from ..safeguards import FILTER_ETA, SATURATION_EPS
 from ..scopes import is_captured
-from .anderson import Anderson, moving_bodies
-from .arguments import Energy, check_isolated, checked_device, checked_energies, checked_steps, per_tet_density
+from .arguments import Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
 from .bodies import find_bodies, first_of_body
-from .coarse import CoarseSpace
-from .coarse_plan import check_coupled, plan_of
-from .describe import describe
-from .replaced import replaced_arguments
-from .rest import lumped_mass, rest_metric
-from .warnings import warn_of
-
-PAPER_SATURATION = 0.1  # [m]
-PAPER_REGULARIZATION = 1e-6  # [kg]
+from .inputs import Inputs, inputs_of
+from .material import lumped_mass, rest_metric
 
 
 def _copy(name: str, text: str) -> Any:
@@ -41,30 +31,16 @@ def _copy(name: str, text: str) -> Any:
 
 
 class Model:
-    """A mesh with its masses, pins, energies and safeguards, colored and laid out for the sweeps.
+    """What is simulated: a mesh with its masses, pins, energies and colliders, colored and laid out for the sweeps.
 
-    A Model holds constants and refuses tensors that require grad; what is differentiated is an argument of
-    :func:`diffvbd.step`, the rest shape too.
+    A Model holds constants and refuses tensors that require grad; what is differentiated is an input of
+    :func:`diffvbd.step`, the rest shape too. How it is stepped is said by a :class:`diffvbd.VBD`.
 
     Args:
         mesh: Tetrahedra with positive rest volume.
         density: [kg/m^3], a number or one for each tet, shape [T].
         pinned: Vertices that sweeps do not move: a bool mask [V] or indices.
         energies: At most one of each kind.
-        saturation: c [m]: every update d is shortened to c d / (|d| + c). None: off.
-        regularization: tau [kg], added to the diagonal of every block. 0: off.
-        relaxation: omega, 0 < omega < 2, multiplies every update. Above 1 it needs fewer sweeps; use it with the exact
-            block or with saturation (docs/numerics.md).
-        rigid: Whether each step moves every free body as a whole to where the step's potential is least, before and
-            after the sweeps (docs/method.md, section 14): it rests, falls and spins right at any number of sweeps. The
-            last sweep of a step then has a relaxation of at most 1. None: where there is no contact of pairs and no
-            friction, which have a correction of their own.
-        start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
-            (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
-            the one of lower incremental potential; with coarse x + h v. Beside pairs it is decided of gravity alone.
-        coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
-            :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
-        acceleration: None, or a :class:`diffvbd.Anderson`, which combines the iterates of each step.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier.
         dtype, device: torch.float64 or torch.float32; where the tensors live.
 
@@ -92,15 +68,8 @@ class Model:
         density: float | Tensor = 1000.0,
         pinned: Any = None,
         energies: Sequence[Energy] = (StableNeoHookean(),),
-        saturation: float | None = None,
-        regularization: float = 0.0,
-        relaxation: float = 1.0,
-        rigid: bool | None = None,
-        start: Literal["auto", "predictor", "inertia"] = "auto",
         colliders: Sequence[Collider] = (),
         *,
-        coarse: CoarseSpace | Literal["auto"] | None = None,
-        acceleration: Anderson | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -108,15 +77,10 @@ class Model:
         check_dtype(dtype)
         self.mesh = mesh
         self._derived: dict[str, Any] = {}
-        self.saturation = None if saturation is None else check_positive("saturation", saturation, "m", dtype)
-        self.regularization = check_number("regularization", regularization, dtype=dtype)
         self._set_energies(checked_energies(energies, mesh.num_vertices))
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
-        checked = checked_steps(relaxation, rigid, start, coarse, acceleration, self.energies, self.saturation)
-        self.relaxation, self.rigid, self.start, self.coarse, self.acceleration = checked
-        self._asked_rigid = rigid
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -128,13 +92,13 @@ class Model:
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = first_of_body(body)
-        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.rigid, self.floor is not None)
+        # those of the default solver: other solvers derive theirs (system.py)
+        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.may_correct, self.floor is not None)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
-        self._arrange_coarse(device)
-        warn_of(self, pinned)
+        warn_of(mesh, pinned, mask, self.energies)
         self._place(dtype, device)
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:
@@ -158,22 +122,20 @@ class Model:
         return build_surface(self.mesh, self._pinned, self.contact, colliders)
 
     @property
-    def corrects(self) -> bool:
-        """Whether steps have a rigid correction, which takes that it is asked for and that some body is free."""
-        return self._bodies.number > 0
+    def may_correct(self) -> bool:
+        """Whether bodies can have a rigid correction of their own: pairs and friction have another, and tets without
+        stiffness are no body."""
+        return not self.touches and any(isinstance(e, StableNeoHookean) for e in self.energies)
 
     @property
-    def starts_from(self) -> str:
-        """Where the sweeps of bodies that are not corrected start; "auto" only where there is something to choose."""
-        if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
-            return "inertia" if self.start == "auto" else self.start
-        # beside pairs a step decides it itself, of gravity's fall alone: step/unsupported.py
-        return "predictor" if self.contact is not None or not self._other_bodies.number else "auto"
+    def inputs(self) -> Inputs:
+        """The keywords that steps and rollouts take, with shapes, units and defaults; prints as a table."""
+        return inputs_of(self)
 
     @property
     def rest_scalars(self) -> Tensor:
         """Stiffness weights and inverse volume of each tet at rest [1, T, 7], rounded once from float64."""
-        return self._rest_scalars if self._rest_scalars.numel() else self.derived("rest", self._find_rest_scalars)
+        return self.derived("rest", self._find_rest_scalars)
 
     def _find_rest_scalars(self) -> Tensor:
         points = torch.from_numpy(self.mesh.points.copy())[None].to(self.device)
@@ -225,7 +187,7 @@ class Model:
 
     @property
     def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:
-        """The energies whose numbers a step may override through ``parameters``."""
+        """The energies whose parameters are inputs of a step."""
         contact = [e for e in (self.contact, self.friction) if e is not None]
         return (*self.vertex_energies, *contact)
 
@@ -248,21 +210,8 @@ class Model:
         self._rest_points = points
         self._mass = lumped_mass(self._density[None], volume, *self._topology)[0]
         self._rest = rest
-        # what "auto" asks for in every step
-        chooses = self.starts_from == "auto" and self.energy_mask & ELASTIC
-        self._rest_scalars = rest if chooses else rest.new_empty((0,))
         data = [e.pack({k: t[None] for k, t in e.constants(points).items()}, None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
-
-    def _arrange_coarse(self, device: torch.device) -> None:
-        if self.coarse is not None:
-            given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._rest, self._plan)
-            self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given, device.type)
-            check_coupled(self.coarse_geometry, self.touches)
-        decides = self.contact is not None or (self.coarse is not None and self.touches)
-        if self.acceleration is not None or decides:  # by potentials of bodies
-            elastic = bool(self.energy_mask & ELASTIC)
-            self._moving = moving_bodies(self._rest_points, self._topology[0], self._pinned, elastic)
 
     def _place(self, dtype: torch.dtype, device: torch.device) -> None:
         self.dtype, self.device = dtype, device
@@ -278,24 +227,8 @@ class Model:
             del self._rest
         if self.surface_of_contact is not None:
             self.surface_of_contact = self.surface_of_contact.to(device, dtype)
-        if self.coarse is not None:
-            self._coarse_plan = self._coarse_plan.to(device, dtype)
-        if hasattr(self, "_moving"):
-            self._moving = self._moving.to(device, dtype)
         for energy in self.parametric_energies:
             self.constants(energy)
-
-    @classmethod
-    def paper(cls, mesh: TetMesh, **options: Any) -> Model:
-        """The paper's preset: block="paper", saturation 0.1 m, regularization 1e-6 kg.
-
-        Both constants are absolute: 0.1 m is 33 edges of a 3 mm cube, and 1e-6 kg is 0.15-0.44 of the mass of such a
-        cube's vertex, so the preset does not suit small bodies (docs/numerics.md).
-        """
-        energies = tuple(options.pop("energies", ()))
-        energies = (StableNeoHookean("paper"), *(e for e in energies if not isinstance(e, StableNeoHookean)))
-        options = {"saturation": PAPER_SATURATION, "regularization": PAPER_REGULARIZATION, **options}
-        return cls(mesh, energies=energies, **options)
 
     @lasting_tensors()
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
@@ -313,13 +246,24 @@ class Model:
         if device.type != self.device.type:
             out._arrange(points, out.tets, device)
         out._measure(points)
-        out._arrange_coarse(device)
         out._place(dtype, device)
         return out
 
     def replace(self, **changes: Any) -> Model:
         """A new Model of the same mesh with other arguments of the constructor; other names raise TypeError."""
-        return Model(self.mesh, **replaced_arguments(self, changes))
+        cpu = torch.device("cpu")
+        own = {
+            "density": self._density.cpu(),
+            "pinned": self._pinned.cpu() if self._pinned.any() else None,
+            "energies": [e.placed(self.num_vertices, cpu) if isinstance(e, VertexEnergy) else e for e in self.energies],
+            "colliders": self.colliders,
+            "dtype": self.dtype,
+            "device": self.device,
+        }
+        if unknown := sorted(set(changes) - set(own)):
+            names = ", ".join(sorted(own))
+            raise TypeError(f"replace: expected arguments of Model ({names}), got {', '.join(unknown)}")
+        return Model(self.mesh, **own | changes)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_derived": {}}
@@ -332,10 +276,6 @@ class Model:
         actual = checked_device(self._mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
-
-    def _on_cpu(self) -> Model:
-        """The same Model on the CPU: what debug_checks() asks about a step on CUDA."""
-        return self.derived("on_cpu", lambda: self.to("cpu"))
 
     def derived(self, name: str, build: Callable[[], Any]) -> Any:
         """Something that follows from the Model alone, built at its first use and kept."""
@@ -376,25 +316,10 @@ class Model:
         """Groups of vertices that a sweep updates one after another."""
         return self._color_ptr.shape[0] - 1
 
-    def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
-        """What the kernels execute for this Model besides its tensors; ``scenes`` chooses the regime on CUDA."""
-        saturation = -1.0 if self.saturation is None else self.saturation
-        # a lone over-relaxed sweep would leave the correction a shape that the next step starts wrong from
-        last = min(self.relaxation, 1.0) if self.corrects or self.coarse is not None else self.relaxation
-        friction_eps = 1.0 if self.friction is None else time_step * self.friction.velocity
-        numbers = ops.StepNumbers(time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS,
-                                  FILTER_ETA, last, friction_eps)  # fmt: skip
-        coarse = self._coarse_plan.sizes if self.coarse is not None else ()
-        work = self.num_vertices, self.num_colors, scenes
-        launch = regimes.choose(*work, self.touches, bool(coarse)) if self.device.type == "cuda" else ()
-        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch, coarse)
-
-    def memory(self, *, sweeps: int, **options: Any) -> dict[str, int]:
-        """Predicted bytes of a rollout, by name. options: steps, scenes, tape, checkpoint_every, save, material, rest,
-        integrator; :func:`diffvbd.rollout.memory.predict` says what they are, what it returns and what raises."""
-        from ..rollout.memory import predict
-
-        return predict(self, sweeps=sweeps, **options)
-
     def __repr__(self) -> str:
-        return describe(self)
+        return (
+            f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
+            f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "
+            f"energies=({', '.join(map(repr, self.energies))})"
+            f"{f', {len(self.colliders)} colliders' if self.colliders else ''}, {self.dtype}, {self.device})"
+        )

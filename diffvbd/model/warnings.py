@@ -1,52 +1,29 @@
-"""What a Model warns of: sizes and safeguards outside the range in which they make sense (docs/numerics.md)."""
+"""Warnings of safeguards, units, thin tets and states outside the range in which they make sense (docs/numerics.md)."""
 
 from __future__ import annotations
-
-import contextlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..energies import StableNeoHookean
-from ..mesh import TetMesh
-from ..said import page, silence, warn
-from .tet_shapes import inside_out, thinness
-
-if TYPE_CHECKING:
-    from .model import Model
+from ..mask import ELASTIC
+from ..said import page, warn
+from .model import Model
+from .system import System
 
 INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts grew; 49 did not
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
-# of accelerated plain sweeps, from which on gradients are erratic: that of docs/contact.md was a third off at 15, had
-# the wrong sign at 20 and at 40 was 7e5 times too large
-ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 TOO_STIFF = 0.55  # times aspect^2: so much too stiff were sheets of one layer, from 3.4 to 24
 MOST_BODIES = 8  # whose bending is looked at
 BENT = 0.01  # of the height of a tet, by which a body is no longer an affine image of its rest shape
-LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 SOFTEST = 10.0  # [Pa] Young's modulus; soft gels have 100 Pa or more
 LONGEST_STEP = 1.0  # [s]
 
-# of a Model's _derived: what is said once, or ever more seldom
-HELD_UP_SEEN, ERRATIC = "steps held up", "erratic gradients"
-ONCE = (HELD_UP_SEEN, ERRATIC)
 
-
-def warn_of(model: Model, pinned: Any) -> None:
-    """Warns (UserWarning) of what is legal and seldom meant. ``pinned``: as it was given."""
-    if size := _size_message(model.mesh):
-        warn(size)
-    if pinned is not None and model.num_vertices and not bool(model._pinned.any()):
-        warn(f"pinned: none of {model.num_vertices} vertices is pinned, so all are free, as with pinned=None")
-    if model.num_vertices and bool(model._pinned.all()):
-        warn(f"pinned: all {model.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
-    if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
-        warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
+def warn_of_solver(model: System) -> None:
+    """Warns (UserWarning) of safeguards and relaxations outside the range in which they make sense."""
     if model.relaxation > STABLE_RELAXATION:
         warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {model.relaxation:g}")
     if model.relaxation > 1 and model.friction is not None:
@@ -54,9 +31,10 @@ def warn_of(model: Model, pinned: Any) -> None:
             f"relaxation: {model.relaxation:g} with Friction: above 1 gradients were seen to grow by ten decades while "
             "vertices stick; take relaxation=1 and more sweeps where gradients matter"
         )
-    paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in model.energies)
-    if paper and model.relaxation > 1 and model.saturation is None:
+    if model.block == "paper" and model.relaxation > 1 and model.saturation is None:
         warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
+    if not model.regularization:
+        return
     active = model._mass[~model._pinned]
     if active.numel() and model.regularization > HEAVY_REGULARIZATION * float(active.min()):
         warn(
@@ -65,22 +43,9 @@ def warn_of(model: Model, pinned: Any) -> None:
         )
 
 
-def warn_of_erratic_gradients(model: Model, sweeps: int) -> None:
-    """Warns, once, of gradients through sweeps that are accelerated without coarse corrections. To be called where a
-    step of so many sweeps is differentiated."""
-    if model.acceleration is None or model.coarse is not None or sweeps < ERRATIC_SWEEPS or ERRATIC in model._derived:
-        return
-    model._derived[ERRATIC] = True
-    warn(
-        "acceleration: gradients through accelerated plain sweeps are exact for what ran, but may depend erratically "
-        "on the input and be wrong by orders of magnitude where positions are right; for gradients add "
-        'coarse="auto" to the Model, or take plain sweeps and more of them; ' + page("numerics.md")
-    )
-
-
 def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:
     """Warns where all tets of a body are inside out at the start x [..., V, 3], as where positions are mirrored."""
-    if not any(isinstance(e, StableNeoHookean) for e in model.energies) or model.num_tets == 0 or x.numel() == 0:
+    if not model.energy_mask & ELASTIC or model.num_tets == 0 or x.numel() == 0:
         return
     states, tets = x.detach().reshape(-1, *x.shape[-2:]), model._topology[0]
     names, first, of = model.derived("bodies of tets", lambda: _bodies_of(model.body[tets[:, 0]]))
@@ -95,7 +60,7 @@ def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:
         warn(
             f"x: all tets of body {body} in scene {scene}{others} are inverted (J <= 0) at the start, as where "
             "positions are mirrored: it will turn itself inside out. Positions of another mesh need a Model of that "
-            "mesh; check_start=False starts without a word"
+            "mesh; checks=dv.Checks(start=False) starts without a word"
         )
 
 
@@ -104,25 +69,6 @@ def _bodies_of(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     found = np.unique(labels.cpu(), return_index=True, return_inverse=True)
     names, first, of = (torch.as_tensor(a, device=labels.device) for a in found)
     return names, first, of
-
-
-@contextlib.contextmanager
-def silent(model: Model) -> Iterator[None]:
-    """Inside, nothing is warned of, and what would have been said once of this Model is still to be said after it."""
-    before = {id(m): {name: m._derived[name] for name in ONCE if name in m._derived} for m in _with_settings(model)}
-    with silence():
-        try:
-            yield
-        finally:
-            for m in _with_settings(model):
-                for name in ONCE:
-                    m._derived.pop(name, None)
-                m._derived.update(before.get(id(m), {}))
-
-
-def _with_settings(model: Model) -> list[Model]:
-    """A Model and those that run in its place with settings."""
-    return [model, *(m for m in model._derived.values() if isinstance(m, type(model)))]
 
 
 def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
@@ -135,29 +81,29 @@ def warn_of_units(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> No
     if time_step >= LONGEST_STEP:
         warn(f"time_step: {time_step:.4g} s is long for a step; times are in seconds: one of 1 ms is 0.001")
     most = float(mu.detach().max()) if mu.numel() else 0.0
-    if not 0 < 2 * most < SOFTEST or not any(isinstance(e, StableNeoHookean) for e in model.energies):
+    if not 0 < 2 * most < SOFTEST or not model.energy_mask & ELASTIC:
         return  # Young's modulus is 2 mu or more, unless Poisson's ratio is negative
     young = float((mu * (3 * lam + 2 * mu) / (mu + lam)).detach().nan_to_num(0.0).max())
     if young < SOFTEST:
         warn(f"mu: Young's modulus is at most {young:.4g} Pa, softer than any gel; moduli are in Pa: 1 MPa is 1e6")
 
 
-def warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> bool:
+def warn_of_over_relaxation(model: System, mu: Tensor, lam: Tensor) -> bool:
     """Warns of over-relaxed sweeps of what is nearly incompressible, whose growth may be too slow to be measured;
     whether it did."""
-    if model.relaxation <= 1 or not any(isinstance(e, StableNeoHookean) for e in model.energies):
+    if model.relaxation <= 1 or not model.energy_mask & ELASTIC:
         return False
     if not is_nearly_incompressible(mu, lam):
         return False
     warn(
         f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
         "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
-        'coarse="auto" in place of it',
+        'subspace="coarse" in place of it',
     )
     return True
 
 
-def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+def warn_of_thin_tets(model: System, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
     """Warns of tets so thin that few sweeps leave a sheet without stiffness; moduli [Pa] that may be looked at.
 
     The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
@@ -213,30 +159,32 @@ def _crossed(model: Model, mu: Tensor, lam: Tensor, time_step: float, height: fl
     return time_step * (max(0.0, modulus) / float(model._density.median())) ** 0.5 / height
 
 
-def _size_message(mesh: TetMesh) -> str:
-    size = _largest_body(mesh)
-    if size > LARGE_BODY:
-        return (
-            f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs "
-            "mesh.transform(1e-3 * numpy.eye(3)), or --scale 0.001 on the command line"
-        )
-    if 0 < size < SMALL_BODY:
-        return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
-    return ""
+# --- how thin the tets of a mesh are, and which tets of a state are inside out ----------------------------------------
 
 
-def _largest_body(mesh: TetMesh) -> float:
-    """Longest side of the bounding box of a body [m]."""
-    if not mesh.num_tets:
-        return 0.0
-    total = float(np.ptp(mesh.points, axis=0).max())
-    if total < SMALL_BODY:
-        return total
-    # a tet is never longer than its body, and most bodies are neither large nor small: no need to know them exactly
-    if total <= LARGE_BODY and float(np.ptp(mesh.points[mesh.tets[:100]], axis=1).max()) >= SMALL_BODY:
-        return total
-    order = np.argsort(mesh.body, kind="stable")
-    first = np.unique(mesh.body[order], return_index=True)[1]
-    points = mesh.points[order]
-    high, low = np.maximum.reduceat(points, first), np.minimum.reduceat(points, first)
-    return float((high - low).max())
+def height_of_tets(model: Model) -> np.ndarray:
+    """The shortest of each tet's four heights [m], [T]."""
+    return model.derived("shapes of tets", lambda: _shapes_of_tets(model))[0]
+
+
+def thinness(model: Model) -> tuple[float, float]:
+    """Longest edge over shortest height [-], and that height [m], of the median tet."""
+    return model.derived("shapes of tets", lambda: _shapes_of_tets(model))[1:]
+
+
+def _shapes_of_tets(model: Model) -> tuple[np.ndarray, float, float]:
+    corners = model.mesh.points[model.mesh.tets]
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)
+    volume = np.abs((edges[:, 0] * normals[:, 0]).sum(-1))
+    normals = np.concatenate([normals, -normals.sum(1, keepdims=True)], 1)
+    height = volume / np.linalg.norm(normals, axis=-1).max(1)
+    sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
+    return height, float(np.median(sides.max(1) / height)), float(np.median(height))
+
+
+def inside_out(tets: Tensor, x: Tensor) -> Tensor:
+    """Which tets [T, 4] of states [..., V, 3] have a volume of 0 or less, bool [..., T]."""
+    corners = x.detach()[..., tets, :]
+    a, b, c = (corners[..., 1:, :] - corners[..., :1, :]).unbind(-2)
+    return (torch.linalg.cross(a, b) * c).sum(-1) <= 0

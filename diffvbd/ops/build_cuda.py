@@ -95,7 +95,7 @@ def extension() -> Any:
     return CUDAExtension(
         "diffvbd._C_cuda",
         [
-            *sorted(glob("csrc/bind/cuda/*.cpp")),
+            *sorted(glob("csrc/bind/*.cpp")),
             *write_instances(cuda_instances()),  # first of the kernels: they take longest
             *sorted(glob("csrc/cuda/*.cu")),
         ],

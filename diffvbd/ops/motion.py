@@ -45,7 +45,7 @@ def contact_motion(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, fall: 
 def contact_motion_backward(bar: Tensor, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, held: Tensor,
                             held_bodies: Tensor, order: Tensor, ptr: Tensor
                             ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Adjoints of x and move [B, V, 3] and of mass [B, V], from that of the rigid motion."""
+    """Adjoints of x [B, V, 3], of mass [B, V] and of move [B, V, 3], from that of the rigid motion."""
     return raw.contact_motion_backward(bar, x, origin, mass, move, held, held_bodies, order, ptr)
 
 
@@ -113,7 +113,7 @@ def _(x, origin, mass, move, fall, held, held_bodies, order, ptr):
 
 @shapes_of("contact_motion_backward")
 def _(bar, x, origin, mass, move, held, held_bodies, order, ptr):
-    return torch.empty_like(x), torch.empty_like(x), x.new_empty(x.shape[:2])
+    return torch.empty_like(x), x.new_empty(x.shape[:2]), torch.empty_like(x)
 
 
 @shapes_of("contact_coast")

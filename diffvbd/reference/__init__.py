@@ -5,10 +5,9 @@ not from the pair scalars of the compiled sweep, and imports nothing compiled, s
 """
 
 from .contact import Part, contact_step
-from .intersections import intersections
-from .layout import build_layout
-from .potential import incremental_potential, residual
-from .sweep import Trajectory, rollout, step, stepper
+from .distance import intersections
+from .scene import build_layout
+from .sweep import Trajectory, incremental_potential, residual, rollout, step, stepper
 
 __all__ = [
     "Part",

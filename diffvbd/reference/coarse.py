@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from .energies import StableNeoHookean
-from .layout import dot
 from .rigid import admits, axial, cross_matrix, turning_stiffness
-from .scene import Scene, shape_functions
+from .scene import Scene, dot, shape_functions
 
 HALVINGS = 8  # lengths that are tried: 1 to 1/128
 DECREASE = 1e-4  # share of the decrease to first order that the potential must make

@@ -1,5 +1,4 @@
-"""The sweeps of a part of a step with contact, with the coarse corrections and combinations of iterates that it has
-made."""
+"""The sweeps of a part of a step with contact, with the coarse corrections that it has made."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,7 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .anderson import Anderson
 from .coarse import Coarse
 from .scene import Scene
 
@@ -31,31 +29,20 @@ def in_cycles(
     lead, model = state.shape[:-2], scene.model
     limits = None if part.limits is None else part.limits.reshape(number, *lead, 1, -1).to(state)
     last = None if getattr(model, "coarse", None) is None else min(model.relaxation, 1.0)
-    sets, taken = (
-        (None, None) if part.combined is None else (t.reshape(*t.shape[:-2], *lead, -1) for t in part.combined)
-    )
-    anderson = None if taken is None else Anderson(scene, energies)
     corrections = None if part.lengths is None else Corrections(scene, energies, forces, y, x_prev)
     every = 1 if corrections is None else model.coarse.every
     lengths: Any = part.lengths
-    before, after, done, corrected = [], [], 0, 0
+    done, corrected = 0, 0
     while done < number:
-        begun = state
         if corrections is not None and done:
             state = corrections(state, lengths[corrected].reshape(*lead, -1))
             corrected += 1
-        alone = corrections is not None and done == 0  # a sweep that is no cycle
+        alone = corrections is not None and done == 0  # a sweep before the first correction
         count = 1 if alone else min(every, number - done)
         for _ in range(count):
             own = None if limits is None else limits[done : done + 1]
             done += 1
             state = swept(state, x_prev, 1, own, last if done == number else None)
-        if taken is None or anderson is None or alone or done == number:
-            continue
-        before.append(begun)
-        after.append(state)
-        if len(before) > 1:
-            state = anderson.combine(before, after, y, x_prev, taken[len(before) - 2], sets)
     return state
 
 

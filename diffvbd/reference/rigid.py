@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from .energies import StableNeoHookean
-from .layout import dot
-from .scene import Scene
+from .scene import Scene, dot
 
 ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from .distance import EDGE_EDGE
-from .energies import StableNeoHookean
-from .friction import FloorFriction
+from .energies import FloorFriction, StableNeoHookean
 from .scene import Scene
 
 LEAST_INERTIA = 1e-11  # of its mass and sum of m r^2, that keeps the system of a body definite

@@ -1,4 +1,8 @@
-"""The differentiable inputs of a run, resolved once: rest metric, masses, materials, energy parameters."""
+"""Index tensors and small array helpers of the reference.
+
+Inside the reference, arrays are component-major ([..., 3, V]: one contiguous row per coordinate), which is what plain
+torch runs fastest: every operation of a color is then elementwise on rows as long as its list of (vertex, tet) pairs.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +10,99 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .layout import Layout, cross, dot
+from ..checks import input_name
+
+
+@dataclass(frozen=True)
+class Color:
+    """One color: its n vertices and the P (vertex, tet) pairs of their stars, sorted by vertex, then by tet."""
+
+    vertices: Tensor  # [n] vertex of each block
+    tet: Tensor  # [P] tet of each pair
+    local: Tensor  # [P] which of the tet's four corners the vertex is
+    owner: Tensor  # [P] position of the vertex within `vertices`
+    corners: Tensor  # [4 P] the tets' vertices, corner by corner
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Everything about a model that is an index: tets [4, T] in summation order, colors in sweep order."""
+
+    tets: Tensor
+    colors: tuple[Color, ...]
+    order: Tensor | None
+
+
+def build_layout(model: Any, tet_order: Tensor | None = None) -> Layout:
+    """Index tensors of `model`; `tet_order` [T] permutes the tets and with them only the order of summation."""
+    tets = model.tets if tet_order is None else model.tets[tet_order]
+    ptr = model.color_ptr.tolist()
+    swept = model.color_vertices
+    position = torch.full((model.rest_points.shape[-2],), -1, dtype=torch.int64, device=tets.device)
+    position[swept] = torch.arange(swept.numel(), device=tets.device)
+
+    # Pairs in the order of the sweep; the stable sort keeps each star in the order of `tets`. Pinned vertices drop out.
+    key, pair = torch.sort(position[tets].flatten(), stable=True)
+    key, pair = key[key >= 0], pair[key >= 0]
+    bounds = torch.searchsorted(key, model.color_ptr.to(key.device)).tolist()
+    colors = []
+    for start, stop, first, last in zip(ptr[:-1], ptr[1:], bounds[:-1], bounds[1:], strict=True):
+        tet = pair[first:last] // 4
+        colors.append(
+            Color(swept[start:stop], tet, pair[first:last] % 4, key[first:last] - start, tets[tet].T.reshape(-1))
+        )
+    return Layout(tets.T.contiguous(), tuple(colors), tet_order)
+
+
+def take(a: Tensor, index: Tensor) -> Tensor:
+    """Columns of a [..., R, V] -> [..., R, len(index)]. Gather, because its backward is the cheapest on the CPU."""
+    return a.gather(-1, index.expand(*a.shape[:-1], -1))
+
+
+def put(a: Tensor, index: Tensor, columns: Tensor) -> Tensor:
+    """A copy of a [..., R, V] with `columns` [..., R, n] written at `index`."""
+    return a.scatter(-1, index.expand(*a.shape[:-1], -1), columns)
+
+
+def add_at(a: Tensor, index: Tensor, columns: Tensor) -> Tensor:
+    """A copy of a [..., R, n] with `columns` [..., R, P] added at `index`, in the order of the columns."""
+    return a.expand(*columns.shape[:-1], -1).scatter_add(-1, index.expand(*columns.shape[:-1], -1), columns)
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner product over components: [..., 3, n] x [..., 3, n] -> [..., n]."""
+    return (a * b).sum(-2)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product over components, [..., 3, n]."""
+    return torch.linalg.cross(a, b, dim=-2)
+
+
+def outer6(a: Tensor) -> Tensor:
+    """Upper triangle (xx, xy, xz, yy, yz, zz) of a a^T: [..., 3, n] -> [..., 6, n]."""
+    x, y, z = a.unbind(-2)
+    return torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -2)
+
+
+def solve6(matrix: Tensor, rhs: Tensor) -> Tensor:
+    """Solve a symmetric positive definite 3x3 system per column: [..., 6, n], [..., 3, n] -> [..., 3, n].
+
+    L D L^T without pivoting: backward stable here, where the adjugate loses twice the digits on stiff blocks.
+    """
+    xx, xy, xz, yy, yz, zz = matrix.unbind(-2)
+    b0, b1, b2 = rhs.unbind(-2)
+    l10, l20 = xy / xx, xz / xx
+    d1 = torch.addcmul(yy, l10, xy, value=-1)
+    e21 = torch.addcmul(yz, l20, xy, value=-1)
+    l21 = e21 / d1
+    d2 = torch.addcmul(torch.addcmul(zz, l20, xz, value=-1), l21, e21, value=-1)
+    b1 = torch.addcmul(b1, l10, b0, value=-1)
+    b2 = torch.addcmul(torch.addcmul(b2, l20, b0, value=-1), l21, b1, value=-1)
+    x2 = b2 / d2
+    x1 = torch.addcmul(b1 / d1, l21, x2, value=-1)
+    x0 = torch.addcmul(torch.addcmul(b0 / xx, l10, x1, value=-1), l20, x2, value=-1)
+    return torch.stack((x0, x1, x2), -2)
 
 
 @dataclass(frozen=True)
@@ -25,9 +121,9 @@ class Scene:
     mass: Tensor  # [..., V]
     parameters: dict[str, Any]
 
-    def parameter(self, kind: str, energy: Any, name: str) -> Tensor:
+    def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
-        return self.tensor(self.parameters.get(f"{kind}.{name}", getattr(energy, name)))
+        return self.tensor(self.parameters.get(input_name(energy, key), getattr(energy, key)))
 
     def tensor(self, value: Any) -> Tensor:
         return torch.as_tensor(value, dtype=self.like.dtype, device=self.like.device)

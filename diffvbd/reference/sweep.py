@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .anderson import Anderson
+from ..model.model import Model
+from ..model.system import system_of
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
-from .energies import StableNeoHookean, build_energies
-from .friction import floor_friction
-from .layout import Layout, build_layout, dot, put, solve6, take
+from .energies import StableNeoHookean, build_energies, floor_friction
 from .rigid import Correction
-from .scene import Scene, build_scene
+from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
 
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
 SOFT = 0.02  # h^2 times a tet's stiffness over the mass of its corners, below which it hardly acts within a step
@@ -25,74 +24,79 @@ class Trajectory(NamedTuple):
     v: Tensor
 
 
+def executed(model: Any, solver: Any) -> Any:
+    """The model with the attributes that the solver decides; what is no Model has them already."""
+    return system_of(model, solver) if isinstance(model, Model) else model
+
+
 def step(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     coarse_steps: Tensor | None = None,
-    taken: Tensor | None = None,
     record: list[Tensor] | None = None,
+    **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
-    """One time step; every tensor argument is differentiable by autograd.
+    """One time step of a model by a solver (`diffvbd.VBD`); every tensor argument is differentiable by autograd.
 
     x, v: positions [m] and velocities [m/s], [..., V, 3]; leading dimensions are scenes. mu, lam [Pa] broadcast to
     x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
     coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
-    given; taken: which bodies took the combinations of a model.acceleration [combinations, ..., bodies], bool, which is
-    decided if not given; record: a list, to which the step appends the lengths that it took.
-    Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
+    given; record: a list, to which the step appends the lengths that it took.
+    parameters: of energies, as `floor_kappa`. Raises ValueError when an unpinned vertex starts below a floor plane.
+    Returns (x', v').
     """
-    layout = build_layout(model, tet_order)
-    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
-    return advance(x, v, force, gravity, prescribed, (coarse_steps, taken), record)
+    system = executed(model, solver)
+    layout = build_layout(system, tet_order)
+    numbers = solver.time_step, solver.sweeps
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
+    return advance(x, v, force, gravity, prescribed, coarse_steps, record)
 
 
 def rollout(
     model: Any,
     x: Tensor,
     v: Tensor,
+    solver: Any,
     *,
     steps: int,
-    mu: Any,
-    lam: Any,
-    time_step: float,
-    sweeps: int,
+    mu: Any = 0.0,
+    lam: Any = 0.0,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: Any = None,
-    parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     force_per_step: Tensor | Sequence[Tensor] | None = None,
     prescribed_per_step: Tensor | Sequence[Tensor] | None = None,
     coarse_steps: Tensor | Sequence[Tensor] | None = None,
-    taken: Tensor | Sequence[Tensor] | None = None,
     record: list[Tensor] | None = None,
+    **parameters: Any,
 ) -> Trajectory:
     """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
-    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps` and `taken`, and
+    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps`, and
     `record` gets an entry for each step. Other arguments as in `step`."""
-    layout = build_layout(model, tet_order)
-    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
+    system = executed(model, solver)
+    layout = build_layout(system, tet_order)
+    numbers = solver.time_step, solver.sweeps
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]
         held = prescribed if prescribed_per_step is None else prescribed_per_step[n]
-        given = tuple(None if a is None else a[n] for a in (coarse_steps, taken))
+        given = None if coarse_steps is None else coarse_steps[n]
         x, v = advance(x, v, f, gravity, held, given, record)
         xs.append(x)
         vs.append(v)
@@ -132,7 +136,6 @@ def stepper(
     masses = color_masses(scene)
     correct = Correction(scene, energies)
     coarse = Coarse(scene, energies) if getattr(model, "coarse", None) is not None else None
-    anderson = Anderson(scene, energies) if getattr(model, "acceleration", None) is not None else None
     last = min(model.relaxation, 1.0) if correct.bodies or coarse is not None else model.relaxation
 
     def advance(
@@ -141,7 +144,7 @@ def stepper(
         force: Any,
         gravity: Any,
         prescribed: Any,
-        given: tuple[Tensor | None, ...] = (None, None),  # coarse_steps, taken
+        coarse_steps: Tensor | None = None,
         record: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         y = predictor(scene, x, v, force, gravity, prescribed)
@@ -164,7 +167,7 @@ def stepper(
             state = run_sweeps(scene, energies, masses, y, state, x_prev, usual)
             return run_sweeps(scene, energies, masses, y, state, x_prev, count - usual, relaxation=last)
 
-        state, lengths = _in_cycles(coarse, anderson, swept, sweeps, state, y, x_prev, *given)
+        state, lengths = _in_cycles(coarse, swept, sweeps, state, y, x_prev, coarse_steps)
         if record is not None:
             record.append(lengths)
         state = correct(state, y, x_prev)
@@ -176,25 +179,21 @@ def stepper(
 
 def _in_cycles(
     coarse: Coarse | None,
-    anderson: Anderson | None,
     swept: Callable[[Tensor, int, bool], Tensor],
     sweeps: int,
     state: Tensor,
     y: Tensor,
     x_prev: Tensor,
     steps: Tensor | None,
-    taken: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """All sweeps of a step. With corrections a sweep, then a correction and up to `every` sweeps, until all are done;
-    or a correction alone. Between such cycles, or between single sweeps, iterates are combined.
+    or a correction alone.
 
     swept(state, count, ends): the state after so many sweeps, which end the step or do not. Returns the state and the
-    lengths of the corrections [corrections, ..., bodies], which are `steps` if these are given; `taken` as in `step`.
+    lengths of the corrections [corrections, ..., bodies], which are `steps` if these are given.
     """
-    every = None if coarse is None else coarse.scene.model.coarse.every
-    cycles = [sweeps] if anderson is None else anderson.cycles(sweeps, every)
-    combines = len(cycles) > 1
-    lengths, combined, matrix = [], 0, y if coarse is None else coarse.begin(x_prev)
+    cycles = [sweeps]
+    lengths, matrix = [], y if coarse is None else coarse.begin(x_prev)
     refused = torch.zeros((), dtype=torch.int64, device=y.device)
     left = sweeps
     if coarse is not None:
@@ -202,20 +201,14 @@ def _in_cycles(
         count = coarse.scene.model.coarse.corrections(sweeps)
         most = coarse.scene.model.coarse.every
         cycles = [min(most, left - n * most) for n in range(count)]
-    before, after = [], []
     for n, count in enumerate(cycles):
-        before.append(state)
         if coarse is not None:
             given = None if steps is None else steps[n]
             state, s = coarse.correct(state, y, x_prev, matrix, given, refused >= REFUSALS)
-            refused = refused if combines else refused + (s == 0)  # each cycle has its own
+            refused = refused + (s == 0)
             lengths.append(s)
         left -= count
         state = swept(state, count, left == 0)
-        after.append(state)
-        if anderson is not None and combines and n and left > 0:
-            state = anderson.combine(before, after, y, x_prev, None if taken is None else taken[combined])
-            combined += 1
     return state, torch.stack(lengths) if lengths else y.new_zeros((0,))
 
 
@@ -404,3 +397,53 @@ def _saturation(update: Tensor, limit: float) -> Tensor:
     moves = square > 0
     length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)
     return limit / (length + limit + SATURATION_EPS)
+
+
+def incremental_potential(
+    model: Any,
+    x: Tensor,
+    y: Tensor,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    x_prev: Tensor | None = None,
+    *,
+    rest_points: Tensor | None = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+) -> Tensor:
+    """G(x) = 1/2 sum m |x - y|^2 + h^2 E(x), h^2-scaled [kg m^2], shape x.shape[:-2].
+
+    x, y: positions and predictor [m], [..., V, 3]; mu, lam [Pa] as in `step`. E is elastic energy (zero at rest) plus
+    barriers (inf at a gap <= 0 of an unpinned vertex) and anchors. x_prev: state at the start of the step, for the
+    lagged damping of a floor; None stands for x itself, where the damping vanishes.
+    """
+    scene = build_scene(
+        model,
+        build_layout(model),
+        x,
+        mu=mu,
+        lam=lam,
+        time_step=time_step,
+        rest_points=rest_points,
+        density=density,
+        parameters=parameters,
+    )
+    rows = x.transpose(-1, -2)
+    lagged = rows if x_prev is None else x_prev.transpose(-1, -2)
+    total = (scene.mass / 2 * ((x - y) ** 2).sum(-1)).sum(-1)
+    for energy in build_energies(scene):
+        total = total + energy.energy(rows, lagged)
+    return total
+
+
+def residual(
+    model: Any, x: Tensor, y: Tensor, mu: Any, lam: Any, time_step: float, *args: Any, **options: Any
+) -> Tensor:
+    """dG/dx [kg m], [..., V, 3], by autograd, detached; arguments as in `incremental_potential`. Zero at unpinned
+    vertices of a converged step; at a pinned vertex it is h^2 times the force that holds it (for y = x there)."""
+    with torch.enable_grad():
+        x = x.detach().requires_grad_()
+        total = incremental_potential(model, x, y, mu, lam, time_step, *args, **options)
+        (gradient,) = torch.autograd.grad(total.sum(), x)
+    return gradient

@@ -3,44 +3,46 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
-from ..adjoint.anderson import combinations_of, cycles_of
-from ..adjoint.routes import ReverseSweep
-from ..checks import check_bool, check_count, is_word
+from ..adjoint.routes import Adjoint, TapedSweep, Unrolled
+from ..checks import check_bool, check_count, fail, is_word
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
+from ..model.solver import BDF2, VBD
+from ..model.system import System, system_of
+from ..scopes import Scope, transformed
+from ..step.advance import cuda_scratch
 from ..step.contact_cycles import sweeps_of_parts
-from ..step.integrators import BDF2, Integrator, check_integrator, solves_of
-from ..step.memory import cuda_scratch
-from .checkpoints import BinomialCheckpoints, _left, choose_schedule
+from ..step.integrators import solves_of
 
 
-def predict(
+def memory(
     model: Model,
+    solver: VBD,
     *,
-    sweeps: int,
     steps: int = 1,
     scenes: int = 1,
-    tape: str = "auto",
     checkpoint_every: Any = "auto",
     save: Any = "last",
     material: bool = True,
     rest: bool = False,
-    integrator: Integrator | None = None,
 ) -> dict[str, int]:
     """Bytes that a differentiated rollout keeps and works with (default arguments otherwise, no force). The lists of
     contact are not counted: about 0.2 KB for each pair, step and detection, and 1 KB in the backward of one step. Nor
     are the sweeps that a step takes beyond its K where pairs hold bodies up (docs/contact.md).
 
     Args:
-        sweeps, steps, scenes: K, number of steps, product of x's leading dimensions.
-        tape, checkpoint_every, save: As in ReverseSweep and rollout.
-        integrator: As in rollout.
+        model, solver: As in rollout.
+        steps, scenes: Number of steps, product of x's leading dimensions.
+        checkpoint_every, save: As in rollout.
         material, rest: Whether material and rest-shape gradients are wanted (they take scratch in the backward).
 
     Returns:
@@ -58,16 +60,18 @@ def predict(
             total: kept + scratch.
 
     Raises:
-        ValueError, TypeError: For what ReverseSweep or rollout would refuse; it names the argument.
+        ValueError, TypeError: For what rollout would refuse; it names the argument.
     """
+    model, sweeps, scheme = system_of(model, solver), solver.sweeps, solver.integrator
     item = model._mass.element_size()
-    steps, scenes, sweeps = check_count("steps", steps), check_count("scenes", scenes), check_count("sweeps", sweeps)
+    steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
     for name, asked in (("material", material), ("rest", rest)):
         check_bool(name, asked)
-    scheme = check_integrator(integrator)
     solves = solves_of(scheme)
-    schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]
-    assert isinstance(adjoint, ReverseSweep)
+    schedule, adjoint = choose_schedule(
+        checkpoint_every, TapedSweep(solver.tape), model, scenes, steps, solves * sweeps
+    )
+    assert isinstance(adjoint, TapedSweep)
     scalars = scenes * sweeps * model.num_active
     policy = adjoint.policy(scalars, item, model.energy_mask, model.device)
     tape_bytes = scalars * ops.tape_rows(policy, model.energy_mask) * item
@@ -77,7 +81,6 @@ def predict(
     per_step = (5 if local else 3) * state + tape_bytes
     per_step += scenes * sum(model._data_count) * item if local else 0
     per_step += scenes * coarse_scalars(model, sweeps) * item
-    per_step += accelerated_states(model, sweeps) * state + scenes * accelerated_scalars(model, sweeps) * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
@@ -121,7 +124,6 @@ def predict(
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
     parts += () if model.coarse is None else (model._coarse_plan,)
-    parts += () if model.acceleration is None else (model._moving,)
     tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
     return {
         "model": sum(t.numel() * t.element_size() for t in tensors),
@@ -133,7 +135,7 @@ def predict(
     }
 
 
-def coarse_scalars(model: Model, sweeps: int) -> int:
+def coarse_scalars(model: System, sweeps: int) -> int:
     """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrices or
     their factors, and what each correction has done; with a floor also where it began."""
     if model.coarse is None or not model.coarse_geometry.bodies:
@@ -147,30 +149,173 @@ def coarse_scalars(model: Model, sweeps: int) -> int:
     return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
 
 
-def accelerated_states(model: Model, sweeps: int) -> int:
-    """States that an accelerated step keeps besides its own start and end: of each cycle, and each combination."""
-    return sum(len(cycles_of(model, n)) - 1 + combinations_of(model, n)
-               for n in _parts(model, sweeps) if combinations_of(model, n))  # fmt: skip
-
-
-def accelerated_scalars(model: Model, sweeps: int) -> int:
-    """Scalars of the small systems of its bodies, for each scene."""
-    if model.acceleration is None:
-        return 0
-    window = model.acceleration.window
-    sizes = [min(n + 1, window) for part in _parts(model, sweeps) for n in range(combinations_of(model, part))]
-    return model._moving.number * sum(n * (n + 1) for n in sizes)
-
-
-def _parts(model: Model, sweeps: int) -> list[int]:
+def _parts(model: System, sweeps: int) -> list[int]:
     """Sweeps of each part of a step: one for each detection of pairs. More parts have fewer cycles, and need less."""
     return sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections or 1)
 
 
-def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:
+def _cpu_scratch(model: System, scenes: int, material: bool, rest: bool) -> int:
     blocks, slots, edge_slots = (ops.LANES["cpu"] * n for n in model._plan[4:7].tolist())
     # packed state and its adjoints, rows along edges, one row per (vertex, tet) pair of what is differentiated
     work = blocks * (22 if model.floor else 16) + 4 * edge_slots
     work += slots * ((2 if material or rest else 0) + (4 if rest else 0))
     threads = torch.get_num_threads()
     return work * (threads if scenes >= threads else 1) * model._mass.element_size()
+
+
+# --- checkpoint schedules of a rollout --------------------------------------------------------------------------------
+
+MAX_REPEATS = 64  # of a step under BinomialCheckpoints: each is a nested checkpoint, and a run of the step
+TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
+UNROLLED_SCALARS = 540  # that autograd keeps per active vertex and sweep; measured on a structured beam (bench/cpu.py)
+
+
+@dataclass(frozen=True)
+class BinomialCheckpoints:
+    """Binomial (treeverse) checkpointing: at most ``snapshots`` states and the tape of one step are kept.
+
+    ``steps`` steps cost at most t extra forward runs of a step, t the least number with C(snapshots + t, t) >= steps.
+
+    Args:
+        snapshots: How many states, at least 1.
+
+    Raises:
+        ValueError: snapshots < 1; in the rollout, so few that t would be more than 64.
+        TypeError: What is no integer.
+
+    Source: Griewank and Walther (2000), Algorithm 799.
+    """
+
+    snapshots: int
+
+    def __post_init__(self) -> None:
+        check_count("snapshots", self.snapshots, 1)
+
+
+# x, v, and what an integrator knows of the step before. A checkpoint takes the tensors one by one: of those that lie in
+# other arguments autograd would keep copies alive.
+State = tuple[Tensor, ...]
+
+
+class Segment(NamedTuple):
+    """The state after some steps, the frames (step, x, v) saved on the way, and what was observed."""
+
+    end: State
+    frames: list[tuple[int, Tensor, Tensor]]
+    observed: list[Any]
+
+
+Run = Callable[..., Segment]  # of the first step, the one after the last, and a State's tensors
+
+
+def checked_schedule(given: Any) -> Any:
+    """A schedule whose kind and numbers are right."""
+    if given is None or is_word(given, "auto") or isinstance(given, BinomialCheckpoints):
+        return given
+    if isinstance(given, str):
+        fail("checkpoint_every", '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)', repr(given))
+    return check_count("checkpoint_every", given, 1)
+
+
+def choose_schedule(
+    checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None,
+    adjoint: Adjoint,
+    model: System,
+    scenes: int,
+    steps: int,
+    sweeps: int,
+) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
+    """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
+    checkpoint_every = checked_schedule(checkpoint_every)
+    inside = transformed()  # torch's checkpoints cannot hold tensors of a transform
+    if inside and torch.is_grad_enabled() and checkpoint_every not in (None, "auto"):
+        raise NotImplementedError(f'checkpoint_every: expected None or "auto", which both keep all tapes inside '
+                                  f"torch.func transforms, got {checkpoint_every}")  # fmt: skip
+    if isinstance(checkpoint_every, BinomialCheckpoints):
+        snapshots = checkpoint_every.snapshots
+        while _repeats(steps, snapshots) > MAX_REPEATS:
+            snapshots += 1
+        if snapshots > checkpoint_every.snapshots:
+            fail(
+                "checkpoint_every",
+                f"BinomialCheckpoints of at least {snapshots} snapshots for {steps} steps",
+                checkpoint_every,
+            )
+    if checkpoint_every != "auto":
+        return checkpoint_every, adjoint
+    row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
+    if not isinstance(adjoint, TapedSweep):  # a step of GlobalAdjoint keeps a few states and no tape
+        kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
+        return None if inside or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
+    candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
+    for tape in candidates:
+        policy = TapedSweep(tape).policy(0, 0, 0, model.device)
+        if steps * row * ops.tape_rows(policy, model.energy_mask) <= TAPE_BUDGET:
+            return None, TapedSweep(tape)
+    if inside:
+        return None, TapedSweep(candidates[-1])
+    return max(1, math.isqrt(steps)), adjoint
+
+
+def run_segments(run: Run, steps: int, state: State, every: int | BinomialCheckpoints | None) -> Segment:
+    """Runs all steps under a schedule."""
+    if isinstance(every, BinomialCheckpoints):
+        return _binomial(run, 0, steps, every.snapshots, *state)
+    if every is None:
+        return run(0, steps, *state)
+    frames, observed = [], []
+    for first in range(0, steps, every):
+        part = _again(run, first, min(first + every, steps), *state)
+        state = part.end
+        frames += part.frames
+        observed += part.observed
+    return Segment(state, frames, observed)
+
+
+def _again(run: Callable[..., Segment], *args: Any) -> Segment:
+    # The non-reentrant form: gradients reach what a callable closes over, and checkpoints nest.
+    # A graph's capture admits no look at the state of the random number generator; what is replayed draws none.
+    capturing = (
+        not torch.compiler.is_compiling() and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+    )
+    if torch.compiler.is_compiling():
+        return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+    scope = Scope()
+    # A run that stops once the last tensor is saved does not reach the end of its last step, which records it.
+    with set_checkpoint_early_stop(not scope.recorders):
+        return checkpoint(_resuming(run, scope), *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+
+
+def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segment]:
+    def resumed(*args: Any) -> Segment:
+        with scope.resumed():
+            return run(*args)
+
+    return resumed
+
+
+def _binomial(run: Run, first: int, end: int, snapshots: int, *state: Tensor) -> Segment:
+    length = end - first
+    if length <= 1:
+        return run(first, end, *state)
+    middle = first + _left(length, snapshots)
+    left = _again(_binomial, run, first, middle, snapshots, *state)
+    right = _binomial(run, middle, end, max(snapshots - 1, 0), *left.end)
+    return Segment(right.end, left.frames + right.frames, left.observed + right.observed)
+
+
+def _left(length: int, snapshots: int) -> int:
+    """Steps before the first snapshot, so that both parts repeat their steps as rarely as can be."""
+    if snapshots == 0:
+        return length - 1
+    repeats = _repeats(length, snapshots)
+    most = math.comb(snapshots + repeats - 1, repeats - 1)
+    return max(1, min(most, length - 1))
+
+
+def _repeats(length: int, snapshots: int) -> int:
+    """How often a step is run again at most."""
+    repeats = 1
+    while math.comb(snapshots + repeats, repeats) < length:
+        repeats += 1
+    return repeats

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..checks import check_positive, fail, to_float
+from ..energies import Anchor
+from ..mask import ELASTIC
+from ..mesh import subdivide
+from ..model.inputs import MODULI
+from ..model.model import Model
+from ..model.solver import VBD
 from ..said import percent
-from ..scopes import Finer, refined
-from .reference import STALLED, is_balanced
+from ..scopes import Finer, record_to, refined
+from ..step.integrators import History, is_step_of
+from ..step.residual import UNBALANCED, left_of_solve, share
+from .checks import check_checks
+from .trajectory import PerStep, StepAverage, Trajectory, stacked
 
 MOST = 16  # times the sweeps, until the forces of the finest run balance
 STEPS = (0.01, 0.1)  # of a parameter, of central differences
@@ -22,7 +32,7 @@ HELPS = {"K": "more sweeps", "2 K": "more sweeps", "h": "smaller steps", "h/2": 
 
 
 @dataclass(frozen=True)
-class GradientCheck:
+class GradientTest:
     """How far the gradient with respect to a parameter is from what it should be, see :func:`refine`: shares of the
     gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
 
@@ -61,7 +71,7 @@ class Refinement:
     before: float | None
     tolerance: float
     mesh: float | None = None
-    gradients: tuple[GradientCheck, ...] = ()
+    gradients: tuple[GradientTest, ...] = ()
     left: float = 0.0
     sweeps: int = 2
 
@@ -247,7 +257,7 @@ class _Runs:
             self.sweeps *= 2
             self.others ^= left > STALLED * before
 
-    def check(self, number: int, loss: float) -> GradientCheck:
+    def check(self, number: int, loss: float) -> GradientTest:
         """The gradient with respect to a parameter, in units of its elements."""
         parameter = self.parameters[number]
         kept, own = parameter.detach().clone(), self.gradients["own"][number]
@@ -273,7 +283,7 @@ class _Runs:
                 better = unit * gradients[number]
                 off, size = float((better - scaled).norm()), float(better.norm())
                 finer[name] = share(off, max(size, steepest / float(way.norm())))
-        return GradientCheck(finer, {name: share(abs(slope - along), steepest) for name, slope in slopes.items()})
+        return GradientTest(finer, {name: share(abs(slope - along), steepest) for name, slope in slopes.items()})
 
     def _moved(self, parameter: Tensor, value: Tensor) -> float:
         """The loss with another value of a parameter."""
@@ -305,3 +315,255 @@ def _scalar(name: str, value: Tensor | float) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{name}: expected a scalar, got {type(value).__name__}")
     return to_float(name, value)
+
+
+# --- a rollout over the same time with smaller steps, more sweeps or smaller tets, as dv.refine -----------------------
+
+_MOVING = ("prescribed", "colliders", "colliders_before")  # other inputs are held over the smaller steps
+
+
+def rollout_finer(rollout: Callable[..., Trajectory], finer: Finer, model: Model, x: Tensor, v: Tensor, solver: VBD,
+                  steps: int, inputs: dict[str, Any], options: dict[str, Any]) -> Trajectory:  # fmt: skip
+    """``rollout`` of these arguments, as much finer as ``finer`` says.
+
+    The result looks like that of the rollout itself: the same vertices, frames, and observations at the same times.
+    What is given per step, or by a function, is asked at the steps of the caller and held in between; prescribed
+    vertices and colliders go in straight lines between the ends of these.
+    """
+    parts, vertices, asked = finer.steps, model.num_vertices if finer.mesh else None, steps
+    options = dict(options)
+    if parts > 1 or finer.mesh:
+        # dv.refine has run this as it stands before, which has checked the arguments
+        if check_checks(options["checks"], model).errors:
+            raise NotImplementedError("refine: expected rollouts without Checks(errors=True)")
+        options |= {"progress": False}
+    if finer.mesh:
+        fine = halved(model)
+        inputs, x, v, options["history"] = on_halved(inputs, model, fine), fine.between(x), fine.between(v), None
+        model = fine.model
+    if parts > 1:
+        solver = replace(solver, time_step=solver.time_step / parts)
+        history, save = options["history"], options["save"]
+        if isinstance(history, History) and not is_step_of(history, solver.time_step):  # but that of a refined rollout
+            raise NotImplementedError("refine: expected rollouts that begin without a history of larger steps")
+        options["save"] = save if save == "last" else parts * (1 if save == "all" else save)
+        inputs, steps = _of_smaller_steps(inputs, parts, model), parts * steps
+    solver = replace(solver, sweeps=finer.sweeps * solver.sweeps)
+    if finer.others:
+        solver = with_other_sweeps(model, solver)
+    observe, observed = options["observe"], []
+
+    def observe_some(step: int, x: Tensor, v: Tensor) -> None:
+        if step % parts == 0:
+            observed.append(observe(step // parts, x[..., :vertices, :], v[..., :vertices, :]))
+
+    solves: list[Any] = []
+    looks = record_to(solves, "solve") if finer.sweeps > 1 else nullcontext()
+    options["observe"] = None if observe is None else observe_some
+    with refined(None), looks:
+        found = rollout(model, x, v, solver, steps=steps, **options, **inputs)
+    finer.ran.append((asked, unbalanced(solves)))
+    history = None if finer.mesh else found.history
+    return Trajectory(found.x[..., :vertices, :], found.v[..., :vertices, :],
+                      [step // parts for step in found.steps], stacked(observed), found.errors, history)  # fmt: skip
+
+
+def _of_smaller_steps(inputs: dict[str, Any], parts: int, model: Model) -> dict[str, Any]:
+    out = {name: value if name in _MOVING else _held(value, parts) for name, value in inputs.items()}
+    if "prescribed" in out:
+        out["prescribed"] = _moving(out["prescribed"], parts, model)
+    if isinstance(out.get("colliders"), PerStep):
+        before = out.get("colliders_before")
+        first = model.collider_points if before is None else before
+        out["colliders"] = _between(out["colliders"].values, first, parts)
+    return out
+
+
+def _kept(value: Callable[[int, Tensor, Tensor], Any], parts: int) -> Callable[[int, Tensor, Tensor], Any]:
+    """A callable of smaller steps that asks ``value`` at the first of each of its steps only. A segment of a
+    checkpointed rollout may begin at another: with gradients all answers are kept."""
+    answers: dict[int, Any] = {}
+
+    def ask(step: int, x: Tensor, v: Tensor) -> Any:
+        if step % parts == 0:
+            if not torch.is_grad_enabled():
+                answers.clear()
+            answers[step // parts] = value(step // parts, x, v)
+        return answers[step // parts]
+
+    return ask
+
+
+def _held(value: Any, parts: int) -> Any:
+    if isinstance(value, PerStep):
+        return PerStep(value.values.repeat_interleave(parts, 0))
+    if isinstance(value, StepAverage):  # over the smaller steps
+        return value
+    return _kept(value, parts) if callable(value) and not isinstance(value, Tensor) else value
+
+
+def _moving(value: Any, parts: int, model: Model) -> Any:
+    """Where pinned vertices are at the end of each smaller step."""
+    if value is None:
+        return None
+    ends = _kept(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
+    begun = _kept(lambda step, x, v: x, parts)
+    pinned = model.pinned[:, None]
+
+    def now(step: int, x: Tensor, v: Tensor) -> Tensor:
+        begin = begun(step, x, v)
+        if ends is not None:
+            end = ends(step, x, v)
+        else:
+            end = value.values[step // parts] if isinstance(value, PerStep) else value
+        if not isinstance(end, Tensor):
+            raise NotImplementedError("refine: expected prescribed positions without those of stages")
+        way = begin + (end - begin) * ((step % parts + 1) / parts)
+        # a policy has given elsewhere where vertices were: that is checked in the first smaller step, and old in others
+        return torch.where(pinned, way, end if step % parts == 0 else x)
+
+    return now
+
+
+def _between(ends: Tensor, first: Tensor, parts: int) -> PerStep:
+    """Where colliders are at the end of each smaller step."""
+    if len(ends) == 0:
+        return PerStep(ends)
+    begins = torch.cat([first.expand_as(ends[0])[None], ends[:-1]])
+    shares = torch.arange(1, parts + 1, dtype=ends.dtype, device=ends.device) / parts
+    ways = torch.stack([begins + share * (ends - begins) for share in shares], dim=1)
+    return PerStep(ways.flatten(0, 1))
+
+
+# --- a scene on the mesh of eight tets for each -----------------------------------------------------------------------
+
+TETS = 8  # of each
+
+
+class Halved(NamedTuple):
+    """A Model on the subdivided mesh, whose first vertices are those of the mesh."""
+
+    model: Model
+    ends: Tensor  # of the edge of each vertex that is new, [E, 2]
+    vertices: int  # of the mesh
+
+    def between(self, value: Tensor) -> Tensor:
+        """[..., V, n], and its means over the ends of edges behind it."""
+        return torch.cat([value, value[..., self.ends, :].mean(-2)], -2)
+
+
+def halved(model: Model) -> Halved:
+    """Raises ValueError for a Model with an Anchor, which holds single vertices."""
+    if any(isinstance(e, Anchor) for e in model.energies):
+        fail("mesh", "False beside an Anchor, which holds single vertices", "True")
+    return model.derived("halved", lambda: _halved(model))
+
+
+def _halved(model: Model) -> Halved:
+    tets, pinned = model.tets.cpu(), model.pinned.cpu()
+    ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
+    density = model.density.cpu().repeat_interleave(TETS)
+    changes = {"density": density, "pinned": torch.cat([pinned, pinned[ends].all(1)]) if pinned.any() else None}
+    fine = Model(subdivide(model.mesh), energies=model.replace().energies, colliders=model.colliders, dtype=model.dtype,
+                 device=model.device, **changes)  # fmt: skip
+    return Halved(fine, ends.to(model.device), model.num_vertices)
+
+
+def of_parts(value: Any, tets: int) -> Any:
+    """A value of each tet for its eight parts; one of all of them as it is."""
+    each = isinstance(value, Tensor) and value.dim() and value.shape[-1] == tets
+    return value.repeat_interleave(TETS, -1) if each else value
+
+
+def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, Any]:
+    """The inputs of a rollout on the finer mesh. Forces stay at the vertices of the mesh."""
+    count = fine.vertices
+    tets, pinned = model.num_tets, fine.model.pinned[:, None]
+
+    def mapped(name: str, change: Callable[[Any], Any]) -> Any:
+        value = given[name]
+        if isinstance(value, PerStep):  # [steps] is a number for each
+            return value if value.values.dim() == 1 else PerStep(change(value.values))
+        if isinstance(value, StepAverage):
+            return value.then(change)
+        if callable(value) and not isinstance(value, Tensor):
+            return lambda k, x, v: change(value(k, x[..., :count, :], v[..., :count, :]))
+        return change(value)
+
+    def pushed(force: Any) -> Any:
+        if force is None:
+            return None
+        rows = force.expand(*force.shape[:-2], count, 3) if force.dim() > 1 else force.expand(count, 3)
+        return torch.cat([rows, rows.new_zeros(*rows.shape[:-2], len(fine.ends), 3)], -2)
+
+    def accelerated(gravity: Any) -> Any:
+        each = isinstance(gravity, Tensor) and gravity.dim() > 1 and gravity.shape[-2] == count
+        return fine.between(gravity) if each else gravity
+
+    def moved(ends: Any) -> Any:
+        if ends is None:
+            return None
+        if not isinstance(ends, Tensor):
+            raise NotImplementedError("refine: expected prescribed positions without those of stages")
+        return torch.where(pinned, fine.between(ends), torch.nan)
+
+    def shaped(points: Any) -> Any:
+        return None if points is None else fine.between(points)
+
+    def of_each(value: Any) -> Any:
+        return of_parts(value, tets)
+
+    changes = {"force": pushed, "gravity": accelerated, "prescribed": moved, "rest_points": shaped}
+    changes |= dict.fromkeys((*MODULI, "density"), of_each)
+    return {name: mapped(name, changes[name]) if name in changes else value for name, value in given.items()}
+
+
+# --- when a run may be called a reference -----------------------------------------------------------------------------
+
+MOST_SWEEPS = 1300
+LOOKS = 64  # at steps of a run, evenly spread
+STALLED = 0.5  # of what was left over: more than this part of it after twice the sweeps
+
+
+def unbalanced(seen: list[Any]) -> float:
+    """The force that solves left over, all together, over all of their forces [-]: of the worst scene, with contact of
+    the worst body. Steps with large forces, such as those of an impact, weigh more than those in flight.
+
+    seen: of solves that a rollout recorded (kind "solve"), each (Model, Solve, positions after it).
+    """
+    if not seen:
+        return 0.0
+    found = [left_of_solve(model, (s.x, s.v), end, s.prepared, s.given) for model, s, end in seen]
+    left, whole = (torch.stack(parts).sum(0) for parts in zip(*found, strict=True))
+    return float(torch.nan_to_num(share(left, whole), nan=math.inf).max()) if left.numel() else 0.0
+
+
+def is_balanced(left: float) -> bool:
+    """Whether the steps of a run leave so little over that others may be held against it."""
+    return left <= UNBALANCED
+
+
+def takes_corrections(model: Model, solver: VBD) -> bool:
+    """Whether coarse corrections are defined."""
+    return bool(model.energy_mask & ELASTIC) and solver.block == "exact" and solver.saturation is None
+
+
+def with_other_sweeps(model: Model, solver: VBD) -> VBD:
+    """Plain sweeps in place of coarse corrections, or corrections, where they are cheap, in place of plain ones."""
+    if solver.coarse is None and (model.touches or not takes_corrections(model, solver)):
+        return solver
+    return replace(solver, subspace="coarse" if solver.coarse is None else "rigid")
+
+
+def with_more_sweeps(settings: VBD, left: float, before: float) -> VBD:
+    """Those of the next attempt: twice the sweeps, or plain ones where more with corrections have not helped.
+
+    left, before: unbalanced() of the last two runs.
+    """
+    if settings.coarse is not None and not is_balanced(left) and left > STALLED * before:
+        return replace(settings, subspace="rigid", relaxation=1.0)
+    return replace(settings, sweeps=2 * settings.sweeps + 1)
+
+
+def unreached(settings: VBD, left: float) -> str:
+    return f"no reference could be reached: {settings} leaves {percent(left)} of its forces unbalanced"

@@ -13,10 +13,19 @@ from ..checks import check_time_step, fail
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from ..ops.sums import one_thread
+from ..step.arguments import GRAVITY
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import GRAVITY, ParticleSolver, all_finite, checked_edges, checked_mesh, mesh_edges, mesh_mass
-from .projections import Springs, Tets
-from .sums import placed
+from .particles import (
+    ParticleSolver,
+    Springs,
+    Tets,
+    all_finite,
+    checked_edges,
+    checked_mesh,
+    mesh_edges,
+    mesh_mass,
+    placed,
+)
 
 MAX_FREE = 4096  # free particles of one dense factor: 128 MiB in float64
 

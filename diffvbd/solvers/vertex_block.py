@@ -11,12 +11,12 @@ from torch import Tensor
 
 from ..checks import check_broadcast, check_kind, check_tensor, check_time_step, fail, name_value
 from ..energies import StableNeoHookean
+from ..model.material import rest_metric
 from ..model.model import Model
-from ..model.rest import rest_metric
+from ..model.solver import VBD
 from ..safeguards import SATURATION_EPS
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
-from .particles import check_finite
-from .sums import FixedSum, placed
+from .particles import FixedSum, check_finite, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
 _OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], device="cpu")
@@ -70,12 +70,12 @@ class VertexBlock(BlockUpdate):
     Source: paper, eqs. 2-3 and 7-13; docs/method.md, sections 2, 3 and 5.
     """
 
-    def __init__(self, model: Model, time_step: float, vertices: Tensor) -> None:
-        energy = elastic_energy(model)
-        self.rows, self.factor = (vertices,), check_time_step(time_step, model.mass.dtype) ** 2
-        self.exact = energy.block == "exact"
-        self.relaxation, self.saturation = model.relaxation, model.saturation
-        self.regularization = model.regularization
+    def __init__(self, model: Model, solver: VBD, vertices: Tensor) -> None:
+        check_elastic(model)
+        self.rows, self.factor = (vertices,), check_time_step(solver.time_step, model.mass.dtype) ** 2
+        self.exact = solver.block == "exact"
+        self.relaxation, self.saturation = solver.relaxation, solver.saturation
+        self.regularization = solver.regularization
         self.num_vertices, self.num_tets = model.num_vertices, model.num_tets
         self._pairs(model, vertices)
 
@@ -211,30 +211,30 @@ class VertexBlock(BlockUpdate):
         return self.to_vertices(torch.cat((to_i, to_j, to_k, to_l), -2))
 
 
-def vertex_block_descent(model: Model, time_step: float, update: type[VertexBlock] = VertexBlock) -> Solver:
+def vertex_block_descent(model: Model, solver: VBD, update: type[VertexBlock] = VertexBlock) -> Solver:
     """The sweep of :func:`diffvbd.step` as a composition of its colors.
 
-    ``solver((x,), (y, mu, lam, mass), sweeps=K)`` equals the sweep that a step executes between predictor and velocity;
+    ``descent((x,), (y, mu, lam, mass), sweeps=K)`` equals the sweep that a step executes between predictor and velocity;
     shapes and units in :class:`VertexBlock`. For study and for comparison: it is many times slower than ``step``.
 
     Args:
         model: A Model whose only energy is StableNeoHookean, on any device.
-        time_step: h [s] > 0, not differentiable.
+        solver: Its time step, relaxation, block, saturation and regularization are taken.
         update: A subclass of VertexBlock to use in its place.
 
     Raises:
-        TypeError: model is no Model, or time_step no number.
-        ValueError: model has other energies than one StableNeoHookean, or time_step is not > 0.
+        TypeError: model is no Model, or solver no VBD.
+        ValueError: model has other energies than one StableNeoHookean.
             In the solver's call, naming them: state or parameters of other shapes, or (looked at on the CPU only) not
             finite, mu < 0, mu + lam < 0, or a mass that is not > 0 where the Model is not pinned.
     """
-    elastic_energy(model)
-    time_step = check_time_step(time_step, model.mass.dtype)
+    check_elastic(model)
+    check_kind("solver", solver, VBD)
     if not (isinstance(update, type) and issubclass(update, VertexBlock)):
         raise TypeError(f"update: expected VertexBlock or a subclass, got {update!r}")
     bounds = model.color_ptr.tolist()
     colors = (model.color_vertices[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
-    return _ColorSolver(model, (update(model, time_step, vertices) for vertices in colors))
+    return _ColorSolver(model, (update(model, solver, vertices) for vertices in colors))
 
 
 class _ColorSolver(Solver):
@@ -277,14 +277,13 @@ def _check_values(model: Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, m
     name_value("mass", "finite numbers > 0 kg where not pinned", used, used > 0)
 
 
-def elastic_energy(model: Model) -> StableNeoHookean:
-    """The one energy that VertexBlock knows; raises where there are others."""
+def check_elastic(model: Model) -> None:
+    """Raises where a Model has other energies than the one that VertexBlock knows."""
     check_kind("model", model, Model)
     energies = model.energies
     if len(energies) != 1 or not isinstance(energies[0], StableNeoHookean):
         names = [type(e).__name__ for e in energies]
         fail("model", "a StableNeoHookean as its only energy", f"{names or 'none'}")
-    return energies[0]
 
 
 def _shaped(parameters: Tensors) -> Tensors:

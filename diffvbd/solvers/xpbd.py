@@ -11,10 +11,18 @@ from torch import Tensor
 from ..checks import check_time_step, fail, is_word
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
+from ..step.arguments import GRAVITY
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import GRAVITY, ParticleSolver, all_finite, checked_edges, checked_mesh, mesh_edges, mesh_mass
-from .projections import direction_of
-from .sums import placed
+from .particles import (
+    ParticleSolver,
+    all_finite,
+    checked_edges,
+    checked_mesh,
+    direction_of,
+    mesh_edges,
+    mesh_mass,
+    placed,
+)
 
 
 class Projection(NamedTuple):

@@ -6,20 +6,22 @@ small sums: loads to accelerations, rest shape to masses, packing of energies, t
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.anderson import none_taken, run_sweeps
 from ..adjoint.implicit import global_sweep
-from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..adjoint.sweep import fused_step
-from ..model.model import Model
-from ..model.warnings import warn_of_erratic_gradients
+from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep, check_adjoint
+from ..adjoint.sweep import fused_step, is_out_of_memory, sweep
+from ..mask import VERTEX_ENERGIES
+from ..model.coarse import TILE
+from ..model.system import System
+from ..ops import regimes
 from ..scopes import checking, recorders
 from ..tuples import replaced
 from .arguments import (
@@ -29,15 +31,13 @@ from .arguments import (
     collider_state,
     named,
 )
-from .check import check_on_cpu
 from .coarse import lengths_of, with_corrections
 from .contact import run_contact
-from .memory import out_of_memory_named
 from .predict import Begun, begin
 
 
 def advance(
-    model: Model,
+    model: System,
     x: Tensor,
     v: Tensor,
     prepared: Prepared,
@@ -54,7 +54,7 @@ def advance(
     adjoint = check_adjoint(adjoint)
     gravity = acceleration_of(gravity, x)
     where = collider_state(model, x, colliders, colliders_before)
-    if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
+    if isinstance(adjoint, TapedSweep) and x.is_cuda and _fuses(model, force, gravity):
         prescribed = None if prescribed is None else broadcastable("prescribed", prescribed, x)
         return _fused(model, x, v, gravity, prescribed, prepared, adjoint)
     begun = begin(model, x, v, prepared, force, gravity, prescribed)
@@ -73,7 +73,7 @@ def advance(
 
 
 def swept(
-    model: Model,
+    model: System,
     begun: Begun,
     prepared: Prepared,
     given: dict[str, Any],
@@ -88,8 +88,6 @@ def swept(
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())
     policy = _tape_policy(model, (*fields, *more), settings, adjoint)
-    if isinstance(adjoint, ReverseSweep) and not torch.compiler.is_compiling() and _is_differentiated((*fields, *more)):
-        warn_of_erratic_gradients(model, settings.sweeps)
     debug_step = index if checking() else -1
     try:
         if colliders is not None:
@@ -101,19 +99,17 @@ def swept(
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            done = run_sweeps(model, fields, settings, tape_policy=policy, debug_step=debug_step)
-            if done.corrections:
-                for found in recorders("coarse"):
-                    found.append(lengths_of(model, torch.cat(done.corrections, 1)))
-            if model.acceleration is not None and prepared.unrolled is None:
-                for found in recorders("anderson"):
-                    found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
-            return done.x
+            end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                                        debug_step=debug_step)  # fmt: skip
+            if corrections.numel():
+                for found in recorders("subspace"):
+                    found.append(lengths_of(model, corrections))
+            return end
     except ValueError as error:
         raise named(model, error, given) from None  # the frames of operators say nothing to who gave the argument
 
 
-def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
+def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
@@ -121,7 +117,6 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
         simple
         and not model.corrects
         and model.coarse is None
-        and model.acceleration is None
         and model.starts_from == "predictor"
         and not ops.TET_READS_X_PREV
     )
@@ -131,13 +126,13 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
 
 
 def _fused(
-    model: Model,
+    model: System,
     x: Tensor,
     v: Tensor,
     gravity: Tensor,
     prescribed: Tensor | None,
     prepared: Prepared,
-    adjoint: ReverseSweep,
+    adjoint: TapedSweep,
 ) -> tuple[Tensor, Tensor]:
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     prescribed = None if prescribed is None else ops.broadcast(prescribed, shape).reshape(flat)
@@ -154,10 +149,89 @@ def _is_differentiated(tensors: Sequence[Tensor | None]) -> bool:
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
-def _tape_policy(model: Model, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
-    if not (isinstance(adjoint, ReverseSweep) and _is_differentiated(tensors)):
+def _tape_policy(model: System, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
+    if not (isinstance(adjoint, TapedSweep) and _is_differentiated(tensors)):
         return ops.NO_TAPE
     x = tensors[0]
     assert x is not None
     scalars = x.shape[0] * settings.sweeps * model.num_active
     return adjoint.policy(scalars, x.element_size(), model.energy_mask, x.device)
+
+
+# --- what a step does where debug_checks() is on ----------------------------------------------------------------------
+
+
+def check_on_cpu(model: System, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
+    """The CPU repeats a step and names what is wrong with it."""
+    twin = model._on_cpu()
+    settings = replaced(settings, sizes=twin._sizes, launch=())
+    with torch.no_grad():
+        here = ops.SweepFields(*(t if t is None else t.detach().cpu() for t in fields))  # pyright: ignore
+        if settings.coarse:
+            plan = twin._coarse_plan  # whose positions are those of the CPU
+            settings = replaced(settings, coarse=replaced(plan.sizes, begun=settings.coarse.begun))
+            here = replaced(here, coarse_plan=plan.plan, coarse_weights=plan.weights)
+        sweep(here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)
+
+
+# --- what a step needs of memory on cuda, and what it says where that is not there ------------------------------------
+
+
+@contextlib.contextmanager
+def out_of_memory_named(model: System, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
+    """Says of a step that does not fit the memory how much it wanted, and which tape would fit a CUDA device."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error) or isinstance(error, torch.OutOfMemoryError) and not x.is_cuda:
+            raise
+        scalars = x.shape[0] * settings.sweeps * model.num_active * x.element_size()
+        base = 2 * x.numel() * x.element_size()
+        base += cuda_scratch(model, x.shape[0], reverse=False) if x.is_cuda else 0
+        wanted = {name: base + scalars * ops.tape_rows(code, model.energy_mask) for name, code in _POLICIES.items()}
+        chosen = next(name for name, code in _POLICIES.items() if code == policy)
+        if not x.is_cuda:
+            smaller = [f'"{name}" {size} bytes' for name, size in wanted.items() if size < wanted[chosen]]
+            advice = f", or a smaller VBD(tape=...): {', '.join(smaller)}" if smaller else ""
+            raise torch.OutOfMemoryError(
+                f'CPU out of memory: a step of {settings.sweeps} sweeps with tape="{chosen}" wanted {wanted[chosen]} '
+                f"bytes; use fewer sweeps or scenes{advice}"
+            ) from error
+        free, _ = torch.cuda.mem_get_info(x.device)
+        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
+        fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
+        advice = f"VBD(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
+        raise torch.OutOfMemoryError(
+            f'CUDA out of memory: a step with tape="{chosen}" wanted {wanted[chosen]} bytes, {free} are free; {advice}'
+        ) from error
+
+
+_POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}
+WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/bind/cuda/sweep.h
+
+
+def cuda_scratch(model: System, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
+    """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
+    corrects = model.coarse is not None
+    launch = regimes.choose(model.num_vertices, model.num_colors, scenes, model.touches, corrects)
+    if launch[0] == regimes.THREAD:
+        return 0
+    _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes
+    lanes = ops.LANES["cuda"]
+    positions, pairs = blocks * lanes, slots * lanes
+    one = 8 * positions + (6 * positions if model.floor else 0) + 2 * pairs
+    one += 3 * positions if model.dtype == torch.float32 else 0  # local origins
+    if reverse:
+        one += 4 * (edge_slots * lanes + 1) + 8 * positions
+        one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
+    if model.touches:
+        one += ((6 if reverse else 4) + (0 if launch[2] == regimes.MANY_LANES else 9)) * positions
+    if corrects:
+        sizes = model._coarse_plan.sizes
+        one += 8 * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)
+        if model.energy_mask & VERTEX_ENERGIES and not model.touches:  # in float64: blocks, matrices, their inversion
+            double, tile = 8 // model._mass.element_size(), sizes.functions * 6 + TILE * sizes.bodies
+            one += double * (6 * positions + 9 * sizes.cells + TILE * tile)
+            one += 9 * sizes.cells + (4 * positions if reverse else 0)
+    one *= model._mass.element_size()
+    return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))

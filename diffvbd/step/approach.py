@@ -6,8 +6,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..checks import input_name
 from ..energies import barrier_curvature
-from ..model.model import Model
+from ..model.system import System
 from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import Prepared
 from .contact import ContactStep
@@ -22,7 +23,7 @@ SOFT = 10.0  # of the mass: h^2 times a barrier's curvature
 
 
 @torch.no_grad()
-def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None) -> Tensor:
+def may_touch(model: System, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None) -> Tensor:
     """Whether the body of each vertex may touch something on its way from begun.x_prev to begun.y, bool [B, V]: where a
     gap is below dhat, or its sides may go that close, unless the step resolves the barrier.
 
@@ -41,9 +42,11 @@ def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tenso
     return of_body.gather(1, first) > 0
 
 
-def _extrapolates(model: Model, prepared: Prepared) -> bool:
+def _extrapolates(model: System, prepared: Prepared) -> bool:
     """Whether contact has forces of gaps alone: those of velocities are measured from the start of a solve."""
-    damped = (f"{e.name}.damping" in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e)
+    damped = (
+        input_name(e, "damping") in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e
+    )
     return model.friction is None and not any(damped)
 
 
@@ -54,7 +57,7 @@ def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, way: Tensor, mass: Tenso
     return slow & (h * h * barrier_curvature(gap - way, kappa, dhat) < SOFT * mass)
 
 
-def _near_floor(model: Model, begun: Begun, prepared: Prepared, way: Tensor) -> Tensor:
+def _near_floor(model: System, begun: Begun, prepared: Prepared, way: Tensor) -> Tensor:
     assert model.floor is not None
     data = begun.data[:, : model.floor.count()]
     gap, normal, kappa, dhat = model.floor.gaps(begun.x_prev, data, begun.origin)
@@ -66,7 +69,7 @@ def _near_floor(model: Model, begun: Begun, prepared: Prepared, way: Tensor) -> 
     return near.any(-1) & ~model._pinned
 
 
-def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, before: Tensor, after: Tensor) -> Tensor:
+def _near_pairs(model: System, begun: Begun, prepared: Prepared, way: Tensor, before: Tensor, after: Tensor) -> Tensor:
     step = ContactStep(model, begun, prepared, before, after)
     assert step.surface is not None
     motion = motion_of(step.surface, step.x_prev, step.origin, step.fields.mass, way, torch.zeros_like(way))

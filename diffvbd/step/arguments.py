@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable
 from functools import partial
-from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +16,6 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..checks import (
     NUMBERS,
     check_broadcast,
-    check_count,
     check_kind,
     check_readable,
     check_tensor,
@@ -28,18 +25,19 @@ from ..checks import (
     name_value,
     to_float,
 )
-from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import MOST_LENGTH, Plane
-from ..energies import VERTEX_ENERGIES
+from ..mask import ELASTIC
+from ..model.inputs import MODULI, Given, parameters_of, sorted_inputs
+from ..model.material import lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
-from ..model.moduli import moduli_of
-from ..model.rest import lumped_mass, rest_metric
+from ..model.solver import VBD
+from ..model.system import System, system_of
+from ..model.warnings import warn_of_solver
 from ..scopes import checking, looks_at, refuse_forward_mode, transformed
 from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 
-MAX_SWEEPS = 2**31 - 1
 SCENE_TET = ("scene", "tet")  # what the dimensions of values of tets count
 
 
@@ -96,32 +94,42 @@ def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], ow
     return ops.broadcast(value, (*lead, *rest)).reshape(-1, *rest)
 
 
-def step_settings(model: Model, lead: tuple[int, ...], time_step: Any, sweeps: Any) -> ops.SweepSettings:
+def system_for(model: Model, solver: VBD) -> System:
+    """The System of a call, with the warnings that it deserves."""
+    system = system_of(model, solver)
+    if system.relaxation > 1 or system.regularization:
+        warn_of_solver(system)
+    return system
+
+
+def given_of(model: Model, inputs: dict[str, Any]) -> Given:
+    """The inputs of a call, sorted, with the default gravity."""
+    return sorted_inputs(model, inputs, GRAVITY)
+
+
+def material_of(**material: Any) -> Given:
+    """Moduli, rest_points and density as inputs."""
+    return Given({**dict.fromkeys((*MODULI, "rest_points", "density")), **material}, {}, {})
+
+
+def step_settings(model: System, lead: tuple[int, ...], time_step: float, sweeps: int) -> ops.SweepSettings:
     """What is executed for scenes of shape ``lead``, the regime on CUDA included."""
-    return model.settings(
-        check_time_step(time_step, model.dtype),
-        check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
-        math.prod(lead),
-    )
+    return model.settings(check_time_step(time_step, model.dtype), sweeps, math.prod(lead))
 
 
 def prepare(
-    model: Model,
+    model: System,
     lead: tuple[int, ...],
+    given_inputs: Given,
     *,
-    mu: float | Tensor | None,
-    lam: float | Tensor | None,
-    young: float | Tensor | None = None,
-    poisson: float | Tensor | None = None,
     time_step: float,
     sweeps: int,
-    rest_points: Tensor | None,
-    density: float | Tensor | None,
-    parameters: dict[str, Any] | None,
     adjoint: Adjoint | None = None,
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
+    mu, lam, young, poisson, rest_points, density = given_inputs.material.values()
+    parameters = given_inputs.parameters
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
         raise NotImplementedError("adjoint: expected ReverseSweep inside torch.func transforms, got GlobalAdjoint, "
@@ -129,7 +137,7 @@ def prepare(
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
-    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson) if model.energy_mask & ELASTIC else (0.0, 0.0)
     rest, corners, mass, given_density = None, None, model._mass[None], density
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
@@ -153,14 +161,8 @@ def prepare(
             name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
             raise
     given: dict[str, Tensor] = {}
-    if parameters is not None and not isinstance(parameters, dict):
-        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
-    known = {}
-    if parameters:
-        known = {f"{e.name}.{k}": (e, k, own) for e in model.parametric_energies for k, own in e.parameters.items()}
-    for name, value in (parameters or {}).items():
-        if name not in known:
-            fail("parameters", f"names among {sorted(known)}", f"{name!r}{_absent(name, model)}")
+    known = parameters_of(model) if parameters else {}
+    for name, value in parameters.items():
         energy, key, own = known[name]
         shape = tuple(model.constants(energy)[key].shape)[:own]
         given[name] = _scenes_first(name, value, like, lead, shape)
@@ -189,7 +191,7 @@ def prepare(
     )
 
 
-def _unrolled(model: Model, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
+def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
               layout: Any, time_step: float, sweeps: int, chord: float
               ) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
     return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout, chord)
@@ -214,23 +216,6 @@ def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) 
             "positions for pinned vertices (elsewhere x, the Model's rest_points or NaN)",
             f"another position for {where}, which is not pinned: Model(pinned=...) says which vertices follow",
         )
-
-
-def _absent(name: Any, model: Model) -> str:
-    """Why a Model does not know a parameter: perhaps its energy is missing, or misspelt."""
-    owners = (*VERTEX_ENERGIES, PairBarrier, Friction)
-    kinds = {f"{kind.name}.{key}": kind for kind in owners for key in kind.parameters}
-    for kind in owners:
-        prefix, _, key = str(name).partition(".")
-        if prefix == kind.name and key in signature(kind).parameters and key not in kind.parameters:
-            return f", a constant: {kind.__name__}({key}=...) sets it when a Model is made"
-    meant = difflib.get_close_matches(str(name), kinds, 1)
-    if not meant:
-        return ""
-    (full,), kind = meant, kinds[meant[0]]
-    text = "" if full == name else f" (is {full!r} meant?)"
-    present = any(isinstance(energy, kind) for energy in model.energies)
-    return text if present else f"{text}: the Model has no {kind.__name__} among its energies"
 
 
 def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tensor, Tensor] | None:

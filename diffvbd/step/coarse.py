@@ -15,8 +15,8 @@ from torch.autograd import Function
 
 from .. import ops
 from ..mask import VERTEX_ENERGIES
-from ..model.model import Model
-from ..model.rest import shape_gradients
+from ..model.material import shape_gradients
+from ..model.system import System
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 from ..tuples import replaced
@@ -34,8 +34,8 @@ class CoarseParts(NamedTuple):
     rest: Tensor  # [1 | B, blocks, 7, lanes], see CoarsePlan
 
 
-def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, rest: Tensor | None, corners: Tensor | None
-                 ) -> CoarseParts:  # fmt: skip
+def coarse_parts(model: System, mu: Tensor, lam: Tensor, mass: Tensor | None, rest: Tensor | None,
+                 corners: Tensor | None) -> CoarseParts:  # fmt: skip
     """mu, lam [1 | B, 1 | T]; mass [B, V], rest [B, T, 7] and the tets' corners at rest [B, T, 4, 3] where a step is
     given them, else None."""
     with torch.autocast(mu.device.type, enabled=False):  # which would take the products in half precision
@@ -53,14 +53,14 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
         return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes)
 
 
-def _unit_stiffness(model: Model) -> Tensor:
+def _unit_stiffness(model: System) -> Tensor:
     """Of all groups with mu = 1 Pa and lam = 0, and with mu = 0 and lam = 1 Pa."""
     gradients, volume = _shapes_of(model)
     mu = volume.new_tensor([[1.0], [0.0]])
     return coarse_stiffness(model._coarse_plan, mu, 1 - mu, gradients, volume)
 
 
-def _shapes_of(model: Model) -> tuple[Tensor, Tensor]:
+def _shapes_of(model: System) -> tuple[Tensor, Tensor]:
     """Gradients of the tets' shape functions and their volumes at the Model's own rest."""
     return shape_gradients(model._rest_points[model._topology[0]][None])
 
@@ -113,7 +113,7 @@ class _MatrixBackward(Function):
         return one_by_one(_MatrixBackward, info.batch_size, in_dims, args)
 
 
-def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
+def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
     matrix = matrix_of(model, parts, fields.x_prev, time_step, factored=not model.energy_mask & VERTEX_ENERGIES)
@@ -121,13 +121,13 @@ def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, 
                            coarse_weights=plan.weights, coarse_rest=parts.rest)  # fmt: skip
 
 
-def matrix_of(model: Model, parts: CoarseParts, x_prev: Tensor, time_step: float, factored: bool) -> Tensor:
+def matrix_of(model: System, parts: CoarseParts, x_prev: Tensor, time_step: float, factored: bool) -> Tensor:
     """The matrices of a step from x_prev, or their factors; see SweepFields.coarse_factor."""
     plan, tensors = model._coarse_plan, distinct(x_prev, parts.stiffness.contiguous(), parts.mass)
     return _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step, factored)
 
 
-def lengths_of(model: Model, corrections: Tensor) -> Tensor:
+def lengths_of(model: System, corrections: Tensor) -> Tensor:
     """Of what an operator has recorded, the length of each body's corrections [B, corrections, bodies]."""
     geometry = model.coarse_geometry
     return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()

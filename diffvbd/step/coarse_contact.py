@@ -18,7 +18,7 @@ from torch.autograd import Function
 from .. import ops
 from ..adjoint.contact_lag import sum_at_corners
 from ..adjoint.potential import IncrementalPotential
-from ..model.model import Model
+from ..model.system import System
 from ..ops.segments import Order, of_segments, sum_by, sum_segments
 from ..ops.sums import one_thread
 from ..tuples import replaced
@@ -50,11 +50,11 @@ class Space(NamedTuple):
         return sum_segments(self.weight[:, None] * of_segments(a, *self.by_function), *self.by_vertex)
 
 
-def space_of(model: Model) -> Space:
+def space_of(model: System) -> Space:
     return model.derived("contact_space", lambda: _space(model))
 
 
-def _space(model: Model) -> Space:
+def _space(model: System) -> Space:
     g, moving = model.coarse_geometry, model._moving
     vertex, function = (torch.from_numpy(a).to(model.device, torch.int64) for a in (g.vertex, g.function))
     weight = torch.from_numpy(g.weight).to(model.device, model.dtype)
@@ -258,7 +258,9 @@ class _Elastic(Function):
     """The gradient of the tets' energy times h^2 [B, V, 3]."""
 
     @staticmethod
-    def forward(x: Tensor, mu: Tensor, lam: Tensor, rest: Tensor | None, fields: Any, model: Model, h: float) -> Tensor:
+    def forward(
+        x: Tensor, mu: Tensor, lam: Tensor, rest: Tensor | None, fields: Any, model: System, h: float
+    ) -> Tensor:
         return IncrementalPotential(model, x, fields, h).elastic()
 
     @staticmethod

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..model.coarse_plan import CoarsePlan
+from ..model.coarse import CoarsePlan
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 

@@ -19,8 +19,9 @@ from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..mask import CONTACT
-from ..model.model import Model
-from ..model.tet_shapes import inside_out
+from ..model.inputs import parameter_of
+from ..model.system import System
+from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.motion import RoomsOfBodies
@@ -50,7 +51,7 @@ LOST = ("x: positions became non-finite {}: check that v, forces and materials a
 class ContactStep:
     """What the parts of one step share."""
 
-    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
+    def __init__(self, model: System, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
         begun = replaced(begun, x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
         self.model, self.begun, self.prepared = model, begun, prepared
         self.x_prev = begun.x_prev
@@ -67,10 +68,10 @@ class ContactStep:
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
         floor = model.floor
         oblique = floor is not None and bool((np.count_nonzero(floor.normal, axis=-1) > 1).any())
-        self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
+        self.any_direction = oblique or "floor_normal" in prepared.parameters
         self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
-        self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_barrier.kappa")
+        self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_kappa")
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
         self.floor_lag = self._floor_lag()
         self.coarse_matrix = None
@@ -80,11 +81,9 @@ class ContactStep:
 
     def _parameter(self, name: str) -> Tensor:
         """A parameter of an energy that the Model has [1 | B]."""
-        if name in self.prepared.parameters:
-            return self.prepared.parameters[name]
-        owner, key = name.split(".")
-        energy = next(e for e in self.model.parametric_energies if e.name == owner)
-        return self.model.constants(energy)[key][None]
+        value = parameter_of(self.model, self.prepared.parameters, name)
+        assert value is not None
+        return value
 
     def _floor_lag(self) -> Tensor:
         """Friction coefficient times normal force of the floor's planes, and their normals, at the start."""
@@ -92,7 +91,7 @@ class ContactStep:
         if floor is None or self.floor_data is None or self.model.friction is None:
             return x.new_zeros((0,))
         force, normal = floor.normal_force(x, of_vertices(self.floor_data, x), self.begun.origin)
-        size = broadcast(self._parameter("friction.coefficient")[:, None, None], force.shape) * force
+        size = broadcast(self._parameter("friction")[:, None, None], force.shape) * force
         normal = broadcast(normal, (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
@@ -100,8 +99,8 @@ class ContactStep:
         """Notes friction and damping of the pairs at the start of the step, where there are any; returns the forces of
         pairs on corner points [B, N, 3] [N]."""
         none = self.kappa.new_empty
-        friction = self._parameter("friction.coefficient") if self.model.friction is not None else none((0,))
-        damping = self._parameter("pair_barrier.damping") if self._damps else none((0,))
+        friction = self._parameter("friction") if self.model.friction is not None else none((0,))
+        damping = self._parameter("pair_damping") if self._damps else none((0,))
         lag, push = rubbing(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
         if self._rubs:
             self.lagged, self.lag = listed, lag
@@ -111,7 +110,7 @@ class ContactStep:
     def _damps(self) -> bool:
         """Whether pairs damp motion."""
         barrier = self.barrier
-        return barrier is not None and (barrier.damping > 0 or "pair_barrier.damping" in self.prepared.parameters)
+        return barrier is not None and (barrier.damping > 0 or "pair_damping" in self.prepared.parameters)
 
     @property
     def _rubs(self) -> bool:
@@ -204,12 +203,12 @@ class ContactStep:
             room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
             near, kept = self._narrowed(detection.listed, x, now, room)
             swept_from = replaced(start, center=x.detach(), room=room)
-            limits, combined, lengths, held, cut = None, None, None, start.short, start.short
+            limits, lengths, held, cut = None, None, start.short, start.short
             if sweeps:
                 part = replaced(settings, sweeps=sweeps)
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
-                x, limits, combined, lengths = swept
+                x, limits, lengths = swept
                 x, shares, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.parts)
                 taken.extend(shares)
                 # what the start has held up, sweeps may have made good, and corrections, what these have
@@ -223,8 +222,8 @@ class ContactStep:
                 held = held & going[..., 0]
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=tuple(taken), limits=limits,
-                                    kept=kept, frames=start.frames, combined=combined, lengths=lengths,
-                                    sweeps=sweeps, going=going, resting=resting)  # fmt: skip
+                                    kept=kept, frames=start.frames, lengths=lengths, sweeps=sweeps, going=going,
+                                    resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.parts < MOST_DETECTIONS:
@@ -305,7 +304,7 @@ class ContactStep:
 
     def _record(self, met: Met) -> Tensor:
         """Notes what became of the step; its counts [parts, 4]."""
-        outcomes[self.model] = outcome = met.outcome(self.capacity, self.x_prev)
+        outcomes[self.model.model] = outcome = met.outcome(self.capacity, self.x_prev)
         return outcome.counts
 
     def _judged(self, x: Tensor, met: Met) -> Tensor:
@@ -349,7 +348,7 @@ class ContactStep:
         if needed > self.capacity:
             raise TooManyPairs(
                 -(-needed // scenes),
-                f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {self.capacity} "
+                f"capacity: {needed} pairs in part {r} of the step do not fit {self.capacity} "
                 f"({-(-self.capacity // scenes)} per scene): "
                 f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})",
             )
@@ -382,7 +381,7 @@ class ContactStep:
 
 
 @not_compiled  # sizes, checks and lists depend on values, and torch 2.11 compiled wrong gradients
-def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
+def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
                 debug_step: int) -> Tensor:  # fmt: skip
     """Positions after the sweeps of a step with contact.
 
@@ -399,4 +398,4 @@ def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, 
             if barrier is None or surface is None or barrier.capacity is not None or 2 * error.needed > MOST_CAPACITY:
                 raise
             # nobody has said how many there may be: again, with room for them
-            model.surface_of_contact = replace(surface, capacity=2 * error.needed)
+            model.model.surface_of_contact = replace(surface, capacity=2 * error.needed)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..contact.above_floor import above_floor
-from ..model.model import Model
+from ..model.system import System
 from ..ops import broadcast
 from .arguments import Prepared
 from .motion import coasting
@@ -18,7 +18,7 @@ from .rigid_contact import bodies_of
 PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
 
 
-def start_on_floor(model: Model, begun: Begun, floor: Tensor | None, mass: Tensor, prepared: Prepared
+def start_on_floor(model: System, begun: Begun, floor: Tensor | None, mass: Tensor, prepared: Prepared
                    ) -> Tensor:  # fmt: skip
     """Positions [B, V, 3] [m]: free bodies go as wholes, above the floor. If each vertex went as far as the floor lets
     it by itself, the start would press a body that hits the floor. Differentiable.

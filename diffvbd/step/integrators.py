@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..checks import check_tensor, fail
-from ..model.model import Model
+from ..checks import check_tensor, fail, input_name
+from ..model.solver import BDF2, SDIRK2, ImplicitEuler, Integrator
+from ..model.system import System
 from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders, refuse_transforms
 from ..tuples import replaced
@@ -36,39 +36,6 @@ GAMMA = 1 - 1 / math.sqrt(2)
 CHORD_OF_BDF2, CHORDS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
 SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
 STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
-
-
-@dataclass(frozen=True)
-class ImplicitEuler:
-    """One solve over the whole step: first order, and damps what vibrates faster than about the step."""
-
-
-@dataclass(frozen=True)
-class SDIRK2:
-    """Two solves over 0.29 of the step each: second order, exact in free fall, L-stable. Twice the work of a step.
-
-    Of the first order in the turn of a body whose vibrations the step does not resolve: it loses half of the spin that
-    implicit Euler does. :class:`BDF2` keeps its order there.
-
-    A body that may touch a floor, a collider, another body or itself takes implicit Euler for a step that does not
-    resolve the barrier, and wherever there is friction or damping of contact.
-
-    Source: Alexander (1977); docs/method.md, section 19.
-    """
-
-
-@dataclass(frozen=True)
-class BDF2:
-    """One solve over 2/3 of the step, from the last two states: second order, exact in free fall, L-stable.
-
-    The first step is one of :class:`SDIRK2`. A body takes implicit Euler where it does with that, and for the next
-    step.
-
-    Source: Curtiss and Hirschfelder (1952); docs/method.md, section 19.
-    """
-
-
-Integrator = ImplicitEuler | SDIRK2 | BDF2
 
 
 class History(NamedTuple):
@@ -99,16 +66,6 @@ class Taken(NamedTuple):
     v: Tensor
     history: History | None  # of BDF2
     last: Solve
-
-
-def check_integrator(integrator: Any) -> Integrator:
-    if integrator is None:
-        return ImplicitEuler()
-    if isinstance(integrator, type) and issubclass(integrator, Integrator):
-        fail("integrator", f"an object, {integrator.__name__}()", "the class")
-    if not isinstance(integrator, Integrator):
-        raise TypeError(f"integrator: expected ImplicitEuler(), SDIRK2() or BDF2(), got {type(integrator).__name__}")
-    return integrator
 
 
 def check_history(integrator: Integrator, history: Any, x: Tensor, time_step: Any) -> None:
@@ -152,7 +109,7 @@ def check_staged(integrator: Integrator, given: dict[str, Any]) -> None:
                  f"{len(value)} with {integrator}")  # fmt: skip
 
 
-def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: History | None, whole: Prepared,
+def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: History | None, whole: Prepared,
          given: dict[str, Any], run: Callable[..., tuple[Tensor, Tensor]]) -> Taken:  # fmt: skip
     """One step.
 
@@ -263,7 +220,7 @@ def _over(whole: Prepared, share: float, chord: float) -> Prepared:
     return replaced(whole, settings=replaced(whole.settings, numbers=numbers), chord=chord)
 
 
-def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:
+def _touching(model: System, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:
     """Whether the body of each vertex may touch something that the step does not resolve, bool [..., V]; None: there is
     nothing to touch."""
     if model.floor is None and model.contact is None:
@@ -275,7 +232,7 @@ def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dic
         return may_touch(model, begun, prepared, where).reshape(x.shape[:-1])
 
 
-def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, share: float
+def _of_euler(model: System, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, share: float
               ) -> tuple[Prepared, dict[str, Any]]:  # fmt: skip
     """Arguments of a solve over a share of the step in which some bodies take all of it. ``euler``: bool [..., V]."""
     factor = torch.ones_like(x[..., 0]).masked_fill(euler, share * share)
@@ -288,7 +245,7 @@ def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor
     parameters = dict(prepared.parameters)
     for energy in (model.floor, model.contact):  # who damps touches something
         if energy is not None:
-            name = f"{energy.name}.damping"
+            name = input_name(energy, "damping")
             value = parameters[name] if name in parameters else model.constants(energy)["damping"][None]
             if name in parameters or energy.damping > 0:
                 parameters[name] = share * value

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ..contact.detection import intersections
-from ..model.model import Model
+from ..model.system import System
 from ..scopes import is_captured
 from .arguments import collider_state
 
 
-def check_start(model: Model, x: Tensor, colliders: Any, colliders_before: Tensor | None, moving: bool) -> None:
+def check_start(model: System, x: Tensor, colliders: Any, colliders_before: Tensor | None, moving: bool) -> None:
     """Raises where the surfaces of a rollout's initial state intersect; waits for the device. Nothing happens without a
     PairBarrier, under torch.compile, and while a CUDA graph is captured.
 
@@ -43,7 +43,7 @@ def advice_to_part(x: Tensor, origin: Tensor, dhat: float) -> str:
     return f"move them apart, best by about dhat, {dhat:g} m"
 
 
-def refuse_intersections(model: Model, x: Tensor, origin: Tensor, colliders: Tensor, otherwise: str = "") -> None:
+def refuse_intersections(model: System, x: Tensor, origin: Tensor, colliders: Tensor, otherwise: str = "") -> None:
     """Raises where an edge of the surfaces passes through a triangle, or a point lies behind a plane.
 
     Args:

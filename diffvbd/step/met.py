@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs
 from ..model.model import Model
-from .contact_cycles import Combined, SweptPart
+from .contact_cycles import SweptPart
 
 
 class Detection(NamedTuple):
@@ -34,7 +34,6 @@ class Detection(NamedTuple):
         corrections: Shares of the rigid corrections before and after the sweeps, [B, bodies] each.
         limits: By how often each update was halved, uint8 [B, K, V]; 8: it was not made.
         frames: Share of the rigid motion that each body begins the part with, [B, bodies].
-        combined: Which combinations of iterates were taken (:class:`diffvbd.Anderson`); None: there are none.
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
         kept: Rows of the listed pairs that sweeps can reach; None where that would have to be read, as on CUDA.
         sweeps: How many sweeps the part has.
@@ -56,7 +55,6 @@ class Detection(NamedTuple):
     corrections: tuple[Tensor, ...] | None = None
     limits: Tensor | None = None
     frames: Tensor | None = None
-    combined: Combined | None = None
     lengths: Tensor | None = None
     kept: Tensor | None = None
     sweeps: int = 0

@@ -37,8 +37,7 @@ class _Motion(Direct):
 class _MotionBackward(Backward):
     @staticmethod
     def forward(bar, x, mass, move, origin, index):
-        x_bar, move_bar, mass_bar = ops_motion.contact_motion_backward(bar, x, origin, mass, move, *index)
-        return x_bar, mass_bar, move_bar
+        return ops_motion.contact_motion_backward(bar, x, origin, mass, move, *index)
 
 
 class _Coast(Direct):

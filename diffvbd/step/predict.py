@@ -10,23 +10,24 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from ..checks import input_name
 from ..mask import ELASTIC
-from ..model.model import Model
+from ..model.system import System
 from ..tuples import replaced
 from .arguments import CHORD, Prepared, broadcastable
 from .rigid import correct
 from .start import begin as start_of
 
 
-def energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Tensor:
+def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
     """The energies' data [1 | B, n]: the Model's constants unless a parameter or an origin changes them."""
     if not prepared.parameters and origin is None:
         return model._energy_data
     packed = []
     for energy in model.vertex_energies:
         values = {k: v[None] for k, v in model.constants(energy).items()}
-        values.update({k: prepared.parameters[f"{energy.name}.{k}"] for k in values
-                       if f"{energy.name}.{k}" in prepared.parameters})  # fmt: skip
+        for key in values:
+            values[key] = prepared.parameters.get(input_name(energy, key), values[key])
         packed.append(energy.pack(values, origin))
     if not packed:
         return model._energy_data
@@ -49,7 +50,7 @@ class Begun(NamedTuple):
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
                      self.lift.detach())  # fmt: skip
 
-    def fields(self, model: Model, prepared: Prepared) -> ops.SweepFields:
+    def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """What the sweeps read, without contact."""
         fields = ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
                                  prepared.rest, self.data, self.origin)  # fmt: skip
@@ -58,16 +59,16 @@ class Begun(NamedTuple):
         corners = self.x_prev[:, model.tets].flatten(2).permute(2, 0, 1).contiguous()
         return replaced(fields, corners_prev=corners)
 
-    def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
+    def corrected(self, x: Tensor, model: System, prepared: Prepared) -> Tensor:
         """x [B, V, 3] after the rigid correction, where the Model has one."""
         return self._correct(x, model, prepared)[0] if model.corrects else x
 
-    def _correct(self, x: Tensor, model: Model, prepared: Prepared) -> tuple[Tensor, Tensor]:
+    def _correct(self, x: Tensor, model: System, prepared: Prepared) -> tuple[Tensor, Tensor]:
         settings = prepared.settings
         return correct(x, self.x_prev, self.y, prepared.mass, self.data, self.origin, model._bodies,
                        model._other_bodies, settings.data_count, settings.numbers.time_step)  # fmt: skip
 
-    def finish(self, end: Tensor, model: Model, prepared: Prepared, corrects: bool = True) -> tuple[Tensor, Tensor]:
+    def finish(self, end: Tensor, model: System, prepared: Prepared, corrects: bool = True) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the step whose sweeps ended at ``end``."""
         if corrects and model.corrects:
             end, velocity = self._correct(end, model, prepared)
@@ -77,7 +78,7 @@ class Begun(NamedTuple):
 
 
 def begin(
-    model: Model, x: Tensor, v: Tensor, prepared: Prepared, force: Any, gravity: Tensor, prescribed: Any
+    model: System, x: Tensor, v: Tensor, prepared: Prepared, force: Any, gravity: Tensor, prescribed: Any
 ) -> Begun:
     """Predictor, local origin, data of the energies and start of the sweeps."""
     h = prepared.settings.numbers.time_step

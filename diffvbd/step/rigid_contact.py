@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.contact_lag import sum_of_scenes
-from ..model.model import Model
+from ..model.system import System
 from ..ops import Backward, Direct, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
 from ..tuples import replaced
@@ -52,7 +52,7 @@ def once(*_: Any) -> None:
     """One correction, and no more."""
 
 
-def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float,
+def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float,
             more: More = once) -> Corrected:  # fmt: skip
     """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as
     ``more`` says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
@@ -69,12 +69,12 @@ def _made(x: Tensor, flat: Sequence[Tensor]) -> ops_rigid.Made:
     return ops_rigid.Made([x, *flat[4::5]], *(flat[k::5] for k in range(4)))
 
 
-def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """order, ptr, free, held and body of ops.TouchingFields."""
     return model.derived("touching_bodies", lambda: _bodies_of(model))
 
 
-def _bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     surface, count = model.surface_of_contact, model.mesh.num_bodies
     pins = torch.zeros((count,), dtype=torch.int64, device=model.device).index_add(0, model.body, model._pinned.long())
     free = pins == 0

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from .. import ops
-from ..model.model import Model
+from ..model.system import System
 from ..ops import Backward, Direct, not_batched
 from ..ops import unsupported as ops_unsupported
 
@@ -57,7 +57,7 @@ class _UnsupportedBackward(Backward):
         return x_bar, lift_bar, force_bar, mass_bar, planes_bar
 
 
-def unsupported(model: Model, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
+def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
                 floor_data: Tensor | None, time_step: float) -> Tensor:  # fmt: skip
     """What is left of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
     part of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
@@ -77,7 +77,7 @@ def unsupported(model: Model, x: Tensor, origin: Tensor, push: Tensor, mass: Ten
     return _Unsupported.apply(*given, origin, constants)
 
 
-def rests(model: Model, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
+def rests(model: System, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
     """Which vertices are of bodies that are held somewhere and whose potential ``lift`` would raise, bool [B, V]; None
     without such bodies. Elasticity bears the weight of a body at rest, and its potential is convex about there: it
     rises by any fall. Few sweeps do not take the fall back, and what stands on such a body would follow it.

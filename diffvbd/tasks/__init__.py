@@ -6,15 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from diffvbd.tasks import (
-    beam_mu,
-    beam_mu_lam,
-    bunny_bounce,
+    beam,
+    bounce,
     cape_mu,
     cape_wind,
     cover_the_spot,
-    cube_bounce,
-    dress_mu_lam,
-    dress_silhouette,
+    dress,
     dress_size,
     fit_real_mesh,
     flag_wind,
@@ -64,9 +61,9 @@ class Task:
 
 
 TASKS = {
-    "beam-mu": Task("shear modulus of a beam that is twisted by half a turn and released", beam_mu.problem),
-    "beam-mu-lam": Task("both Lame parameters of a soft beam that is kicked sideways", beam_mu_lam.problem),
-    "bunny-bounce": Task("throw a bunny that meets a target after its bounce", bunny_bounce.problem),
+    "beam-mu": Task("shear modulus of a beam that is twisted by half a turn and released", beam.beam_mu),
+    "beam-mu-lam": Task("both Lame parameters of a soft beam that is kicked sideways", beam.beam_mu_lam),
+    "bunny-bounce": Task("throw a bunny that meets a target after its bounce", bounce.bunny_bounce),
     "cape-mu": Task("shear modulus of a cloth from how far its center sags", cape_mu.problem),
     "cape-wind": Task("constant wind that a cape hung in, from its final shape", cape_wind.problem),
     "cover-the-spot": Task(
@@ -76,11 +73,11 @@ TASKS = {
     ),
     "cube-bounce": Task(
         "throw a cube that meets a target after its bounce",
-        cube_bounce.problem,
+        bounce.cube_bounce,
         {"sweeps": Option(int, "sweeps per step (default 20)")},
     ),
-    "dress-mu-lam": Task("both Lame parameters of a dress that drapes over a mannequin", dress_mu_lam.problem),
-    "dress-silhouette": Task("both Lame parameters of the dress from its outline alone", dress_silhouette.problem),
+    "dress-mu-lam": Task("both Lame parameters of a dress that drapes over a mannequin", dress.dress_mu_lam),
+    "dress-silhouette": Task("both Lame parameters of the dress from its outline alone", dress.dress_silhouette),
     "dress-size": Task("size of a dress from the height of its hem", dress_size.problem),
     "fit-real-mesh": Task(
         "map the stiffness inside a body from pulls at its surface",

@@ -14,17 +14,14 @@ relaxation; with 20 the center falls freely, whatever mu is. The run ends when t
 after 80 iterations, the paper's count.
 """
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import viz
 from diffvbd.tasks.cloth import mean_weights
 from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.report import pictures
 
 TRUE_MU, START_MU, LAM = 2000.0, 8000.0, 2000.0  # [Pa]
 SIDE, THICKNESS = 0.6, 0.01  # [m]
@@ -38,16 +35,15 @@ def problem(settings: Settings) -> Problem:
     mesh = dv.mesh.sheet(*vertices, size=(SIDE, SIDE), thickness=THICKNESS)
     from_center = np.abs(mesh.points[:, ::2] - 0.5 * SIDE)
     corners = (from_center > 0.5 * SIDE - 1e-9).all(axis=1)
-    model = dv.Model(mesh, density=DENSITY, pinned=corners, relaxation=RELAXATION, coarse="auto")
-    model = model.to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=corners).to(settings.device)
+    solver = dv.VBD(TIME_STEP, sweeps, relaxation=RELAXATION, subspace="coarse")
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     distance = np.hypot(*from_center.T)
     center = mean_weights(distance < distance.min() + 1e-9, x)
 
     def simulate(mu: Tensor) -> Tensor:
         """Positions [m] after each step, shape [steps + 1, V, 3]."""
-        motion = dv.rollout(model, x, v, steps=steps, mu=mu, lam=LAM, time_step=TIME_STEP, sweeps=sweeps)
-        return motion.x
+        return dv.rollout(model, x, v, solver, steps=steps, mu=mu, lam=LAM).x
 
     def height(mu: Tensor) -> Tensor:
         return center @ simulate(mu)[-1, :, 1]
@@ -65,40 +61,18 @@ def problem(settings: Settings) -> Problem:
     # the two layers lie so close that a picture of both mixes them up
     upper = mesh.surface[(mesh.surface >= mesh.num_vertices // 2).all(axis=1)]
 
-    def picture(path: Path, history: list[Row]) -> None:
-        shown = [steps // 4, steps // 2, steps]
-        frames = {name: motion[shown] for name, motion in motions().items()}
-        viz.comparison(path, upper, frames, [k * TIME_STEP for k in shown], history, {"mu": TRUE_MU})
-
     return Problem(
         name="cape-mu",
         parameters={"log_mu": log_mu},
         stages=[
-            Stage(
-                loss=lambda: (height(log_mu.exp()) - target).square(),
-                iterations=iterations,
-                learning_rate=0.1,
-                tolerance=1e-10,
-                capturable=True,
-            )
+            Stage(loss=lambda: (height(log_mu.exp()) - target).square(), iterations=iterations, learning_rate=0.1,
+                  tolerance=1e-10, capturable=True)
         ],
         estimates=lambda: {"mu": log_mu.exp().item()},
         truth={"mu": TRUE_MU},
         units={"mu": "Pa"},
-        protocol={
-            "vertices": vertices,
-            "side": SIDE,
-            "thickness": THICKNESS,
-            "density": DENSITY,
-            "lam": LAM,
-            "start_mu": START_MU,
-            "steps": steps,
-            "time_step": TIME_STEP,
-            "sweeps": sweeps,
-            "relaxation": RELAXATION,
-            "coarse": "auto",
-            "target_height": target.item(),
-        },
-        picture=picture,
-        animation=lambda path: viz.animation(path, upper, motions(), TIME_STEP),
-    )
+        protocol={"vertices": vertices, "side": SIDE, "thickness": THICKNESS, "density": DENSITY, "lam": LAM,
+                  "start_mu": START_MU, "steps": steps, "time_step": TIME_STEP, "sweeps": sweeps,
+                  "relaxation": RELAXATION, "subspace": "coarse", "target_height": target.item()},
+        **pictures(upper, motions, TIME_STEP, [steps // 4, steps // 2, steps], {"mu": TRUE_MU}),
+    )  # fmt: skip

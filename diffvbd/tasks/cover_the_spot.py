@@ -33,8 +33,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 TARGET_RADIUS = 0.45  # R [m]
 RADIUS = 0.42  # r [m]
@@ -86,23 +85,15 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
         name="cover-the-spot",
         parameters={"velocity": fall.velocity, "offset": fall.offset},
         stages=[
-            Stage(
-                loss=fall.loss,
-                iterations=version.iterations,
-                learning_rate=0.06,
-                clip=CLIP,
-                rough=True,
-                before=fall.anneal,
-                criterion="uncovered",
-                capturable=True,
-            )
+            Stage(loss=fall.loss, iterations=version.iterations, learning_rate=0.06, clip=CLIP, rough=True,
+                  before=fall.anneal, criterion="uncovered", capturable=True)
         ],
         estimates=fall.estimates,
         protocol=protocol(fall, radius),
         findings=None if settings.quick else fall.findings,
         picture=fall.picture,
         animation=fall.animation,
-    )
+    )  # fmt: skip
 
 
 class Fall:
@@ -133,9 +124,9 @@ class Fall:
             each[:, None].expand(-1, self.disk.num_vertices, -1).flatten(0, 1)
             for each in (OFFSET * self.offset.tanh(), self.velocity)
         )
-        motion = dv.rollout(self.model, self.model.rest_points + moved, v, steps=shorter * self.version.steps, mu=MU,
-                            lam=LAM, time_step=TIME_STEP / shorter, sweeps=shorter * self.version.sweeps,
-                            save=save)  # fmt: skip
+        solver = dv.VBD(TIME_STEP / shorter, shorter * self.version.sweeps)
+        motion = dv.rollout(self.model, self.model.rest_points + moved, v, solver, steps=shorter * self.version.steps,
+                            save=save, mu=MU, lam=LAM)  # fmt: skip
         return motion.x.unflatten(1, (3, -1))
 
     def loss(self) -> Tensor:
@@ -182,30 +173,12 @@ def model_of(disk: dv.TetMesh, centers: np.ndarray) -> dv.Model:
 
 
 def protocol(fall: Fall, radius: float) -> dict[str, Any]:
-    return {
-        "radius": radius,
-        "target_radius": TARGET_RADIUS,
-        "vertices": fall.model.num_vertices,
-        "tets": fall.model.num_tets,
-        "rings": fall.version.rings,
-        "steps": fall.version.steps,
-        "time_step": TIME_STEP,
-        "sweeps": fall.version.sweeps,
-        "density": DENSITY,
-        "mu": MU,
-        "lam": LAM,
-        "kappa": KAPPA,
-        "dhat": DHAT,
-        "damping": DAMPING,
-        "reach": REACH,
-        "detections": 1,
-        "heights": fall.centers[:, 1].tolist(),
-        "sharpness": SHARPNESS,
-        "clip": CLIP,
-        "offset": OFFSET,
-        "noise": NOISE,
-        "samples": (SAMPLES, FINE_SAMPLES),
-    }
+    return {"radius": radius, "target_radius": TARGET_RADIUS, "vertices": fall.model.num_vertices,
+            "tets": fall.model.num_tets, "rings": fall.version.rings, "steps": fall.version.steps,
+            "time_step": TIME_STEP, "sweeps": fall.version.sweeps, "density": DENSITY, "mu": MU, "lam": LAM,
+            "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING, "reach": REACH, "detections": 1,
+            "heights": fall.centers[:, 1].tolist(), "sharpness": SHARPNESS, "clip": CLIP, "offset": OFFSET,
+            "noise": NOISE, "samples": (SAMPLES, FINE_SAMPLES)}  # fmt: skip
 
 
 def outline(disk: dv.TetMesh) -> np.ndarray:

@@ -22,16 +22,13 @@ paper's figure; K = 40 with relaxation 1.7, which leaves the hem of the target 3
 of the first one, or after 80 iterations, the paper's count. The sweeps start from the predictor, as in the paper.
 """
 
-from pathlib import Path
-
 import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import viz
 from diffvbd.tasks.cloth import few_sweeps, mean_weights, ring_of_vertices
 from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.report import pictures
 
 TRUE_SIZE, START_SIZE = 0.910, 0.45
 NECK, THICKNESS = 1.45, 0.01  # [m]
@@ -48,8 +45,8 @@ def problem(settings: Settings) -> Problem:
         (around, rings), steps, sweeps, iterations = ((8, 6), 15, 15, 40)
     mesh = dv.mesh.dress(around, rings, THICKNESS, neck_height=NECK)
     ring = ring_of_vertices(mesh, around, rings)
-    model = dv.Model(mesh, density=DENSITY, pinned=ring == 0, relaxation=RELAXATION, start="predictor")
-    model = model.to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=ring == 0).to(settings.device)
+    solver = dv.VBD(TIME_STEP, sweeps, relaxation=RELAXATION, start="predictor")
     v = torch.zeros_like(model.rest_points)
     hem = mean_weights(ring == rings - 1, v)
     neck = torch.tensor((0.0, NECK, 0.0), dtype=v.dtype, device=v.device)
@@ -58,9 +55,7 @@ def problem(settings: Settings) -> Problem:
     def simulate(size: Tensor) -> Tensor:
         """Positions [m] after each step, shape [steps + 1, V, 3]."""
         shape = cut(model.rest_points, size, neck)
-        motion = dv.rollout(model, shape, v, steps=steps, mu=MU, lam=LAM, time_step=TIME_STEP, sweeps=sweeps,
-                            rest_points=shape)  # fmt: skip
-        return motion.x
+        return dv.rollout(model, shape, v, solver, steps=steps, mu=MU, lam=LAM, rest_points=shape).x
 
     def height(size: Tensor) -> Tensor:
         return hem @ simulate(size)[-1, :, 1]
@@ -75,45 +70,20 @@ def problem(settings: Settings) -> Problem:
     def motions() -> dict[str, Tensor]:
         return {"initial": simulate(start), "target": simulate(true), "recovered": simulate(log_size.exp())}
 
-    def picture(path: Path, history: list[Row]) -> None:
-        shown = [0, steps // 2, steps]
-        frames = {name: motion[shown] for name, motion in motions().items()}
-        viz.comparison(
-            path, mesh.surface, frames, [k * TIME_STEP for k in shown], history, {"size": TRUE_SIZE}, view=VIEW
-        )
-
     return Problem(
         name="dress-size",
         parameters={"log_size": log_size},
         stages=[
-            Stage(
-                loss=lambda: (height(log_size.exp()) - target).square(),
-                iterations=iterations,
-                learning_rate=0.05,
-                tolerance=1e-10,
-                capturable=True,
-            )
+            Stage(loss=lambda: (height(log_size.exp()) - target).square(), iterations=iterations, learning_rate=0.05,
+                  tolerance=1e-10, capturable=True)
         ],
         estimates=lambda: {"size": log_size.exp().item()},
         truth={"size": TRUE_SIZE},
-        protocol={
-            "start_size": START_SIZE,
-            "around": around,
-            "rings": rings,
-            "thickness": THICKNESS,
-            "neck": NECK,
-            "density": DENSITY,
-            "mu": MU,
-            "lam": LAM,
-            "steps": steps,
-            "time_step": TIME_STEP,
-            "sweeps": sweeps,
-            "relaxation": RELAXATION,
-            "target_height": target.item(),
-        },
-        picture=picture,
-        animation=lambda path: viz.animation(path, mesh.surface, motions(), TIME_STEP, view=VIEW),
-    )
+        protocol={"start_size": START_SIZE, "around": around, "rings": rings, "thickness": THICKNESS, "neck": NECK,
+                  "density": DENSITY, "mu": MU, "lam": LAM, "steps": steps, "time_step": TIME_STEP, "sweeps": sweeps,
+                  "relaxation": RELAXATION, "target_height": target.item()},
+        **pictures(mesh.surface, motions, TIME_STEP, [0, steps // 2, steps], {"size": TRUE_SIZE}, view=VIEW),
+    )  # fmt: skip
 
 
 def cut(shell: Tensor, size: Tensor, center: Tensor) -> Tensor:

@@ -39,9 +39,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.newton import lbfgs
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.optimizer import lbfgs
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 HEIGHT = 0.3  # [m]
 SOFT, STIFF, START = 5e3, 2e4, 3e4  # mu of the two regions, first guess everywhere [Pa]
@@ -102,31 +101,15 @@ def problem(
         estimates=fit.estimates,
         truth={"mu_soft": SOFT, "mu_stiff": STIFF},
         units={"mu_soft": "Pa", "mu_stiff": "Pa"},
-        protocol={
-            "mesh": str(mesh or "bunny"),
-            "edge_length": edge_length,
-            "vertices": body.num_vertices,
-            "tets": body.num_tets,
-            "observed": list(pulled.observed.shape),
-            "noise": pulled.sigma,
-            "iterations": version.counts,
-            "steps": version.steps,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "relaxation": RELAXATION,
-            "density": DENSITY,
-            "poisson": POISSON,
-            "start_mu": START,
-            "traction": TRACTION,
-            "weight": version.weight,
-            "fall": FALL,
-            "smooth": SMOOTH,
-            "range": RANGE,
-        },
+        protocol={"mesh": str(mesh or "bunny"), "edge_length": edge_length, "vertices": body.num_vertices,
+                  "tets": body.num_tets, "observed": list(pulled.observed.shape), "noise": pulled.sigma,
+                  "iterations": version.counts, "steps": version.steps, "time_step": TIME_STEP, "sweeps": SWEEPS,
+                  "relaxation": RELAXATION, "density": DENSITY, "poisson": POISSON, "start_mu": START,
+                  "traction": TRACTION, "weight": version.weight, "fall": FALL, "smooth": SMOOTH, "range": RANGE},
         findings=fit.findings,
         picture=fit.picture,
         animation=fit.animation,
-    )
+    )  # fmt: skip
 
 
 class Pulled:
@@ -135,8 +118,9 @@ class Pulled:
     def __init__(self, body: dv.TetMesh, settings: Settings, version: Version) -> None:
         self.body, self.version = body, version
         pinned = body.points[:, 1] <= HELD * HEIGHT
-        model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION, start="predictor")
+        model = dv.Model(body, density=DENSITY, pinned=pinned)
         self.model = model.to(settings.device)
+        self.solver = dv.VBD(TIME_STEP, SWEEPS, relaxation=RELAXATION, start="predictor")
         self.like = {"dtype": self.model.dtype, "device": self.model.device}
         self.force = torch.as_tensor(pulls(body, version.grips), **self.like)
         self.x = self.model.rest_points.expand(version.grips, -1, -1)
@@ -157,10 +141,9 @@ class Pulled:
     def simulate(self, mu: Tensor, save: int | None = None) -> Tensor:
         """Positions [m] of saved frames, shape [frames, grips, V, 3]."""
         lam = 2 * POISSON / (1 - 2 * POISSON) * mu
-        motion = dv.rollout(self.model, self.x, self.v, steps=self.version.steps, mu=mu, lam=lam, time_step=TIME_STEP,
-                            sweeps=SWEEPS, force=self.force, gravity=(0.0, 0.0, 0.0),
-                            save=self.version.every if save is None else save)  # fmt: skip
-        return motion.x
+        save = self.version.every if save is None else save
+        return dv.rollout(self.model, self.x, self.v, self.solver, steps=self.version.steps, save=save, mu=mu, lam=lam,
+                          force=self.force, gravity=(0.0, 0.0, 0.0)).x  # fmt: skip
 
     def misfit(self, mu: Tensor) -> Tensor:
         """Mean squared residual over the variance of the noise."""
@@ -200,12 +183,9 @@ class Fit:
     def estimates(self) -> Row:
         mu, stiff = self.log_mu().exp(), self.pulled.stiff
         error = (mu / self.pulled.true - 1).abs()
-        return {
-            "mu_soft": mu[~stiff].mean().item(),
-            "mu_stiff": mu[stiff].mean().item(),
-            "field_error": error.median().item(),
-            "within_10_percent": (error <= 0.1).to(error.dtype).mean().item(),
-        }
+        return {"mu_soft": mu[~stiff].mean().item(), "mu_stiff": mu[stiff].mean().item(),
+                "field_error": error.median().item(),
+                "within_10_percent": (error <= 0.1).to(error.dtype).mean().item()}  # fmt: skip
 
     @torch.no_grad()
     def findings(self, history: list[Row]) -> dict[str, float]:
@@ -229,15 +209,9 @@ class Fit:
 
 def stage_of(fit: Fit, number: int, iterations: int) -> Stage:
     """L-BFGS on one number for all tets (stage 0), or on one for each."""
-    return Stage(
-        loss=fit.loss,
-        iterations=iterations,
-        optimizer=lambda p: lbfgs(p, history=30),
-        moves=("exponents",) if number else ("level",),
-        before=partial(fit.lower, number),
-        capturable=True,
-        name=f"field, weight {number}" if number else "uniform",
-    )
+    return Stage(loss=fit.loss, iterations=iterations, optimizer=lambda p: lbfgs(p, history=30),
+                 moves=("exponents",) if number else ("level",), before=partial(fit.lower, number), capturable=True,
+                 name=f"field, weight {number}" if number else "uniform")  # fmt: skip
 
 
 def read(path: Path, edge_length: float | None = None) -> dv.TetMesh:

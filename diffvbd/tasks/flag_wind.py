@@ -22,17 +22,16 @@ sweeps start from the predictor, as in the paper.
 """
 
 import math
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import losses, viz
+from diffvbd import losses
 from diffvbd.tasks.cloth import hanging
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
+from diffvbd.tasks.report import pictures
 
 WINDOWS = 8
 STRENGTH = 16.0  # of the reference wind [m/s^2]
@@ -49,7 +48,8 @@ VISIBLE = 0.1  # of the largest singular value
 def problem(settings: Settings) -> Problem:
     vertices, steps, iterations = ((5, 4), 48, 40) if settings.quick else ((17, 13), 120, 199)
     mesh, top = hanging(*vertices, WIDTH, LENGTH, THICKNESS)
-    model = dv.Model(mesh, density=DENSITY, pinned=top, relaxation=RELAXATION, start="predictor").to(settings.device)
+    model = dv.Model(mesh, density=DENSITY, pinned=top).to(settings.device)
+    solver = dv.VBD(TIME_STEP, SWEEPS, relaxation=RELAXATION, start="predictor")
     gravity = torch.tensor(GRAVITY, dtype=model.dtype, device=model.device)
     true = reference_wind().to(model.device, model.dtype)
 
@@ -57,9 +57,8 @@ def problem(settings: Settings) -> Problem:
         """Positions [m] after each step for winds [8, ..., 3] [m/s^2], shape [steps + 1, ..., V, 3]."""
         x = model.rest_points.expand(*wind.shape[1:-1], -1, -1).contiguous()
         each_step = wind[:, None].expand(-1, steps // WINDOWS, *wind.shape[1:]).flatten(0, 1)
-        motion = dv.rollout(model, x, torch.zeros_like(x), steps=steps, mu=MU, lam=LAM, time_step=TIME_STEP,
-                            sweeps=SWEEPS, gravity=dv.per_step((gravity + each_step)[..., None, :]))  # fmt: skip
-        return motion.x
+        winds = dv.per_step((gravity + each_step)[..., None, :])
+        return dv.rollout(model, x, torch.zeros_like(x), solver, steps=steps, mu=MU, lam=LAM, gravity=winds).x
 
     with torch.no_grad():
         target = simulate(true)
@@ -71,52 +70,29 @@ def problem(settings: Settings) -> Problem:
     @torch.no_grad()
     def findings(history: list[Row]) -> dict[str, Any]:
         values = singular_values(simulate, wind)
-        return {
-            "deviation": deviation(),
-            "singular_values": values.tolist(),
-            "effective": int((values > VISIBLE * values[0]).sum()),
-            "allowed": math.sqrt(TOLERATED) / values[-1].item(),
-        }
+        return {"deviation": deviation(), "singular_values": values.tolist(),
+                "effective": int((values > VISIBLE * values[0]).sum()),
+                "allowed": math.sqrt(TOLERATED) / values[-1].item()}  # fmt: skip
 
     @torch.no_grad()
     def motions() -> dict[str, Tensor]:
         return {"initial": simulate(torch.zeros_like(true)), "target": target, "recovered": simulate(wind)}
 
-    def picture(path: Path, history: list[Row]) -> None:
-        shown = [steps // 3, 2 * steps // 3, steps]
-        frames = {name: motion[shown] for name, motion in motions().items()}
-        viz.comparison(path, mesh.surface, frames, [k * TIME_STEP for k in shown], history)
-
     return Problem(
         name="flag-wind",
         parameters={"wind": wind},
         stages=[
-            Stage(
-                loss=lambda: (steps + 1) * losses.vertex_distance(simulate(wind), target),
-                iterations=iterations,
-                learning_rate=2.0,
-                capturable=True,
-            )
+            Stage(loss=lambda: (steps + 1) * losses.vertex_distance(simulate(wind), target), iterations=iterations,
+                  learning_rate=2.0, capturable=True)
         ],
         estimates=lambda: {"deviation": deviation()},
         units={"deviation": "m/s^2", "loss": "m^2"},
-        protocol={
-            "reference_wind": true.tolist(),
-            "gravity": GRAVITY,
-            "vertices": vertices,
-            "size": (WIDTH, LENGTH, THICKNESS),
-            "density": DENSITY,
-            "mu": MU,
-            "lam": LAM,
-            "steps": steps,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "relaxation": RELAXATION,
-        },
+        protocol={"reference_wind": true.tolist(), "gravity": GRAVITY, "vertices": vertices,
+                  "size": (WIDTH, LENGTH, THICKNESS), "density": DENSITY, "mu": MU, "lam": LAM, "steps": steps,
+                  "time_step": TIME_STEP, "sweeps": SWEEPS, "relaxation": RELAXATION},
         findings=findings,
-        picture=picture,
-        animation=lambda path: viz.animation(path, mesh.surface, motions(), TIME_STEP),
-    )
+        **pictures(mesh.surface, motions, TIME_STEP, [steps // 3, 2 * steps // 3, steps]),
+    )  # fmt: skip
 
 
 def reference_wind() -> Tensor:

@@ -1,10 +1,22 @@
-"""The folder of a run: what may lie there before it, and how its files are written."""
+"""Files of a run: its folder, archives of arrays, and the ranks of torchrun, of which the first keeps files."""
 
 import contextlib
+import gc
 import json
 import os
+import tempfile
+import zipfile
+import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+
+from diffvbd.tasks.problem import Settings
 
 try:
     import fcntl
@@ -85,3 +97,78 @@ def put_aside(state: Path) -> Path:
     while aside.exists():
         aside, k = state.with_name(f"state.other-{k + 1}.pt"), k + 1
     return state.rename(aside)
+
+
+def is_first() -> bool:
+    """Whether this process keeps files: alone, or the first of its group."""
+    return not dist.is_initialized() or dist.get_rank() == 0
+
+
+@contextlib.contextmanager
+def joined(device: str, splits: bool) -> Iterator[None]:
+    """Inside, the processes that torchrun has started are one group; a process on its own stays so.
+
+    Raises:
+        ValueError: several processes for a task that does not split; a CUDA device by its number, where each rank takes
+            its own.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield
+        return
+    if not splits:
+        raise ValueError("torchrun: expected a task that ranks can share (million-cubes): run this one without it")
+    cuda = torch.device(device).type == "cuda"
+    if cuda:
+        if torch.device(device).index is not None:
+            raise ValueError(f"device: expected cuda, of which each rank takes its own, got {device}")
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    dist.init_process_group("nccl" if cuda else "gloo")
+    yield
+    gc.collect()  # CUDA graphs that hold what is destroyed now
+    dist.destroy_process_group()  # not after an error: other ranks may wait for this one, and torchrun ends them
+
+
+@contextlib.contextmanager
+def with_own_folder(settings: Settings) -> Iterator[Settings]:
+    """Settings whose folder no other rank writes to: that of the first rank is the user's, those of the others are
+    thrown away. All begin with the state that the first one has found."""
+    if not dist.is_initialized() or dist.get_world_size() == 1:
+        yield settings
+        return
+    state = settings.out / STATE
+    found = [state.read_bytes() if is_first() and state.exists() else None]
+    dist.broadcast_object_list(found, src=0)
+    if is_first():
+        yield settings
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        if found[0] is not None:
+            (Path(folder) / STATE).write_bytes(found[0])
+        yield replace(settings, out=Path(folder))
+
+
+MOST_BYTES = 4 << 30  # of all arrays together, unpacked: 1000 frames of 150,000 vertices
+_DAMAGED = (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, AttributeError, TypeError, KeyError,
+            MemoryError, RuntimeError, OverflowError)  # fmt: skip
+
+
+def read_archive(path: str | Path, expected: str) -> dict[str, Any]:
+    """All arrays of an .npz file.
+
+    Raises:
+        OSError: the file cannot be opened.
+        ValueError: not an .npz file, damaged, or more than MOST_BYTES when unpacked, looked at before it is.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > MOST_BYTES:
+            raise ValueError(f"{path}: expected at most {MOST_BYTES} bytes of arrays, got {size} when unpacked")
+        with np.load(path, allow_pickle=False) as content:
+            return dict(content)
+    except _DAMAGED:
+        raise ValueError(f"{path}: expected {expected}") from None
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: expected {expected}") from None

@@ -11,9 +11,8 @@ from pathlib import Path
 import torch
 
 from diffvbd import losses, viz
-from diffvbd.tasks.newton import lbfgs
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.optimizer import lbfgs
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 from diffvbd.tasks.scene import Observation
 
 # Line searches try wild steps: the material stays within this factor of the first guess, or its inverse.
@@ -73,23 +72,12 @@ def problem(
         name="identify",
         parameters={"exponents": exponents},
         stages=[
-            Stage(
-                loss=lambda: losses.vertex_distance(simulate(*material()), target) / scale,
-                iterations=iterations,
-                tolerance=1e-12,
-                gradient_tolerance=1e-7,
-                optimizer=lbfgs,
-            )
+            Stage(loss=lambda: losses.vertex_distance(simulate(*material()), target) / scale, iterations=iterations,
+                  tolerance=1e-12, gradient_tolerance=1e-7, optimizer=lbfgs)
         ],
         estimates=lambda: dict(zip(("mu", "lam"), material().tolist(), strict=True)),
         truth=observation.truth,
-        protocol={
-            "start": list(start),
-            "fixed_lam": fixed_lam,
-            "iterations": iterations,
-            "range": RANGE,
-            "steps": observed,
-            "observation": hashlib.sha256(observation.x.tobytes()).hexdigest(),
-        },
+        protocol={"start": list(start), "fixed_lam": fixed_lam, "iterations": iterations, "range": RANGE,
+                  "steps": observed, "observation": hashlib.sha256(observation.x.tobytes()).hexdigest()},
         picture=picture,
-    )
+    )  # fmt: skip

@@ -31,8 +31,7 @@ from torch import Tensor, nn
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 SIZE = (0.08, 0.4, 0.08)  # [m]
 DENSITY = 1000.0  # [kg/m^3]
@@ -64,29 +63,14 @@ def problem(settings: Settings) -> Problem:
         stages=[Stage(loss=training.loss, iterations=iterations, learning_rate=0.05, capturable=True)],
         estimates=lambda: judged(training.missed),
         units={"distance": "m"},
-        protocol={
-            "scenes": scenes,
-            "vertices": arm.model.num_vertices,
-            "steps": STEPS,
-            "held": STAY,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "density": DENSITY,
-            "mu": MU,
-            "lam": LAM,
-            "size": SIZE,
-            "height": HEIGHT,
-            "distance": DISTANCE,
-            "swing": SWING,
-            "acceleration": ACCELERATION,
-            "hidden": HIDDEN,
-            "near": NEAR,
-            "spread": SPREAD,
-        },
+        protocol={"scenes": scenes, "vertices": arm.model.num_vertices, "steps": STEPS, "held": STAY,
+                  "time_step": TIME_STEP, "sweeps": SWEEPS, "density": DENSITY, "mu": MU, "lam": LAM, "size": SIZE,
+                  "height": HEIGHT, "distance": DISTANCE, "swing": SWING, "acceleration": ACCELERATION,
+                  "hidden": HIDDEN, "near": NEAR, "spread": SPREAD},
         findings=training.findings,
         picture=training.picture,
         animation=training.animation,
-    )
+    )  # fmt: skip
 
 
 class Arm:
@@ -95,7 +79,7 @@ class Arm:
     def __init__(self, device: str) -> None:
         self.mesh = dv.mesh.box((2, 7, 2), SIZE, split="kuhn").translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
         height = self.mesh.points[:, 1]
-        self.model = dv.Model(self.mesh, density=DENSITY, pinned=height == 0.0, start="predictor").to(device)
+        self.model = dv.Model(self.mesh, density=DENSITY, pinned=height == 0.0).to(device)
         self.like = {"dtype": self.model.dtype, "device": self.model.device}
         self.foot, self.tip = (
             torch.as_tensor(np.flatnonzero(height == y), device=self.model.device) for y in (0.0, SIZE[1])
@@ -124,24 +108,14 @@ class Arm:
 
     def simulate(
         self, policy: Policy, given: Scenes, lead: tuple[int, ...] = (), save: Literal["all", "last"] = "last"
-    ) -> dv.Trajectory:
+    ) -> dv.results.Trajectory:
         """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
         targets, swings = given
         shape = (*lead, len(targets), self.model.num_vertices, 3)
-        return dv.rollout(
-            self.model,
-            self.model.rest_points.expand(shape),
-            (self.bend * (swings @ self.ground)[:, None]).expand(shape),
-            steps=STEPS,
-            mu=MU,
-            lam=LAM,
-            time_step=TIME_STEP,
-            sweeps=SWEEPS,
-            prescribed=self.driven(policy, targets),
-            observe=lambda x, v, step: mean(x, self.tip) - (targets @ self.ground + self.standing),
-            save=save,
-            checkpoint_every=None,
-        )
+        x, v = self.model.rest_points.expand(shape), (self.bend * (swings @ self.ground)[:, None]).expand(shape)
+        return dv.rollout(self.model, x, v, dv.VBD(TIME_STEP, SWEEPS, start="predictor"), steps=STEPS, save=save,
+                          observe=lambda step, x, v: mean(x, self.tip) - (targets @ self.ground + self.standing),
+                          checkpoint_every=None, mu=MU, lam=LAM, prescribed=self.driven(policy, targets))  # fmt: skip
 
     def misses(self, policy: Policy, given: Scenes, lead: tuple[int, ...] = ()) -> Tensor:
         """Mean squared distance from tip to target while it must be there [m^2], shape [*lead, scenes]."""
@@ -199,14 +173,11 @@ class Training:
         return {
             "seconds": seconds,
             "gradient_was_there_after": next((row["seconds"] for row in history if row["loss"] <= lowest), None),
-            "cma_es": {
-                "version": importlib.metadata.version("cma"),
-                "networks": networks,
-                "train": {"distance": lowest**0.5},
-                "test": judged(self.arm.misses(policies(network, best.to(**like)), self.test)),
-                "course": self.course,
-            },
-        }
+            "cma_es": {"version": importlib.metadata.version("cma"), "networks": networks,
+                       "train": {"distance": lowest**0.5},
+                       "test": judged(self.arm.misses(policies(network, best.to(**like)), self.test)),
+                       "course": self.course},
+        }  # fmt: skip
 
     @torch.no_grad()
     def shown(self, policy: Policy) -> Tensor:
@@ -223,14 +194,9 @@ class Training:
         motions = {"untrained": self.shown(policies(self.network, self.first)), "trained": self.shown(self.network)}
         at = [0, STEPS // 4, STEPS // 2, STEPS]
         curves = {"gradient": [(row["seconds"], row["loss"]) for row in history], "CMA-ES": self.course}
-        viz.learning(
-            path,
-            self.surface,
-            {name: motion[at] for name, motion in motions.items()},
-            [k * TIME_STEP for k in at],
-            {name: curve for name, curve in curves.items() if curve},
-            self.goals(),
-        )
+        viz.learning(path, self.surface, {name: motion[at] for name, motion in motions.items()},
+                     [k * TIME_STEP for k in at], {name: curve for name, curve in curves.items() if curve},
+                     self.goals())  # fmt: skip
 
     def animation(self, path: Path) -> None:
         viz.animation(path, self.surface, {"trained": self.shown(self.network)}, TIME_STEP, self.goals())

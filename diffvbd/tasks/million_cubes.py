@@ -17,7 +17,7 @@ The first guess is 3 m/s upwards for all. After t = 0.6 s bodies fly on without 
 the paper rolls these steps out, so it is the default (option `steps`). The center of mass of a free body does not
 depend on its material, except through what K = 5 sweeps leave unsolved: the gradient of mu is that of the executed
 solver, and tiny beside that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does
-not identify it. The rigid correction is off (`rigid=False`) and the sweeps start from the predictor, as in the paper.
+not identify it. The rigid correction is off (`subspace=None`) and the sweeps start from the predictor, as in the paper.
 float32, because a million bodies fill tens of GB; the quick version uses float64.
 
 That the bar is met says little: the paper does not say where its bodies start and end, so its errors and ours are of
@@ -37,8 +37,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 BODIES, QUICK_BODIES = 1_000_000, 64
 EDGE = 3e-3  # [m]
@@ -102,15 +101,9 @@ def problem(
         name="million-cubes",
         parameters={"velocity": cubes.velocity, "material": cubes.material},
         stages=[
-            Stage(
-                loss=cubes.loss,
-                iterations=count,
-                learning_rate=rate,
-                before=partial(cubes.begin, touching=touching),
-                criterion="mean_error",
-                capturable=not dist.is_initialized() or dist.get_backend() == "nccl",
-                name=name,
-            )
+            Stage(loss=cubes.loss, iterations=count, learning_rate=rate,
+                  before=partial(cubes.begin, touching=touching), criterion="mean_error",
+                  capturable=not dist.is_initialized() or dist.get_backend() == "nccl", name=name)
             for name, count, rate, touching in zip(STAGES, version.counts, version.rates, (False, True), strict=True)
         ],
         estimates=lambda: {"mean_error": cubes.error.mean().item()},
@@ -119,7 +112,7 @@ def problem(
         findings=cubes.findings,
         picture=cubes.picture,
         animation=cubes.animation,
-    )
+    )  # fmt: skip
 
 
 def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int | None) -> Version:
@@ -159,8 +152,8 @@ class Cubes:
         mine = slice(part.start * self.group, part.stop * self.group)
         self.bodies = mine.stop - mine.start
         self.shape = (part.stop - part.start, self.group * cube.num_vertices, 3)
-        model = dv.Model(dv.mesh.replicate(cube, np.zeros((self.group, 3))), density=DENSITY, dtype=version.dtype,
-                         rigid=False, start="predictor")  # fmt: skip
+        model = dv.Model(dv.mesh.replicate(cube, np.zeros((self.group, 3))), density=DENSITY,
+                         dtype=version.dtype)  # fmt: skip
         self.model = model.to(settings.device)
         device = self.model.device
         like = {"dtype": version.dtype, "device": device}
@@ -241,19 +234,12 @@ class Cubes:
     def simulate(self, save: int) -> Tensor:
         """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""
         cube, mu = self.cube, MU[0] + (MU[1] - MU[0]) * self.own(self.material).sigmoid()
-        motion = dv.rollout(
-            self.model,
-            self.x,
-            self.own(self.velocity)[:, None].expand(-1, cube.num_vertices, -1).reshape(self.shape),
-            steps=self.version.steps,
-            mu=mu.view(-1, self.group, 1).expand(-1, -1, cube.num_tets).flatten(1),
-            lam=LAM,
-            time_step=TIME_STEP,
-            sweeps=SWEEPS,
-            force=self.push if self.contact else None,
-            save=save,
-            checkpoint_every=CHECKPOINT_EVERY,
-        )
+        v = self.own(self.velocity)[:, None].expand(-1, cube.num_vertices, -1).reshape(self.shape)
+        mu = mu.view(-1, self.group, 1).expand(-1, -1, cube.num_tets).flatten(1)
+        solver = dv.VBD(TIME_STEP, SWEEPS, subspace=None, start="predictor")
+        motion = dv.rollout(self.model, self.x, v, solver, steps=self.version.steps, save=save,
+                            checkpoint_every=CHECKPOINT_EVERY, mu=mu, lam=LAM,
+                            force=self.push if self.contact else None)  # fmt: skip
         centers = losses.center_of_mass(motion.x.view(-1, self.bodies, cube.num_vertices, 3), self.mass)
         return self.all_of(centers.transpose(0, 1)).transpose(0, 1)
 
@@ -298,29 +284,12 @@ def is_near(points: Tensor, others: Tensor) -> Tensor:
 
 
 def protocol(cube: dv.TetMesh, version: Version) -> dict[str, Any]:
-    return {
-        "bodies": version.bodies,
-        "vertices": version.bodies * cube.num_vertices,
-        "tets": version.bodies * cube.num_tets,
-        "steps": version.steps,
-        "target_step": version.target_step,
-        "iterations": version.counts,
-        "edge": EDGE,
-        "squeeze": SQUEEZE,
-        "density": DENSITY,
-        "mu": MU,
-        "lam": LAM,
-        "time_step": TIME_STEP,
-        "sweeps": SWEEPS,
-        "checkpoint_every": CHECKPOINT_EVERY,
-        "radius": RADIUS,
-        "stiffness": STIFFNESS,
-        "huber": HUBER,
-        "clip": CLIP,
-        "spacing": (PAD_SPACING, RING_SPACING),
-        "height": HEIGHT,
-        "dtype": str(version.dtype),
-    }
+    return {"bodies": version.bodies, "vertices": version.bodies * cube.num_vertices,
+            "tets": version.bodies * cube.num_tets, "steps": version.steps, "target_step": version.target_step,
+            "iterations": version.counts, "edge": EDGE, "squeeze": SQUEEZE, "density": DENSITY, "mu": MU, "lam": LAM,
+            "time_step": TIME_STEP, "sweeps": SWEEPS, "checkpoint_every": CHECKPOINT_EVERY, "radius": RADIUS,
+            "stiffness": STIFFNESS, "huber": HUBER, "clip": CLIP, "spacing": (PAD_SPACING, RING_SPACING),
+            "height": HEIGHT, "dtype": str(version.dtype)}  # fmt: skip
 
 
 def launch_pad(bodies: int) -> np.ndarray:

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffvbd import Refinement
-from diffvbd.tasks.progress import Row
+from diffvbd.results import Refinement
 
+Row = dict[str, float]
 OWN_KEYS = ("iteration", "stage", "loss", "gradient_norm", "seconds")  # of a row; the others are estimates
 
 

@@ -1,13 +1,124 @@
-"""What is said at the end of a run: a table of the estimates, and whether the result survives finer settings."""
+"""Reports of a run: progress while it goes on, a table at its end, and the versions that it depended on."""
 
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.tasks.problem import Problem, Result, Settings, estimates_of
-from diffvbd.tasks.progress import table_of
+from diffvbd import viz
+from diffvbd.results import Refinement
+from diffvbd.tasks.problem import Problem, Result, Row, Settings, estimates_of
 
 
-def survival(problem: Problem, settings: Settings, first: float) -> dv.Refinement | str:
+class Progress:
+    """A bar that redraws itself on a terminal, and about ten plain lines elsewhere (a log file, a pipe)."""
+
+    def __init__(self, name: str, total: int, done: int = 0, watch: Callable[[Row], object] | None = None) -> None:
+        self.name, self.total, self.done, self.before, self.watch = name, total, done, done, watch
+        self.terminal = sys.stderr.isatty()
+        self.begun = time.perf_counter()
+        self.last: Row | None = None
+        self.printed = True
+
+    def show(self, row: Row) -> None:
+        self.done += 1
+        self.last = row
+        self.printed = self.terminal or self.done == 1 or self.done % max(1, self.total // 10) == 0
+        if self.printed:
+            self._print()
+        if self.watch is not None:
+            self.watch(row)
+
+    def _print(self) -> None:
+        assert self.last is not None
+        left = (time.perf_counter() - self.begun) / (self.done - self.before) * (self.total - self.done)
+        filled = 20 * self.done // self.total
+        text = f"{self.name} [{'#' * filled}{'.' * (20 - filled)}] {self.done}/{self.total}  {summary(self.last)}"
+        text += f"  {left:.0f} s left"
+        if self.terminal:
+            text = text[: shutil.get_terminal_size().columns - 1]  # a line that wraps cannot be cleared
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def say(self, text: str) -> None:
+        """A line of its own."""
+        print(f"\n{text}" if self.terminal and self.last else text, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        if not self.printed:
+            self._print()
+        if self.terminal:
+            print(file=sys.stderr)
+
+
+def pictures(
+    surface: NDArray[np.int64],
+    motions: Callable[[], dict[str, Tensor]],
+    time_step: float,
+    shown: list[int],
+    truth: Row | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """`picture` and `animation` of a Problem whose motions [N, V, 3] are compared, the picture at the frames shown.
+
+    Options are those of both functions of `viz`: scenery and view.
+    """
+
+    def picture(path: Path, history: list[Row]) -> None:
+        frames = {name: motion[shown] for name, motion in motions().items()}
+        times = [k * time_step for k in shown]
+        viz.comparison(path, surface, frames, times, history, truth, **options)
+
+    def animation(path: Path) -> None:
+        viz.animation(path, surface, motions(), time_step, **options)
+
+    return {"picture": picture, "animation": animation}
+
+
+def table_of(start: Mapping[str, float], estimates: Row, truth: Row, errors: Row, units: Mapping[str, str]) -> str:
+    """Start, true and recovered values as aligned text."""
+    rows = [("parameter", "start", "true", "recovered", "relative error")]
+    for name, value in estimates.items():
+        true = f"{truth[name]:.6g}" if name in truth else "-"
+        error = f"{100 * errors[name]:.2g} %" if name in errors else "-"
+        label = f"{name} [{units[name]}]" if name in units else name
+        rows.append((label, f"{start[name]:.6g}", true, f"{value:.6g}", error))
+    widths = [max(len(row[k]) for row in rows) for k in range(5)]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)
+
+
+def versions(device: str = "cpu") -> dict[str, str]:
+    """Versions of what can change a result, and the machine."""
+    return {
+        "diffvbd": dv.__version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "threads": str(torch.get_num_threads()),
+        "device": torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else platform.machine(),
+    }
+
+
+def summary(row: Row) -> str:
+    """A row of the history in one line."""
+    short = {"loss": "loss", "gradient_norm": "|grad|"}
+    return "  ".join(f"{short.get(k, k)} {v:.4g}" for k, v in row.items() if k not in ("iteration", "seconds"))
+
+
+def survival(problem: Problem, settings: Settings, first: float) -> Refinement | str:
     """Whether the result survives more sweeps and smaller steps, or why that is not known."""
     stage = problem.stages[-1]
     if settings.quick:

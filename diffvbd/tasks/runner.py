@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from diffvbd.mesh.write import replace
-from diffvbd.tasks.capture import captured
-from diffvbd.tasks.folder import STATE, alone_in, prepare, put_aside, remove_results
+from diffvbd.tasks.folder import STATE, alone_in, is_first, prepare, put_aside, remove_results, with_own_folder
 from diffvbd.tasks.optimizer import optimizer_of
 from diffvbd.tasks.problem import (
     OWN_KEYS,
     Problem,
     Result,
+    Row,
     Settings,
     Stage,
     check,
@@ -32,9 +32,7 @@ from diffvbd.tasks.problem import (
     check_row,
     estimates_of,
 )
-from diffvbd.tasks.progress import Progress, Row, summary, versions
-from diffvbd.tasks.ranks import is_first, with_own_folder
-from diffvbd.tasks.report import survival
+from diffvbd.tasks.report import Progress, summary, survival, versions
 
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
 
@@ -223,18 +221,12 @@ class _Run:
     def save(self) -> None:
         if not is_first():
             return
-        state = {
-            "fingerprint": self.fingerprint,
-            "history": self.history,
-            "stage": (self.at, self.first, self.best),
-            "stalls": (self.stalled, self.still),
-            "best_parameters": self.best_parameters,
-            "parameters": {name: p.detach() for name, p in self.problem.parameters.items()},
-            "state": self.problem.state,
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": self.schedule.state_dict() if self.schedule else None,
-            "random": torch.get_rng_state(),
-        }
+        state = {"fingerprint": self.fingerprint, "history": self.history, "stage": (self.at, self.first, self.best),
+                 "stalls": (self.stalled, self.still), "best_parameters": self.best_parameters,
+                 "parameters": {name: p.detach() for name, p in self.problem.parameters.items()},
+                 "state": self.problem.state, "optimizer": self.optimizer.state_dict(),
+                 "schedule": self.schedule.state_dict() if self.schedule else None,
+                 "random": torch.get_rng_state()}  # fmt: skip
         replace(self.state, partial(_save, state))
         self.write_log()
 
@@ -327,20 +319,10 @@ class _Run:
         findings = problem.findings(self.history) if problem.findings else {}
         refined = survival(problem, self.settings, self.history[0]["loss"])
         listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
-        log = self.write_log(
-            converged=self.last_converged,
-            stalled=self.last_stalled,
-            best=best,
-            parameters=listed,
-            estimates=estimates,
-            truth=problem.truth,
-            units=problem.units,
-            relative_error=errors,
-            findings=findings,
-            refined=str(refined),
-            variables=sum(p.numel() for p in problem.parameters.values()),
-            **memory,
-        )
+        log = self.write_log(converged=self.last_converged, stalled=self.last_stalled, best=best, parameters=listed,
+                             estimates=estimates, truth=problem.truth, units=problem.units, relative_error=errors,
+                             findings=findings, refined=str(refined),
+                             variables=sum(p.numel() for p in problem.parameters.values()), **memory)  # fmt: skip
         result = Result(
             best, self.history, estimates, errors, self.last_converged, self.last_stalled, [log], findings, refined
         )
@@ -398,3 +380,37 @@ def _plain(value: Any) -> Any:
 
 def _moved(problem: Problem, stage: Stage) -> dict[str, Tensor]:
     return {name: p for name, p in problem.parameters.items() if stage.moves is None or name in stage.moves}
+
+
+def captured(run: Callable[[], Tensor], warm: int = 2) -> Callable[[], Tensor]:
+    """`run` as a CUDA graph: the same work on the same memory, results and gradients included. The optimiser stays
+    outside: its few launches cost nothing beside a rollout, and so any optimiser will do.
+
+    A graph cannot make its lists of pairs longer: a step with more pairs than when it was captured returns NaN. Then
+    `run` works once outside of it, where lists grow or the step says what is wrong, and is captured anew.
+    """
+    graph, result = _graph(run, warm)
+
+    def replay() -> Tensor:
+        nonlocal graph, result
+        graph.replay()
+        if not bool(torch.isfinite(result).all()):
+            del graph  # its memory goes to the next
+            graph, result = _graph(run, 1)
+            graph.replay()
+        return result
+
+    return replay
+
+
+def _graph(run: Callable[[], Tensor], warm: int) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(warm):  # libraries load, autograd makes its buffers
+            run()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = run()
+    return graph, result

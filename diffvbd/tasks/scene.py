@@ -11,13 +11,14 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.mesh.write import replace
-from diffvbd.tasks import archive
+from diffvbd.tasks.folder import read_archive
 
 MOST_STEPS = 10**7  # beyond, a typing error is likelier than patience
 
 Array = NDArray[np.float64]
 
 
+SUBSPACES: dict[str, Any] = {"rigid": "rigid", "coarse": "coarse", "none": None}
 INTEGRATORS = {"implicit-euler": dv.ImplicitEuler, "sdirk2": dv.SDIRK2, "bdf2": dv.BDF2}
 
 
@@ -38,9 +39,9 @@ class Scene:
         kappa: Stiffness of the floor's barrier.
         dhat: Distance at which the barrier begins [m].
         friction: Coefficient of the floor's friction; None: none.
-        relaxation: Multiplies every update, as in `diffvbd.Model`.
+        relaxation: Multiplies every update, as in `diffvbd.VBD`.
         integrator: One of INTEGRATORS.
-        coarse: Whether coarse corrections, `coarse="auto"` of `diffvbd.Model`, go between the sweeps.
+        subspace: One of SUBSPACES: which corrections go between the sweeps.
     """
 
     mesh: dv.TetMesh
@@ -57,7 +58,7 @@ class Scene:
     friction: float | None = None
     relaxation: float = 1.0
     integrator: str = "implicit-euler"
-    coarse: bool = False
+    subspace: str = "rigid"
 
     def model(self, device: str = "cpu") -> dv.Model:
         energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
@@ -65,29 +66,20 @@ class Scene:
             energies += (dv.FloorBarrier(height=self.floor, kappa=self.kappa, dhat=self.dhat),)
         if self.friction is not None:
             energies += (dv.Friction(self.friction),)
-        options: dict[str, Any] = {"density": self.density, "relaxation": self.relaxation}
-        options |= {"coarse": "auto"} if self.coarse else {}
-        options |= {"pinned": self.pinned} if self.pinned.any() else {}
-        return dv.Model(self.mesh, energies=energies, **options).to(device)
+        pinned = self.pinned if self.pinned.any() else None
+        return dv.Model(self.mesh, self.density, pinned, energies).to(device)
+
+    @property
+    def solver(self) -> dv.VBD:
+        subspace, integrator = SUBSPACES[self.subspace], INTEGRATORS[self.integrator]()
+        return dv.VBD(self.time_step, self.sweeps, relaxation=self.relaxation, subspace=subspace, integrator=integrator)
 
     def simulate(
         self, model: dv.Model, mu: Tensor | float, lam: Tensor | float, steps: int, **options: Any
-    ) -> dv.Trajectory:
+    ) -> dv.results.Trajectory:
         """Roll out from (x0, v0); mu and lam in [Pa]; options as in `diffvbd.rollout`."""
         x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (self.x0, self.v0))
-        return dv.rollout(
-            model,
-            x,
-            v,
-            steps=steps,
-            mu=mu,
-            lam=lam,
-            time_step=self.time_step,
-            sweeps=self.sweeps,
-            gravity=self.gravity,
-            integrator=INTEGRATORS[self.integrator](),
-            **options,
-        )
+        return dv.rollout(model, x, v, self.solver, steps=steps, mu=mu, lam=lam, gravity=self.gravity, **options)
 
 
 @dataclass(frozen=True)
@@ -119,8 +111,8 @@ class Observation:
             values["relaxation"] = s.relaxation
         if s.integrator != Scene.integrator:
             values["integrator"] = s.integrator
-        if s.coarse:
-            values["coarse"] = 1.0
+        if s.subspace != Scene.subspace:
+            values["subspace"] = s.subspace
         values |= self.truth
 
         def write(new: Path) -> None:
@@ -138,7 +130,7 @@ class Observation:
           shape);
         * x0, v0: initial positions [m] and velocities [m/s], shape [V, 3] (default: the mesh, at rest);
         * pinned: bool [V]; time_step [s]; sweeps; density [kg/m^3]; gravity [3]; floor, kappa, dhat,
-          friction, relaxation, integrator, coarse: as in `Scene`;
+          friction, relaxation, integrator, subspace: as in `Scene`;
         * mu, lam: the true material [Pa], only to report the error.
 
         Args:
@@ -152,13 +144,13 @@ class Observation:
             ValueError: not an .npz file, unknown or missing keys, wrong shapes; positions that are not in metres, by
                 their size; a time_step that does not meet the times of the observations.
         """
-        values = archive.read(path, "an .npz file with the key x")
+        values = read_archive(path, "an .npz file with the key x")
         given = {key: value for key, value in overrides.items() if value is not None}
         recorded = None if {"time_step", "steps"} <= set(given) else values.get("time_step")
         values |= given
         known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam"}
         numbers = {"time_step", "density", "floor", "kappa", "dhat", "friction", "relaxation"}
-        known |= numbers | {"sweeps", "gravity", "integrator", "coarse"}
+        known |= numbers | {"sweeps", "gravity", "integrator", "subspace"}
         unknown = sorted(set(values) - known)
         if unknown or "x" not in values:
             wrong = f"unknown keys {unknown}" if unknown else "the key x is missing"
@@ -177,23 +169,18 @@ class Observation:
             steps = _at_the_same_times(path, steps, _number(path, "time_step", recorded), fields["time_step"])
         if "sweeps" in values:
             fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
-        if "coarse" in values:
-            asked = np.asarray(values["coarse"])  # the option gives True
-            fields["coarse"] = bool(_number(path, "coarse", asked.astype(int) if asked.dtype == bool else asked))
         if "gravity" in values:
             fields["gravity"] = tuple(_array(path, "gravity", values["gravity"], (3,)).tolist())
-        if "integrator" in values:
-            fields["integrator"] = str(np.asarray(values["integrator"]))
-            if fields["integrator"] not in INTEGRATORS:
-                raise ValueError(f"{path}: integrator: expected one of {[*INTEGRATORS]}, got {fields['integrator']!r}")
+        for key, words in (("integrator", INTEGRATORS), ("subspace", SUBSPACES)):
+            if key in values:
+                fields[key] = str(np.asarray(values[key]))
+                if fields[key] not in words:
+                    raise ValueError(f"{path}: {key}: expected one of {[*words]}, got {fields[key]!r}")
         _check_size(path, x[0], mesh)
-        scene = Scene(
-            mesh=mesh,
-            x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
-            v0=_checked(path, "v0", values.get("v0", np.zeros(shape)), shape),
-            pinned=_mask(path, values.get("pinned", np.zeros(shape[0], bool)), shape[0]),
-            **fields,
-        )
+        scene = Scene(mesh=mesh, x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
+                      v0=_checked(path, "v0", values.get("v0", np.zeros(shape)), shape),
+                      pinned=_mask(path, values.get("pinned", np.zeros(shape[0], bool)), shape[0]),
+                      **fields)  # fmt: skip
         truth = {key: _number(path, key, values[key]) for key in ("mu", "lam") if key in values}
         return cls(scene, x, steps, truth)
 

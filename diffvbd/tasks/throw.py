@@ -24,9 +24,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.newton import lbfgs
-from diffvbd.tasks.problem import Problem, Settings, Stage
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.optimizer import lbfgs
+from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 SIZE, THICKNESS = (1.0, 0.7), 0.03  # of the sheet [m]
 STRETCH = 1.15  # of the sheet between the bars
@@ -68,31 +67,14 @@ def problem(settings: Settings) -> Problem:
         stages=[Stage(throw.loss, version.evaluations, optimizer=lbfgs, gradient_tolerance=TOLERANCE, capturable=True)],
         estimates=throw.estimates,
         units={"miss": "m"},
-        protocol={
-            "vertices": throw.model.num_vertices,
-            "tets": throw.model.num_tets,
-            "steps": throw.steps,
-            "time_step": version.time_step,
-            "sweeps": SWEEPS,
-            "density": DENSITY,
-            "sheet": SHEET,
-            "ball": BALL,
-            "stretch": STRETCH,
-            "kappa": KAPPA,
-            "dhat": DHAT,
-            "damping": DAMPING,
-            "reach": REACH,
-            "controls": CONTROLS,
-            "knot": KNOT,
-            "limit": LIMIT,
-            "lift": LIFT,
-            "box": BOX,
-            "effort": EFFORT,
-        },
+        protocol={"vertices": throw.model.num_vertices, "tets": throw.model.num_tets, "steps": throw.steps,
+                  "time_step": version.time_step, "sweeps": SWEEPS, "density": DENSITY, "sheet": SHEET, "ball": BALL,
+                  "stretch": STRETCH, "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING, "reach": REACH,
+                  "controls": CONTROLS, "knot": KNOT, "limit": LIMIT, "lift": LIFT, "box": BOX, "effort": EFFORT},
         findings=throw.findings,
         picture=throw.picture,
         animation=throw.animation,
-    )
+    )  # fmt: skip
 
 
 class Throw:
@@ -130,7 +112,7 @@ class Throw:
     def model_of(self, *others: Any, **more: Any) -> dv.Model:
         """Sheet and ball, with other energies and arguments of the Model beside their own."""
         energies = (dv.StableNeoHookean(), *others, self.barrier)
-        model = dv.Model(self.mesh, energies=energies, density=DENSITY, pinned=self.pinned, start="predictor", **more)
+        model = dv.Model(self.mesh, energies=energies, density=DENSITY, pinned=self.pinned, **more)
         return model.to(self.device)
 
     def heights(self, raw: Tensor) -> Tensor:
@@ -139,21 +121,11 @@ class Throw:
 
     def simulate(
         self, raw: Tensor, model: dv.Model, steps: int, save: Literal["all", "last"] = "last"
-    ) -> dv.Trajectory:
+    ) -> dv.results.Trajectory:
         bars = self.x + (self.heights(raw)[:steps] @ self.lifts.flatten(1)).unflatten(-1, (-1, 3))
-        return dv.rollout(
-            model,
-            self.x,
-            torch.zeros_like(self.x),
-            steps=steps,
-            mu=self.mu,
-            lam=self.mu,
-            time_step=self.time_step,
-            sweeps=SWEEPS,
-            prescribed=dv.per_step(bars),
-            save=save,
-            checkpoint_every=None,
-        )
+        solver = dv.VBD(self.time_step, SWEEPS, start="predictor")
+        return dv.rollout(model, self.x, torch.zeros_like(self.x), solver, steps=steps, save=save, checkpoint_every=None,
+                          mu=self.mu, lam=self.mu, prescribed=dv.per_step(bars))  # fmt: skip
 
     def loss(self) -> Tensor:
         ball = self.simulate(self.raw, self.model, self.steps).x[-1, self.part]

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from .. import mesh
-from ..adjoint.routes import ReverseSweep
+from ..checks import input_name
 from ..contact import colliders
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import FloorBarrier, StableNeoHookean
-from ..inspect.contact import record
+from ..inspect.record import record
 from ..model.model import Model
+from ..model.solver import VBD
 from ..reference import contact as reference
 from ..step.step import step
 from .scenes import generator
@@ -35,6 +36,10 @@ class Scene:
     time_step: float = 1 / 100
     inputs: dict[str, Any] = field(default_factory=dict)  # mu, lam, force, prescribed, colliders, ...
     parameters: dict[str, Tensor] = field(default_factory=dict)
+
+    def solver(self, sweeps: int, **options: Any) -> VBD:
+        """A solver with the scene's time step."""
+        return VBD(self.time_step, sweeps, **options)
 
     def leaves(self) -> dict[str, Tensor]:
         """Fresh differentiable copies of all inputs, parameters by their names."""
@@ -66,9 +71,8 @@ def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float =
         "force": noise(name, "force", shape=shape, size=0.5),
         "density": 1000 * torch.exp(noise(name, "density", shape=tet_shape, size=0.1)),
     }
-    constants = {f"{e.name}.{k}": v for e in model.parametric_energies for k, v in model.constants(e).items()}
-    wanted = ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient", "floor_barrier.kappa",
-              "floor_barrier.height")  # fmt: skip
+    constants = {input_name(e, k): v for e in model.parametric_energies for k, v in model.constants(e).items()}
+    wanted = ("pair_kappa", "pair_damping", "friction", "floor_kappa", "floor_height")
     parameters = {k: v.clone() for k, v in constants.items() if k in wanted}
     return Scene(model, x, v, inputs=inputs, parameters=parameters, **scene_options)
 
@@ -146,7 +150,7 @@ def batched() -> Scene:
     scene = build("batched", boxes((0, 0, 0), (0.04, 0.212, -0.03), points=2), (
         FloorBarrier(height=-0.012, kappa=2e4, dhat=0.02), PairBarrier(kappa=2e4, dhat=0.02, damping=1.0),
         Friction(0.3, 0.05)), batch=(3,), jitter=4e-3)  # fmt: skip
-    for name in ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient"):
+    for name in ("pair_kappa", "pair_damping", "friction"):
         scene.parameters[name] = scene.parameters[name] * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)
     return scene
 
@@ -208,15 +212,8 @@ def part_of(detection: Any) -> reference.Part:
                           torch.stack(detection.corrections).cpu(), limits,
                           None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
                           lengths=None if detection.lengths is None else detection.lengths.cpu(),
-                          combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined),
                           sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu(),
                           resting=None if detection.resting is None else detection.resting.cpu())  # fmt: skip
-
-
-def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Arguments of a step, and its parameters."""
-    parameters = {k: v for k, v in leaves.items() if "." in k}
-    return {k: v for k, v in leaves.items() if "." not in k}, parameters
 
 
 def objective(x: Tensor, v: Tensor) -> Tensor:
@@ -225,39 +222,35 @@ def objective(x: Tensor, v: Tensor) -> Tensor:
     return (weights[0] * x).sum() + 1e-2 * (weights[1] * v).sum()
 
 
-def compiled(scene: Scene, steps: int, sweeps: int, tape: Any = "full", model: Model | None = None
+def compiled(scene: Scene, steps: int, solver: VBD, model: Model | None = None
              ) -> tuple[dict[str, Tensor], list[list[reference.Part]]]:  # fmt: skip
     """End state and gradients of the package's steps, and the detections of each of them."""
     model = scene.model if model is None else model
     leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
-    options: dict[str, Any]
-    options, parameters = split(leaves)
-    x, v = options.pop("x"), options.pop("v")
+    inputs: dict[str, Any] = dict(leaves)
+    x, v = inputs.pop("x"), inputs.pop("v")
     parts = []
     for _ in range(steps):
-        with record() as found:
-            x, v = step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
-                           parameters=parameters, adjoint=ReverseSweep(tape=tape), **options)  # fmt: skip
+        with record("contact") as found:
+            x, v = step(model, x, v, solver, gravity=GRAVITY, **inputs)
         parts.append([part_of(d) for d in found])
     return _result(x, v, leaves), parts
 
 
-def unrolled(scene: Scene, steps: int, sweeps: int, parts: list[list[reference.Part]], seed: int | None = None
+def unrolled(scene: Scene, steps: int, solver: VBD, parts: list[list[reference.Part]], seed: int | None = None
              ) -> dict[str, Tensor]:  # fmt: skip
     """The same by autograd through the reference; ``seed`` permutes pairs and tets, which changes rounding alone."""
     leaves = scene.leaves()
-    options: dict[str, Any]
-    options, parameters = split(leaves)
-    x, v = options.pop("x"), options.pop("v")
+    inputs: dict[str, Any] = dict(leaves)
+    x, v = inputs.pop("x"), inputs.pop("v")
     for own in parts[:steps]:
         order = tets = None
         if seed is not None:
             rng = generator("order", seed)
             order = [torch.from_numpy(rng.permutation(len(p.pairs))) for p in own]
             tets = torch.from_numpy(rng.permutation(scene.model.num_tets))
-        x, v = reference.contact_step(scene.model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
-                                      parameters=parameters, parts=own, order=order, tet_order=tets,
-                                      **options)  # fmt: skip
+        x, v = reference.contact_step(scene.model, x, v, solver, gravity=GRAVITY, parts=own, order=order,
+                                      tet_order=tets, **inputs)  # fmt: skip
     return _result(x, v, leaves)
 
 

@@ -150,7 +150,7 @@ def _step(
         x[i] if pinned[i] else [a + h * b + h * h * g for a, b, g in zip(x[i], v, inputs["gravity"], strict=True)]
         for i, v in enumerate(inputs["v"])
     ]
-    floor = _Floor(inputs, h) if "floor_barrier.height" in inputs else None
+    floor = _Floor(inputs, h) if "floor_height" in inputs else None
     now = [y[i] if pinned[i] or floor is None else floor.started(x[i], _sub(y[i], x[i])) for i in range(len(x))]
     tau, omega = Decimal(float(model.regularization)), Decimal(float(model.relaxation))
     for _ in range(sweeps):
@@ -202,11 +202,11 @@ class _Floor:
 
     def __init__(self, inputs: dict[str, np.ndarray], h: Decimal) -> None:
         def parameter(name: str) -> np.ndarray:
-            return inputs[f"floor_barrier.{name}"]
+            return inputs[f"floor_{name}"]
 
         self.h = h
         self.kappa, self.dhat = parameter("kappa"), parameter("dhat")
-        self.damping = parameter("damping") if "floor_barrier.damping" in inputs else 0 * self.kappa
+        self.damping = parameter("damping") if "floor_damping" in inputs else 0 * self.kappa
         self.planes = []
         for normal, height in zip(parameter("normal"), parameter("height"), strict=True):
             length = _root(_dot(list(normal), list(normal)))

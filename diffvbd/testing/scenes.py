@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from diffvbd import reference
+from diffvbd.model.system import system_of
 from diffvbd.testing.tolerances import tolerance
 
 KINDS = ("structured", "delaunay", "random")
@@ -179,7 +180,7 @@ class Scene:
         """The case's energies as the package's dataclasses."""
         from diffvbd.energies import Anchor, FloorBarrier, StableNeoHookean
 
-        built: list[Any] = [StableNeoHookean(block=self.case.block)]
+        built: list[Any] = [StableNeoHookean()]
         if self.case.floor is not None:
             built.append(FloorBarrier(**self.case.floor))
         if self.case.anchor is not None:
@@ -196,28 +197,29 @@ class Scene:
             density=torch.from_numpy(self.arrays["density"]),
             pinned=torch.from_numpy(self.pinned) if self.pinned.any() else None,
             energies=self.energies(),
-            saturation=self.case.saturation,
-            regularization=self.case.regularization,
-            relaxation=self.case.relaxation,
             device=device,
             **options,
         )
 
+    def solver(self, sweeps: int, **options: Any) -> Any:
+        """A `diffvbd.VBD` of the case; options of it in addition."""
+        from ..model.solver import VBD
+
+        names = ("saturation", "regularization", "relaxation", "block")
+        return VBD(self.case.time_step, sweeps, **{**{name: getattr(self.case, name) for name in names}, **options})
+
     def inputs(self, dtype: torch.dtype = torch.float64, device: str = "cpu") -> dict[str, Any]:
-        """Fresh tensors for every differentiable argument of `step` (and `time_step`), parameters as a dict."""
+        """Fresh tensors for x, v and every differentiable input of `step`."""
         tensors: dict[str, Any] = {name: torch.tensor(a, dtype=dtype) for name, a in self.arrays.items()}
-        parameters: dict[str, Any] = {}
         if self.case.floor is not None:
             floor = {"normal": (0.0, 1.0, 0.0), "kappa": 400.0, "dhat": 0.02} | self.case.floor
             floor["height"] = np.atleast_1d(floor["height"])
             floor["normal"] = np.atleast_2d(floor["normal"])
-            parameters |= {f"floor_barrier.{k}": torch.as_tensor(value, dtype=dtype) for k, value in floor.items()}
+            tensors |= {f"floor_{k}": torch.as_tensor(value, dtype=dtype) for k, value in floor.items()}
         if self.case.anchor is not None:
-            parameters["anchor.stiffness"] = torch.full((len(self.points),), self.case.anchor, dtype=dtype)
-            parameters["anchor.points"] = torch.tensor(self.points, dtype=dtype)
-        if parameters:
-            tensors["parameters"] = parameters
-        return on_device(tensors, device) | {"time_step": self.case.time_step}
+            tensors["anchor_stiffness"] = torch.full((len(self.points),), self.case.anchor, dtype=dtype)
+            tensors["anchor_points"] = torch.tensor(self.points, dtype=dtype)
+        return on_device(tensors, device)
 
 
 def build_scene(case: str, kind: str = "structured", size: str = "small") -> Scene:
@@ -277,22 +279,18 @@ def relative_error(value: Tensor | np.ndarray, expected: Tensor | np.ndarray) ->
     return error / scale if scale else (0.0 if error == 0 else float("inf"))
 
 
-def evaluate(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any]) -> dict[str, Tensor]:
-    """Final state and gradients of a fixed random linear loss.
+def evaluate(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any], time_step: float) -> dict[str, Tensor]:
+    """Final state and gradients of a fixed random linear loss of x and time_step times v.
 
-    `run(**inputs)` returns the final (x, v). The result holds "x", "v" and a "grad_<name>" for every floating tensor in
-    inputs and inputs["parameters"] (None becomes zeros: an input that does not matter has gradient zero).
+    `run(**inputs)` returns the final (x, v). The result holds "x", "v" and a "grad_<name>" for every tensor in inputs
+    (None becomes zeros: an input that does not matter has gradient zero).
     """
     flat = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
-    flat |= inputs.get("parameters", {})
     leaves = {name: value.detach().clone().requires_grad_() for name, value in flat.items()}
-    call = {name: leaves.get(name, value) for name, value in inputs.items()}
-    if "parameters" in inputs:
-        call["parameters"] = {name: leaves[name] for name in inputs["parameters"]}
-    x, v = run(**call)
+    x, v = run(**{name: leaves.get(name, value) for name, value in inputs.items()})
     rng = generator("loss")
     weights = [torch.as_tensor(rng.standard_normal(tuple(x.shape)), dtype=x.dtype, device=x.device) for _ in range(2)]
-    loss = (weights[0] * x).sum() + inputs["time_step"] * (weights[1] * v).sum()
+    loss = (weights[0] * x).sum() + time_step * (weights[1] * v).sum()
     gradients = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
     result = {"x": x.detach(), "v": v.detach()}
     for (name, leaf), gradient in zip(leaves.items(), gradients, strict=True):
@@ -303,40 +301,38 @@ def evaluate(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any]) 
 def reference_result(
     model: Any,
     inputs: dict[str, Any],
-    sweeps: int,
+    solver: Any,
     steps: int = 1,
     tet_order: Tensor | None = None,
     coarse_steps: Any = None,
-    taken: Any = None,
 ) -> dict[str, Tensor]:
-    """`evaluate` of the reference rollout; coarse_steps: recorded lengths of coarse corrections, one entry a step;
-    taken: likewise who took the combinations of an acceleration."""
+    """`evaluate` of the reference rollout; coarse_steps: recorded lengths of coarse corrections, one entry a step."""
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
         trajectory = reference.rollout(
-            model, steps=steps, sweeps=sweeps, tet_order=tet_order, coarse_steps=coarse_steps, taken=taken, **options
+            model, solver=solver, steps=steps, tet_order=tet_order, coarse_steps=coarse_steps, **options
         )
         return trajectory.x[-1], trajectory.v[-1]
 
-    return evaluate(run, inputs)
+    return evaluate(run, inputs, solver.time_step)
 
 
-def _turned(model: Any) -> Any:
+def _turned(model: Any, solver: Any) -> Any:
     """What the reference reads of a model, each tet listed from another corner (an even permutation)."""
     names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
-    names += ("saturation", "regularization", "relaxation", "rigid", "starts_from")
-    names += ("coarse", "coarse_geometry", "acceleration")
+    names += ("saturation", "regularization", "relaxation", "block", "rigid", "starts_from")
+    names += ("coarse", "coarse_geometry")
+    model = system_of(model, solver)
     return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name, None) for name in names})
 
 
 def spread(
     model: Any,
     inputs: dict[str, Any],
-    sweeps: int,
+    solver: Any,
     steps: int = 1,
     expected: dict[str, Tensor] | None = None,
     coarse_steps: Any = None,
-    taken: Any = None,
 ) -> dict[str, float]:
     """How far two references with permuted tets disagree, per entry of `evaluate`: what rounding alone does here.
 
@@ -344,25 +340,24 @@ def spread(
     `expected`: the unpermuted `reference_result`, when it is at hand.
     """
     order = torch.from_numpy(generator("order").permutation(model.tets.shape[0]))
-    permuted = reference_result(_turned(model), inputs, sweeps, steps, order, coarse_steps, taken)
+    permuted = reference_result(_turned(model, solver), inputs, solver, steps, order, coarse_steps)
     if expected is None:
-        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps, taken=taken)
+        expected = reference_result(model, inputs, solver, steps, coarse_steps=coarse_steps)
     return {name: relative_error(permuted[name], expected[name]) for name in expected}
 
 
 def sensitivity(
     model: Any,
     inputs: dict[str, Any],
-    sweeps: int,
+    solver: Any,
     steps: int = 1,
     expected: dict[str, Tensor] | None = None,
     coarse_steps: Any = None,
-    taken: Any = None,
 ) -> dict[str, float]:
     """How far the reference moves, per entry of `evaluate`, when every input moves by an ulp (the worst of three random
     moves): no algorithm can be asked for less. A barrier feels it in a small gap, which the order of the tets hides."""
     if expected is None:
-        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps, taken=taken)
+        expected = reference_result(model, inputs, solver, steps, coarse_steps=coarse_steps)
     rng = generator("sensitivity")
 
     def nudged(a: Any) -> Any:
@@ -372,8 +367,7 @@ def sensitivity(
             return a
         return a * torch.as_tensor(1 + rng.choice((-1, 1), tuple(a.shape)) * 2.0**-52, device=a.device)
 
-    again = {"coarse_steps": coarse_steps, "taken": taken}
-    moved = [reference_result(model, nudged(inputs), sweeps, steps, **again) for _ in range(3)]
+    moved = [reference_result(model, nudged(inputs), solver, steps, coarse_steps=coarse_steps) for _ in range(3)]
     return {name: max(relative_error(m[name], expected[name]) for m in moved) for name in expected}
 
 

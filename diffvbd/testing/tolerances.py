@@ -118,8 +118,6 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "cancelling": (1e-12, "sums that cancel in part, and differences over a time step: two digits fewer than a sum"),
     "geometry": (1e-12, "volumes, normals and distances: differences of coordinates lose the digits that these share"),
     "thin_volumes": (1e-9, "the same of tets a hundred times thinner than long, and of parts of them"),
-    "accelerated": (1e-10, "gradients of three accelerated steps by autograd: small systems amplify rounding"),
-    "regularized": (1e-4, "Anderson's small systems with and without a millionth of their diagonal, times a condition"),
     "solves_of_a_part": (
         1e-12,
         "three steps with contact by implicit Euler, over all of a step and scaled to a share of it: measured 2e-14; "

@@ -15,12 +15,9 @@ import torch
 from ..checks import check_bool, check_count, fail
 from ..model.model import Model
 from .drawing import Scenery
-from .motion import Mesh, Motion, mesh_of, motions_of
-from .opened import opened
-from .panel import Slider
-from .scenery import scenery_of
+from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of
 from .values import Values
-from .viewer import Viewer
+from .viewer import Slider, Viewer
 
 
 def live(
@@ -44,7 +41,7 @@ def live(
     Args:
         source: What to show:
 
-            * a dv.Trajectory, or positions [m], shape [N, V, 3] or [N, B, V, 3], array or tensor; a dict of such things
+            * a dv.results.Trajectory, or positions [m], shape [N, V, 3] or [N, B, V, 3], array or tensor; a dict of such things
               by name;
             * a dv.Model or dv.TetMesh, for :meth:`Viewer.update`;
             * a file: a .pvd that `write_series` wrote, a mesh with tets, or the folder of a `diffvbd run`;

@@ -1,23 +1,30 @@
-"""A motion as the viewer holds it: positions of a surface over time, and what its colors are computed from."""
+"""Motions as the viewer takes them: positions of a surface over time, from results, files and Models."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import check_positive, fail
+from ..contact.colliders import Capsule, Plane, Sphere
+from ..mesh.arrays import connected
+from ..mesh.io import load
+from ..mesh.motions import read_frames
 from ..mesh.tet_mesh import TetMesh, boundary_faces
 from ..mesh.write import replace
 from ..model.model import Model
 from ..rollout.trajectory import Trajectory
-from .drawing import SCENERY, Scenery, as_array, check_surface
-from .surfaces import bodies
+from .drawing import SCENERY, Scenery, as_array, capsule, check_surface
 
 Mesh = Model | TetMesh
 
@@ -93,7 +100,9 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
     if isinstance(source, Trajectory):
         x, v, steps = source.x, as_array(source.v), np.asarray(source.steps)
     if isinstance(x, (str, bytes)) or not (hasattr(x, "__array__") or isinstance(x, Sequence)):
-        raise TypeError(f"source: expected a dv.Trajectory, positions, a mesh or a file, got {type(source).__name__}")
+        raise TypeError(
+            f"source: expected a dv.results.Trajectory, positions, a mesh or a file, got {type(source).__name__}"
+        )
     points = positions("source", x, body.num_vertices)
     numbers = np.arange(len(points)) if steps is None else steps
     times = None if step is None else as_array(numbers * step)
@@ -185,3 +194,151 @@ def load_motions(path: str | PathLike[str]) -> dict[str, Motion]:
     if not motions:
         raise ValueError(f"{path}: expected motions of a run, got a file that has none")
     return motions
+
+
+MOTION, LOG = "motion.npz", "log.json"  # of the folder of a run
+NOT_SHOWN = {"iteration", "stage", "seconds", "loss"}  # of a row of the log
+
+
+_FOR_OTHERS = (".glb", ".gltf", ".usd", ".usda", ".usdc")  # what `write_series` writes and nothing here reads
+
+
+class Opened(NamedTuple):
+    """Motions by name, their mesh if the file has tets, and the course of an optimisation."""
+
+    motions: dict[str, Motion]
+    mesh: TetMesh | None = None
+    losses: tuple[float, ...] = ()
+    parameters: Mapping[str, float] = MappingProxyType({})
+
+
+def opened(path: Path, time_step: float | None = None) -> Opened:
+    """The motions of a .pvd, of a mesh file, of a motion.npz, or of the folder of a run.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file of another kind, or a run that has kept no motion.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist: expected a .pvd, a mesh with tets or the folder of a run")
+    if path.is_dir():
+        return _run(path)
+    if path.suffix.lower() == ".npz":
+        return Opened(load_motions(path))
+    if path.suffix.lower() == ".pvd":
+        frames = read_frames(path)
+        motions = motions_of(frames.points, frames.mesh, time_step)
+        if time_step is None:
+            motions = {name: _timed(motion, frames.times) for name, motion in motions.items()}
+        return Opened(motions, frames.mesh)
+    if path.suffix.lower() in _FOR_OTHERS:
+        raise ValueError(
+            f"{path}: expected a .pvd, a mesh with tets or the folder of a run; {path.suffix} is for other programs"
+        )
+    mesh = load(path)
+    return Opened(motions_of(mesh, time_step=time_step), mesh)
+
+
+def _timed(motion: Motion, times: Any) -> Motion:
+    """A motion at other times [s], which are not those of single steps."""
+    return dataclasses.replace(motion, times=times, steps=None) if len(times) < 2 or times[-1] > times[0] else motion
+
+
+def _run(folder: Path) -> Opened:
+    if not (folder / MOTION).is_file():
+        kind = "a run that is not finished" if (folder / "state.pt").exists() else "none"
+        raise ValueError(f"{folder}: expected the folder of a finished `diffvbd run` with {MOTION}, got {kind}")
+    history: list[dict[str, Any]] = []
+    losses: tuple[float, ...] = ()
+    if (folder / LOG).is_file():
+        try:
+            history = json.loads((folder / LOG).read_text(encoding="utf-8")).get("history", [])
+            losses = tuple(float(row.get("loss", math.nan)) for row in history)
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{folder / LOG}: expected the log of a run, got {error}") from None
+    last = history[-1] if history else {}
+    numbers = {k: v for k, v in last.items() if k not in NOT_SHOWN and isinstance(v, (int, float))}
+    return Opened(load_motions(folder / MOTION), None, losses, numbers)
+
+
+FLOOR = "#dcdad5"
+REACH = 2.5  # planes are shown so far around a scene, in its radii
+
+
+def scenery_of(
+    model: Model,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    colliders: Any = None,
+) -> tuple[Scenery, ...]:
+    """Floors and colliders around a scene between two corners [m].
+
+    Args:
+        model: The scene.
+        low, high: Its lowest and highest corner [m], shape [3].
+        colliders: Where the corner points of the colliders are in each frame [m], shape [N, Vc, 3]; None: at rest.
+
+    Raises:
+        ValueError: colliders of another shape.
+    """
+    middle, reach = 0.5 * (low + high), REACH * 0.5 * float(np.linalg.norm(high - low))
+    things = []
+    if model.floor is not None:
+        normals, heights = np.atleast_2d(as_array(model.floor.normal)), np.atleast_1d(as_array(model.floor.height))
+        for k, normal in enumerate(normals):
+            unit = normal / np.linalg.norm(normal)
+            things.append(plane(heights[min(k, len(heights) - 1)] * unit, unit, middle, reach))
+    rest = as_array(model.collider_points) if model.colliders else np.zeros((0, 3))
+    moved = rest if colliders is None else as_array(colliders)
+    if moved.shape[-2:] != rest.shape or moved.ndim not in (2, 3):
+        fail("colliders", f"shape [N, {len(rest)}, 3]", f"shape {list(moved.shape)}")
+    rows_of = model.collider_rows if model.colliders else ()
+    for collider, rows in zip(model.colliders, rows_of, strict=True):
+        frames = moved[..., rows, :]
+        if isinstance(collider, Plane):
+            corners = frames if frames.ndim == 2 else frames[0]
+            across = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            unit = across / np.linalg.norm(across)
+            things.append(plane(corners[0], unit, middle, reach))
+        elif isinstance(collider, (Sphere, Capsule)):
+            ends = frames[None] if frames.ndim == 2 else frames
+            shapes = [capsule(each[0], each[-1], collider.radius) for each in ends]
+            points = np.stack([shape.points for shape in shapes])
+            things.append(Scenery(points[0] if frames.ndim == 2 else points, shapes[0].triangles, SCENERY))
+        else:
+            things.append(Scenery(frames, collider.corners().triangles, SCENERY))
+    return tuple(things)
+
+
+def plane(
+    point: NDArray[np.float64], normal: NDArray[np.float64], middle: NDArray[np.float64], reach: float
+) -> Scenery:
+    """A square piece of a plane, as large as `reach` [m] to each side of the place below `middle` [m]."""
+    foot = middle - ((middle - point) @ normal) * normal
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    corners = foot + reach * as_array([-first - second, first - second, first + second, second - first])
+    return Scenery(corners, np.array([[0, 1, 2], [0, 2, 3]]), FLOOR)
+
+
+SHARP = np.cos(np.radians(40.0))  # cosine between two triangles from which on their edge is drawn as one
+
+
+def bodies(triangles: NDArray[np.int64], vertices: int) -> NDArray[np.int64]:
+    """Labels [V] of the connected parts of a surface [F, 3]."""
+    return connected(np.concatenate([triangles[:, :2], triangles[:, 1:]]), vertices)
+
+
+def smooth_parts(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Labels [F] of the parts of a surface that sharp edges bound, for points [m] of shape [V, 3]."""
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    key = edges[:, 0] * len(points) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    pairs = np.stack([order[:-1][same] // 3, order[1:][same] // 3], 1)
+    smooth = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1) > SHARP
+    return connected(pairs[smooth], len(triangles))

@@ -13,9 +13,7 @@ from ..checks import check_positive, fail
 from ..mesh.write import replace
 from ..model.model import Model
 from .drawing import Scenery, as_array
-from .motion import Mesh, Motion, mesh_of, motions_of
-from .opened import opened
-from .scenery import scenery_of
+from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of
 from .values import Values, rgb
 
 ANIMATED = (".webp", ".gif")

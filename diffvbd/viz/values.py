@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..checks import fail, is_word
 from ..inspect.forces import forces, stress
 from ..model.model import Model
+from ..model.solver import VBD
 from .drawing import as_array
 from .motion import Motion
 
@@ -161,7 +162,7 @@ class Values:
         rows, out = max(1, _CHUNK // max(1, model.num_tets)), []
         for k in range(0, len(motion), rows):
             with torch.no_grad():
-                found = stress(model, _like(model, motion.points[k : k + rows]), *given)
+                found = stress(model, _like(model, motion.points[k : k + rows]), mu=given[0], lam=given[1])
             out.append(as_array(found.von_mises)[:, tets])
         return np.concatenate(out)
 
@@ -176,7 +177,7 @@ class Values:
         for k in range(len(motion)):
             given: dict[str, Any] = {} if places is None else {"colliders": places[k]}
             if step is not None and k:
-                given |= {"previous": (x[k - 1], x[k - 1]), "time_step": step}
+                given |= {"previous": (x[k - 1], x[k - 1]), "solver": VBD(step, 1)}
                 given |= {} if places is None else {"colliders_before": places[k - 1]}
             with torch.no_grad():
                 total = forces(model, x[k], **given).vertices.total

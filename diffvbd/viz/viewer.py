@@ -1,25 +1,417 @@
-"""A page that shows motions while a program runs: the server, and the thread that draws."""
+"""Page of a motion: playback, sliders, colors and the course of an optimisation, drawn by viser."""
 
 from __future__ import annotations
 
 import contextlib
 import html
 import io
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..checks import check_count, fail, is_word
 from ..rollout.trajectory import Trajectory
 from ..scopes import record_to
-from .clock import DELAY, Clock, Rerun
-from .drawing import Scenery
-from .motion import Mesh, Motion, motions_of
-from .panel import Panel, Slider
+from .drawing import Scenery, as_array
+from .motion import Mesh, Motion, motions_of, smooth_parts
 from .server import open_server
-from .stage import Stage
-from .values import QUANTITIES, Values, legend
+from .values import QUANTITIES, Colors, Values, legend, rgb
+
+RATE = 24.0  # frames a second of a motion without times
+DELAY = 0.2  # [s] without a change before a function runs again
+
+
+class Clock:
+    """Plays a motion: a position in time that advances, and the frame that it falls on.
+
+    Attributes:
+        playing, loop, speed: Whether it advances, begins again at the end, and how much faster than time it is.
+    """
+
+    def __init__(self, times: NDArray[np.float64] | None, frames: int) -> None:
+        self.playing, self.loop, self.speed = False, True, 1.0
+        self._now = 0.0
+        self.set_times(times, frames)
+
+    def set_times(self, times: NDArray[np.float64] | None, frames: int) -> None:
+        """Another motion: the position stays where that has it."""
+        self.times = np.arange(frames) / RATE if times is None else np.asarray(times) - times[0]
+        self._now = min(self._now, self.end)
+
+    @property
+    def end(self) -> float:
+        return float(self.times[-1])
+
+    @property
+    def frame(self) -> int:
+        return max(0, int(np.searchsorted(self.times, self._now + 1e-9 * (1 + self.end), side="right")) - 1)
+
+    @frame.setter
+    def frame(self, k: int) -> None:
+        self._now = float(self.times[int(np.clip(k, 0, len(self.times) - 1))])
+
+    def play(self) -> None:
+        """Begins at the start if it stands at the end."""
+        if not self.loop and self._now >= self.end:
+            self._now = 0.0
+        self.playing = True
+
+    def advance(self, seconds: float) -> int:
+        """Moves on by so many seconds of the viewer; returns the frame."""
+        if self.playing and self.end > 0:
+            self._now += self.speed * seconds
+            if self._now > self.end:
+                # the last frame stays as long as the one before it
+                period = self.end * len(self.times) / (len(self.times) - 1)
+                if self.loop:
+                    self._now %= period
+                else:
+                    self._now, self.playing = self.end, False
+        return self.frame
+
+
+class Rerun:
+    """Runs a function in a thread of its own once its arguments have stood still for a while.
+
+    Args:
+        function: Called with the latest arguments; never twice at a time.
+        done: Called with its result.
+        failed: Called with the exception that it raised.
+        delay: [s] without another request before it runs.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        done: Callable[[Any], object],
+        failed: Callable[[Exception], object],
+        delay: float = DELAY,
+    ) -> None:
+        self.function, self.done, self.failed, self.delay = function, done, failed, delay
+        self.runs = 0
+        self._asked: tuple[float, dict[str, Any]] | None = None
+        self._stopped = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="diffvbd-rerun", daemon=True)
+        self._thread.start()
+
+    def request(self, **arguments: Any) -> None:
+        """Asks for a run with these arguments, in place of what was asked for before and has not begun."""
+        with self._changed:
+            self._asked = (time.monotonic() + self.delay, arguments)
+            self._changed.notify()
+
+    def stop(self, wait: float = 2.0) -> None:
+        """Ends the thread, after a run that is under way."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+        if self._thread is not threading.current_thread():
+            self._thread.join(wait)
+
+    def _next(self) -> dict[str, Any] | None:
+        with self._changed:
+            while not self._stopped:
+                if self._asked is None:
+                    self._changed.wait()
+                elif (left := self._asked[0] - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                else:
+                    arguments, self._asked = self._asked[1], None
+                    return arguments
+        return None
+
+    def _work(self) -> None:
+        while (arguments := self._next()) is not None:
+            try:
+                self.runs += 1
+                self.done(self.function(**arguments))
+            except Exception as error:  # a user's function may raise anything; the page shows it
+                self.failed(error)
+
+
+EYE = np.array([0.55, 0.4, 1.0])  # direction from the scene to the camera
+ROOM = 1.15  # around the scene, in its radii
+VIEW_ANGLE = 0.7  # [rad] from the lowest to the highest that the camera sees
+
+
+class Stage:
+    """Draws frames of a motion into a viser server; viser has one color a mesh, so each color is a mesh."""
+
+    def __init__(self, server: Any) -> None:
+        self.server = server
+        server.scene.set_up_direction("+y")
+        self._layers: list[tuple[Any, NDArray[np.int64]]] = []  # meshes of constant color: handle, their vertices
+        self._bins: list[Any] = []  # meshes of the levels of a quantity
+        self._things: list[tuple[Any, NDArray[np.float64]]] = []  # what moves of the scenery, and where it is
+        self._scenery: list[Any] = []
+        self._shown: tuple[Any, Any] | None = None
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing has been drawn."""
+        return self._shown is None
+
+    def look_at(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Puts the camera where it sees all between two corners [m]."""
+        middle, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
+        eye = middle + EYE / np.linalg.norm(EYE) * ROOM * radius / np.sin(0.5 * VIEW_ANGLE)
+        cameras = [self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())]
+        for camera in cameras:
+            camera.fov, camera.near, camera.far = VIEW_ANGLE, radius / 100, radius * 100
+            camera.position, camera.look_at = tuple(eye), tuple(middle)
+
+    def set_scenery(self, things: tuple[Scenery, ...]) -> None:
+        """What else is there."""
+        for handle in self._scenery:
+            handle.remove()
+        self._scenery, self._things = [], []
+        for k, thing in enumerate(things):
+            points = as_array(thing.points)
+            handle = self.server.scene.add_mesh_simple(
+                f"/scenery/{k}",
+                points if points.ndim == 2 else points[0],
+                np.asarray(thing.triangles),
+                color=rgb(thing.color),
+                side="double",
+                flat_shading=len(thing.triangles) <= 12,
+                receive_shadow=len(thing.triangles) > 2,  # the map of viser's light ends on a large plane
+            )
+            self._scenery.append(handle)
+            if points.ndim == 3:
+                self._things.append((handle, points))
+
+    def show(self, motion: Motion, colors: Colors, frame: int) -> None:
+        """Draws a frame."""
+        with self.server.atomic():
+            if self._shown is None or self._shown[0] is not motion.triangles or self._shown[1] is not colors:
+                self._begin(motion, colors)
+            points = motion.points[frame].astype(np.float32)
+            if self._bins:
+                self._show_levels(points[motion.triangles], colors.at(frame))
+            for handle, vertices in self._layers:
+                handle.vertices = points[vertices]
+            for handle, places in self._things:
+                handle.vertices = places[min(frame, len(places) - 1)].astype(np.float32)
+
+    def _begin(self, motion: Motion, colors: Colors) -> None:
+        for handle in (*self._bins, *(handle for handle, _ in self._layers)):
+            handle.remove()
+        self._bins, self._layers, self._shown = [], [], (motion.triangles, colors)
+        start, none = motion.points[0], (np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]))
+        part = smooth_parts(start, motion.triangles)[:, None]
+        for k, color in enumerate(colors.palette):
+            tint = tuple(int(c) for c in color)
+            if colors.unit:
+                self._bins.append(
+                    self.server.scene.add_mesh_simple(
+                        f"/level/{k}", *none, color=tint, flat_shading=True, side="double", visible=False
+                    )
+                )
+                continue
+            rows = colors.levels == k
+            if not rows.any():
+                continue
+            # a vertex on a sharp edge is one for each side, lest it be shaded as if it were round
+            of_parts, faces = np.unique(part[rows] * len(start) + motion.triangles[rows], return_inverse=True)
+            vertices = of_parts % len(start)
+            handle = self.server.scene.add_mesh_simple(
+                f"/body/{k}", start[vertices], faces.reshape(-1, 3), color=tint, side="double"
+            )
+            self._layers.append((handle, vertices))
+
+    def _show_levels(self, corners: NDArray[np.float32], levels: NDArray[np.int64]) -> None:
+        """Triangles [F, 3, 3] in the mesh of their level."""
+        order = np.argsort(levels, kind="stable")
+        ends = np.searchsorted(levels[order], np.arange(len(self._bins) + 1))
+        for k, handle in enumerate(self._bins):
+            mine = corners[order[ends[k] : ends[k + 1]]].reshape(-1, 3)
+            if handle.visible != bool(len(mine)):
+                handle.visible = bool(len(mine))
+            if len(mine):
+                # a mesh may never have faces beyond its vertices, not even between two messages
+                faces = np.arange(len(mine)).reshape(-1, 3)
+                if len(mine) >= len(handle.vertices):
+                    handle.vertices, handle.faces = mine, faces
+                else:
+                    handle.faces, handle.vertices = faces, mine
+
+
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+STEPS = 200  # of a slider of a parameter
+ROWS = 500  # points of the loss's curve
+Slider = tuple[float, float, float]  # lowest, highest, first value
+
+
+class Panel:
+    """Controls of a viser server. What the user does is told to functions; what is shown is set by methods.
+
+    Args:
+        server: The viser server.
+        names: Of the motions.
+        tell: Called as tell(what, value) with "play", "frame", "loop", "speed", "color", "motion" or "camera".
+        sliders: Lowest, highest and first value of each parameter.
+        moved: Called with all parameters once a slider has moved.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        names: Sequence[str],
+        color: str,
+        tell: Callable[[str, Any], None],
+        sliders: Mapping[str, Slider],
+        moved: Callable[[dict[str, float]], None],
+    ) -> None:
+        self.gui = server.gui
+        self.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 111, 159))
+        self.gui.main_panel.dock_right()
+        self._names, self._last = tuple(names), 1  # motions that there are; the last frame
+        with self.gui.add_folder("Motion"):
+            self.motion = self.gui.add_dropdown("show", tuple(names), initial_value=names[0], visible=len(names) > 1)
+            self.play = self.gui.add_button("Play")
+            self.frame = self.gui.add_slider("frame", 0, 1, 1, 0)
+            self.time = self.gui.add_markdown("")
+            self.speed = self.gui.add_dropdown("playback", SPEEDS, initial_value="1")
+            self.loop = self.gui.add_checkbox("loop", True)
+            camera = self.gui.add_button("Frame the scene")
+        with self.gui.add_folder("Color"):
+            self.color = self.gui.add_dropdown("by", tuple(QUANTITIES), initial_value=color)
+            self.legend = self.gui.add_html("")
+        self.message = self.gui.add_markdown("", visible=False)
+        self._listen(self.motion, lambda name: _among(name, self._names), lambda name: tell("motion", name))
+        self._listen(self.frame, lambda k: _within(k, 0, self._last), lambda k: tell("frame", int(k)))
+        self._listen(self.color, lambda name: _among(name, QUANTITIES), lambda name: tell("color", name))
+        self._listen(self.loop, bool, lambda loop: tell("loop", loop))
+        self._listen(self.speed, lambda speed: _among(speed, SPEEDS), lambda speed: tell("speed", float(speed)))
+        self.play.on_click(lambda _: tell("play", None))
+        camera.on_click(lambda _: tell("camera", None))
+        self._values = {name: first for name, (_, _, first) in sliders.items()}
+        self._moved = moved
+        self.state: Any = None
+        if sliders:
+            self._add_sliders(sliders)
+        self._chart: Any = None
+        self._label = "loss"
+        self._table: Any = None
+
+    def _listen(self, handle: Any, accept: Callable[[Any], Any], tell: Callable[[Any], None]) -> None:
+        """Tells of values that users set, as `accept` takes them; None: not at all, and the control goes back.
+
+        The page keeps to the limits of its controls, but whoever reaches the server can send anything.
+        """
+        last = handle.value
+
+        def told(event: Any) -> None:
+            nonlocal last
+            if event.client is None:  # the program has set it
+                last = handle.value
+                return
+            given = handle.value
+            value = accept(given)
+            last = last if value is None else value
+            if value != given:
+                handle.value = last
+            if value is not None:
+                tell(value)
+
+        handle.on_update(told)
+
+    def _add_sliders(self, sliders: Mapping[str, Slider]) -> None:
+        with self.gui.add_folder("Parameters"):
+            for name, (low, high, first) in sliders.items():
+                handle = self.gui.add_slider(name, low, high, (high - low) / STEPS, first)
+                self._listen(handle, partial(_within, low=low, high=high), partial(self._move, name))
+            self.state = self.gui.add_markdown("up to date")
+
+    def _move(self, name: str, value: float) -> None:
+        self._values[name] = float(value)
+        self._moved(dict(self._values))
+
+    def say_state(self, text: str) -> None:
+        """How the simulation behind the sliders stands."""
+        if self.state is not None:
+            self.state.content = text
+
+    def say(self, error: str) -> None:
+        """An error, or none ("")."""
+        self.message.content = f"**{error}**" if error else ""
+        self.message.visible = bool(error)
+
+    def set(self, handle: Any, value: Any) -> None:
+        """Sets a control without telling of it."""
+        if handle.value != value:
+            handle.value = value
+
+    def show_frame(self, frame: int, frames: int, seconds: float | None, playing: bool) -> None:
+        """The frame that is shown, of so many, and its time [s]."""
+        self._last = max(1, frames - 1)
+        if self.frame.max != self._last:
+            self.frame.max = self._last
+        self.set(self.frame, frame)
+        when = "" if seconds is None else f", {seconds:.3f} s"
+        text = f"frame {frame} of {frames - 1}{when}"
+        if self.time.content != text:
+            self.time.content = text
+        label = "Pause" if playing and frames > 1 else "Play"
+        if self.play.label != label:
+            self.play.label = label
+
+    def show_names(self, names: Sequence[str], chosen: str) -> None:
+        """The motions that there are."""
+        self._names = tuple(names)
+        if tuple(self.motion.options) != self._names:
+            self.motion.options = self._names
+        self.set(self.motion, chosen)
+        self.motion.visible = len(names) > 1
+
+    def show_course(self, losses: Sequence[float], parameters: Mapping[str, float]) -> None:
+        """The losses so far, and the parameters of the latest iteration."""
+        if not losses and not parameters:
+            return
+        if self._table is None:
+            with self.gui.add_folder("Optimisation", order=0):
+                self._table = self.gui.add_html("")
+        every = -(-max(1, len(losses)) // ROWS)
+        iterations = np.arange(len(losses), dtype=np.float64)[::every]
+        shown = np.asarray(losses, dtype=np.float64)[::every]
+        if len(shown) > 1:
+            self._show_curve(iterations, shown)
+        rows = {"iteration": f"{max(0, len(losses) - 1)}"} | ({"loss": f"{losses[-1]:.6g}"} if losses else {})
+        rows |= {name: f"{value:.6g}" for name, value in parameters.items()}
+        cells = "".join(f"<tr><td>{html.escape(n)}</td><td align='right'>{v}</td></tr>" for n, v in rows.items())
+        self._table.content = f"<table style='width:100%;padding:4px 12px;font-size:13px'>{cells}</table>"
+
+    def _show_curve(self, iterations: np.ndarray, losses: np.ndarray) -> None:
+        if self._chart is None:
+            self._label = "log10 of the loss" if (losses > 0).all() else "loss"
+        if self._label != "loss":
+            losses = np.log10(np.maximum(losses, 1e-300))
+        if self._chart is not None:
+            self._chart.data = (iterations, losses)
+            return
+        from viser import uplot
+
+        series = (uplot.Series(label="iteration"), uplot.Series(label=self._label, stroke="#2f6f9f", width=2))
+        scales = {"x": uplot.Scale(time=False)}
+        with self.gui.add_folder("Loss", order=0):
+            self._chart = self.gui.add_uplot((iterations, losses), series, scales=scales, aspect=1.6)
+
+
+def _within(value: float, low: float, high: float) -> float | None:
+    """The nearest value of a slider; None for NaN."""
+    return None if math.isnan(value) else min(max(value, low), high)
+
+
+def _among(value: str, known: Collection[str]) -> str | None:
+    return value if value in known else None
+
 
 TICK = 1 / 30  # [s] between two looks at the clock
 PAUSE = 0.1  # [s] at least between two shapes of an optimisation
@@ -119,7 +511,7 @@ class Viewer:
         those on a CUDA device are copied at most every 0.1 s, every 2 s when no browser shows the page.
 
         Args:
-            x: Positions [m], shape [V, 3], [N, V, 3] or [N, B, V, 3], or a dv.Trajectory; None: those of the latest
+            x: Positions [m], shape [V, 3], [N, V, 3] or [N, B, V, 3], or a dv.results.Trajectory; None: those of the latest
                 rollout inside :meth:`listening`, or as before.
             loss: A number or a tensor of one.
             parameters: Numbers or tensors of one to list.

@@ -11,7 +11,6 @@ from bench.__main__ import main
 
 CALLED = {  # operators that tell of a feature
     "coarse corrections": {"coarse_matrix"},
-    "acceleration": {"anderson_combine"},
     "rigid correction": {"rigid"},
     "floor with friction": {"contact_rigid_system"},
     "contact of bodies": {"contact_detect"},
@@ -24,10 +23,8 @@ CALLED = {  # operators that tell of a feature
 def test_a_plain_step_calls_two_operators_of_the_package() -> None:
     model, once = absent.scene(absent.Feature(), True, "cpu")
     assert absent.counted(once).own() == {"diffvbd::begin": 1, "diffvbd::sweep": 1}
-    kept = ("_moving", "_coarse_plan")  # of acceleration and coarse corrections
-    assert model.surface_of_contact is None and not any(hasattr(model, name) for name in kept)
-    assert all(hasattr(absent.scene(absent.FEATURES[f], True, "cpu")[0], name)
-               for f, name in zip(("acceleration", "coarse corrections"), kept, strict=True))  # fmt: skip
+    assert model.surface_of_contact is None and not hasattr(model, "_coarse_plan")
+    assert hasattr(absent.scene(absent.FEATURES["coarse corrections"], True, "cpu")[0], "_coarse_plan")
 
 
 @pytest.mark.parametrize("name", ["SDIRK2", "floor", "anchors", "coarse corrections"])

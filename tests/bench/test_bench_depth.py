@@ -10,7 +10,7 @@ import torch
 
 from bench import depth, paper
 from bench.__main__ import main
-from diffvbd.tasks import Settings, cube_bounce, solve
+from diffvbd.tasks import Settings, bounce, solve
 from diffvbd.testing import tolerance
 
 
@@ -46,14 +46,14 @@ def test_page_says_what_its_numbers_say() -> None:
 
 
 def test_throw_of_a_batch_moves_as_if_alone(tmp_path: Path) -> None:
-    scene = cube_bounce.scene(Settings(tmp_path), sweeps=5)
+    scene = bounce.scene(Settings(tmp_path), sweeps=5)
     batch = depth.Batch(scene, depth.first_states(1))
     batch.problem(2).stages[0].loss().backward()
-    problem = cube_bounce.problem(Settings(tmp_path), sweeps=5)
+    problem = bounce.cube_bounce(Settings(tmp_path), sweeps=5)
     problem.stages[0].loss().backward()
     alone = [problem.parameters[name] for name in ("offset", "velocity")]
-    norm = torch.nn.utils.clip_grad_norm_(alone, cube_bounce.CLIP)
-    assert norm > 1.05 * cube_bounce.CLIP
+    norm = torch.nn.utils.clip_grad_norm_(alone, bounce.CLIP)
+    assert norm > 1.05 * bounce.CLIP
     states = torch.stack([p.grad for p in alone if p.grad is not None])
     assert batch.states.grad is not None
     # clip_grad_norm_ adds 1e-6 to the norm
@@ -62,7 +62,7 @@ def test_throw_of_a_batch_moves_as_if_alone(tmp_path: Path) -> None:
 
 
 def test_best_state_of_each_throw_is_kept(tmp_path: Path) -> None:
-    scene = cube_bounce.scene(Settings(tmp_path), sweeps=5)
+    scene = bounce.scene(Settings(tmp_path), sweeps=5)
     batch = depth.Batch(scene, depth.first_states(1))
     history = solve(batch.problem(2), Settings(tmp_path)).history
     least = torch.tensor([min(row[f"distance {k}"] for row in history) for k in range(2)], dtype=torch.float64)
@@ -73,7 +73,7 @@ def test_best_state_of_each_throw_is_kept(tmp_path: Path) -> None:
 
 def test_first_states_are_relative(tmp_path: Path) -> None:
     own, *others = depth.first_states(8)
-    assert own[0].tolist() == [0.0, 0.0, 0.0] and tuple(own[1].tolist()) == cube_bounce.VELOCITY
+    assert own[0].tolist() == [0.0, 0.0, 0.0] and tuple(own[1].tolist()) == bounce.VELOCITY
     offsets, velocities = torch.stack(others).unbind(1)
     assert (offsets[:, [0, 2]] == 0).all() and (offsets[:, 1] != 0).all()
     spread = (velocities / own[1] - 1).std().item()

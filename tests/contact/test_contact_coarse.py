@@ -21,10 +21,9 @@ SPACE = dv.CoarseSpace(functions=6, groups=2, every=2)
 
 
 @functools.cache
-def corrected(name: str, window: int | None = None) -> Scene:
+def corrected(name: str) -> Scene:
     scene = SCENES[name]()
-    acceleration = None if window is None else dv.Anderson(window)
-    return replace(scene, model=rebuilt(scene.model, coarse=SPACE, acceleration=acceleration))
+    return replace(scene, model=rebuilt(scene.model, coarse=SPACE))
 
 
 def lengths_in(detections: list[Any]) -> list[Tensor]:
@@ -44,11 +43,11 @@ def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("steps", "sweeps", "window"), [(1, 7, None), slow(1, 9, 2), slow(3, 6, None)])
+@pytest.mark.parametrize(("steps", "sweeps"), [(1, 7), slow(1, 9), slow(3, 6)])
 @pytest.mark.parametrize("name", list(SCENES))
-def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, window: int | None,
+def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int,
                                                   device: str) -> None:  # fmt: skip
-    lengths = check(corrected(name, window), steps, sweeps, device)
+    lengths = check(corrected(name), steps, sweeps, device)
     assert (lengths == 1).any() or name in ("fast", "thrown")
 
 
@@ -88,7 +87,7 @@ def test_nearer_in_as_many_sweeps(build: Any) -> None:
 @pytest.mark.parametrize("name", ["fast", "crossed", "stacked"])
 def test_nothing_crosses(name: str) -> None:
     """Every step looks for intersections at its start."""
-    scene = corrected(name, 2)
+    scene = corrected(name)
     x, v, lengths = scene.x, scene.v, []
     for _ in range(12):
         with dv.debug_checks(), dv.contact.record() as found:
@@ -152,7 +151,7 @@ def test_gradients_of_the_rest_shape() -> None:
 
 
 def test_float32_is_near_float64() -> None:
-    model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
+    model, given = stack(coarse="auto")
     ends = []
     for dtype in (torch.float64, torch.float32):
         own = model.to(dtype=dtype)
@@ -184,7 +183,7 @@ def test_scenes_of_a_batch_do_not_mix(device: str) -> None:
 
 
 def test_checkpoints_and_threads_change_no_bit() -> None:
-    model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
+    model, given = stack(coarse="auto")
     x, found, threads = model.rest_points, [], torch.get_num_threads()
     try:
         for every, count in ((None, 1), (2, 2)):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from diffvbd.tasks import TASKS, Problem, Result, Settings, solve
-from diffvbd.tasks.progress import Row
+from diffvbd.tasks.problem import Row
 
 
 def quick(name: str, out: Path, **options: Any) -> tuple[Problem, Settings]:

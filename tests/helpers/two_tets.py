@@ -11,8 +11,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import reference
 from diffvbd.reference import distance
-from diffvbd.reference.layout import build_layout
-from diffvbd.reference.scene import build_scene
+from diffvbd.reference.scene import build_layout, build_scene
 from diffvbd.testing import generator
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])

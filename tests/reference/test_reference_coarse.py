@@ -16,9 +16,9 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import reference
 from diffvbd.model.coarse import CoarseSpace, build_coarse
-from diffvbd.reference import coarse, friction, rigid, sweep
-from diffvbd.reference.layout import build_layout
-from diffvbd.reference.scene import build_scene
+from diffvbd.reference import coarse, rigid, sweep
+from diffvbd.reference import energies as laws
+from diffvbd.reference.scene import build_layout, build_scene
 from diffvbd.testing import generator, relative_error, structured, tolerance
 
 NAMES = ("tets", "rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation")
@@ -199,7 +199,7 @@ def test_terms_add_up_to_the_energies() -> None:
     model.friction = dv.Friction(0.5)
     x = inputs_of(model)["x"]
     correction, scene = coarse_of(model, x)
-    energies = [*correction.energies, *friction.floor_friction(scene, correction.energies)]
+    energies = [*correction.energies, *laws.floor_friction(scene, correction.energies)]
     assert len(energies) == 4
     moved = x + 0.01 * torch.as_tensor(generator("terms").standard_normal(tuple(x.shape)))
     for energy in energies:

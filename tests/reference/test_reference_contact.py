@@ -16,9 +16,8 @@ import diffvbd as dv
 from diffvbd import reference
 from diffvbd.reference import distance
 from diffvbd.reference.contact import LaggedPairForces, PairBarrier, Pairs
-from diffvbd.reference.energies import build_energies
-from diffvbd.reference.friction import floor_friction
-from diffvbd.reference.layout import build_layout
+from diffvbd.reference.energies import build_energies, floor_friction
+from diffvbd.reference.scene import build_layout
 from diffvbd.testing import generator, relative_error, tolerance
 
 # --- two tets, a sphere, a capsule, a plane ---------------------------------------------------------------------------

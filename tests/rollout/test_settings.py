@@ -19,10 +19,10 @@ def beam() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
 
 def test_they_stand_for_the_arguments_that_they_name(beam) -> None:
     model, x, v = beam
-    settings = dv.Settings(0.011, 4, dv.SDIRK2(), relaxation=1.5, coarse="auto", acceleration=dv.Anderson(2))
+    settings = dv.Settings(0.011, 4, dv.SDIRK2(), relaxation=1.5, coarse="auto")
     mu = torch.tensor(1e5, dtype=torch.float64, requires_grad=True)
     end = dv.rollout(model, x, v, duration=DURATION, settings=settings, mu=mu, lam=1e5, save="last")
-    own = dv.Model(model.mesh, pinned=model.pinned, relaxation=1.5, coarse="auto", acceleration=dv.Anderson(2))
+    own = dv.Model(model.mesh, pinned=model.pinned, relaxation=1.5, coarse="auto")
     same = dv.rollout(own, x, v, steps=5, time_step=DURATION / 5, sweeps=4, integrator=dv.SDIRK2(), mu=mu, lam=1e5,
                       save="last")  # fmt: skip
     assert end.steps == [5]
@@ -110,7 +110,6 @@ def test_what_does_not_go_together_raises(beam, given, error, text) -> None:
         ({"relaxation": 2.0}, ValueError, "relaxation: expected a number in"),
         ({"relaxation": None}, TypeError, "relaxation: expected a number, got NoneType"),
         ({"coarse": "yes"}, TypeError, "coarse: expected a diffvbd.CoarseSpace"),
-        ({"acceleration": 5}, TypeError, "acceleration: expected a diffvbd.Anderson"),
         ({"dtype": "float64"}, ValueError, "dtype: expected torch.float64"),
         ({"checkpoint_every": 0}, ValueError, "checkpoint_every: expected an integer >= 1"),
         ({"checkpoint_every": "all"}, ValueError, 'checkpoint_every: expected "auto"'),

@@ -13,7 +13,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import testing
 from diffvbd.reference import sweep as reference
-from diffvbd.reference.potential import incremental_potential
+from diffvbd.reference.sweep import incremental_potential
 from diffvbd.testing import build_scene, evaluate, tolerance
 
 RADIUS, DHAT, MODULI = 0.1, 5e-3, {"young": 1e5, "poisson": 0.3}

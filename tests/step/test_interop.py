@@ -213,7 +213,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
     if policy == ops.FULL_TAPE:  # those that know no tape, once
         arguments |= coarse_arguments(device) | start_arguments(device)
-        arguments |= anderson_arguments(device)
+        arguments |= rise_arguments(device)
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
 
 
@@ -292,19 +292,17 @@ def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     }
 
 
-def anderson_arguments(device: str) -> dict[str, tuple[Any, ...]]:
-    """The same of Anderson's method, of which CUDA has the combination in torch."""
+def rise_arguments(device: str) -> dict[str, tuple[Any, ...]]:
+    """The same of the potentials of bodies."""
     mesh = dv.mesh.cube(3, size=0.3)
-    model = dv.Model(mesh, acceleration=dv.Anderson(), energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)),
-                     device=device)  # fmt: skip
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(-0.1), dv.PairBarrier())
+    model = dv.Model(mesh, energies=energies, device=device)
     moving, x = model._moving, model.rest_points[None].contiguous()
     material = x.new_full((1, *moving.tet.shape, 2), 1e4).transpose(-1, -2).contiguous()
     of = model._other_bodies.of
     given = (x, 1.1 * x, x, x, model.mass[None], model._energy_data, x.new_empty((0,)), material, moving.rest,
              moving.order, moving.ptr, of, moving.corner, moving.block_ptr)  # fmt: skip
-    states = torch.rand(2, 3, *x.shape, dtype=x.dtype)
-    combined = {"anderson_combine": (states, model._mass[None], moving.order, moving.ptr, 1e-6, 1e-14)}
-    return {"potential_rise": (*given, model._data_count, 0.3)} | (combined if device == "cpu" else {})
+    return {"potential_rise": (*given, model._data_count, 0.3)}
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:

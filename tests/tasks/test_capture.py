@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.tasks.capture import captured
+from diffvbd.tasks.runner import captured
 
 
 @pytest.mark.cuda

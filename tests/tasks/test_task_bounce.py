@@ -9,7 +9,7 @@ from helpers.task_checks import check_fall, check_gradient, quick
 
 from diffvbd import losses
 from diffvbd.cli import main
-from diffvbd.tasks import Settings, cube_bounce
+from diffvbd.tasks import Settings, bounce
 from diffvbd.testing import tolerance
 
 NAMES = ("cube-bounce", "bunny-bounce")
@@ -32,7 +32,7 @@ def test_gradient_matches_central_differences(name: str, tmp_path: Path) -> None
 
 
 def test_only_frames_from_the_first_contact_on_count(tmp_path: Path) -> None:
-    scene = cube_bounce.scene(Settings(tmp_path))
+    scene = bounce.scene(Settings(tmp_path))
     rest, center = scene.model.rest_points, losses.center_of_mass(scene.model.rest_points, scene.model.mass)
     bottom = rest[:, 1].min().item()
 
@@ -52,7 +52,7 @@ def test_only_frames_from_the_first_contact_on_count(tmp_path: Path) -> None:
 
 
 def test_scenes_of_a_batch_do_not_mix(tmp_path: Path) -> None:
-    scene = cube_bounce.scene(Settings(tmp_path))
+    scene = bounce.scene(Settings(tmp_path))
     offsets = torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.2, 0.0]], dtype=torch.float64)
     velocities = torch.tensor([[2.0, -1.0, 0.3], [1.5, -2.0, 0.5]], dtype=torch.float64, requires_grad=True)
     both = scene.squared_miss(offsets, velocities)
@@ -79,7 +79,7 @@ def test_sweeps_are_an_option_of_the_cube(tmp_path: Path, capsys: pytest.Capture
 def test_picture_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     settings = Settings(tmp_path, quick=True)
-    problem = cube_bounce.problem(settings)
+    problem = bounce.cube_bounce(settings)
     assert problem.picture is not None
     with torch.no_grad():
         problem.parameters["velocity"].add_(0.1)

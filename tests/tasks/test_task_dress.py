@@ -8,8 +8,8 @@ import torch
 from helpers.marks import slow
 from helpers.task_checks import check_fall, check_gradient
 
-from diffvbd.tasks import TASKS, Settings, dress, dress_mu_lam
-from diffvbd.tasks.dress_silhouette import SOFTNESS, profile
+from diffvbd.tasks import TASKS, Settings, dress
+from diffvbd.tasks.dress import SOFTNESS, profile
 from diffvbd.testing import tolerance
 
 HEIGHTS = torch.tensor([0.1, 0.4, 0.7], dtype=torch.float64)
@@ -33,7 +33,7 @@ def test_gradient_matches_central_differences(name: str, stage: int, tmp_path: P
 
 
 def test_stages_alternate_and_each_objective_moves_one_parameter(tmp_path: Path) -> None:
-    problem = dress_mu_lam.problem(Settings(tmp_path, quick=True))
+    problem = dress.dress_mu_lam(Settings(tmp_path, quick=True))
     first, *rest = problem.stages
     assert first.moves is None
     assert [stage.moves for stage in rest] == [("log_mu",), ("log_lam",)] * (len(rest) // 2)

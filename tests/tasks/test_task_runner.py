@@ -14,7 +14,7 @@ import torch
 from helpers.task_checks import timeless
 
 from diffvbd.tasks import Problem, Settings, Stage, solve, table
-from diffvbd.tasks.newton import Newton, lbfgs
+from diffvbd.tasks.optimizer import Newton, lbfgs
 from diffvbd.testing import tolerance
 
 CENTER = (0.5, -1.0)

@@ -10,7 +10,7 @@ import torch
 from helpers.task_checks import check_gradient, quick, timeless
 
 from diffvbd import losses
-from diffvbd.tasks import TASKS, Settings, beam_mu, solve, table
+from diffvbd.tasks import TASKS, Settings, beam, solve, table
 from diffvbd.testing import tolerance
 
 MATERIAL = sorted(name for name in TASKS if name.startswith("beam"))
@@ -35,7 +35,7 @@ def test_gradient_at_the_start_matches_central_differences(name: str, tmp_path: 
 
 def test_log_and_picture_are_written(tmp_path: Path) -> None:
     settings = Settings(tmp_path, quick=True)
-    result = solve(beam_mu.problem(settings), settings)
+    result = solve(beam.beam_mu(settings), settings)
     log = json.loads((tmp_path / "log.json").read_text())
     assert {"diffvbd", "torch", "numpy", "python"} <= set(log["versions"])
     assert log["settings"]["seed"] == 0
@@ -95,7 +95,7 @@ def test_a_loss_that_is_not_finite_is_reported(tmp_path: Path) -> None:
 
 def test_twist_turns_the_free_end_and_keeps_the_clamped_one() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 2.0], [4.0, 0.0, 0.0], [4.0, 2.0, 2.0]], dtype=torch.float64)
-    turned = beam_mu.twisted(points, torch.pi)
+    turned = beam.twisted(points, torch.pi)
     expected = points[[0, 1, 3, 2]].clone()
     expected[2:, 0] = 4.0
     torch.testing.assert_close(turned, expected, rtol=0, atol=tolerance("formula"))

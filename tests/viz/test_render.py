@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import diffvbd as dv
-from diffvbd.viz import surfaces
+from diffvbd.viz import motion
 from diffvbd.viz.values import BODY_COLORS, rgb
 
 MESH = dv.mesh.join([dv.mesh.cube(2, 0.2), dv.mesh.cube(2, 0.2).translate((0.3, 0.1, 0.0))])
@@ -68,9 +68,9 @@ def test_what_cannot_be_drawn_is_refused(arguments: dict[str, Any], expected: st
 
 
 def test_parts_of_surfaces() -> None:
-    labels = surfaces.bodies(MESH.surface, MESH.num_vertices)
+    labels = motion.bodies(MESH.surface, MESH.num_vertices)
     assert np.array_equal(labels, np.where(MESH.body == 0, 0, 8))
-    sides = surfaces.smooth_parts(MESH.points, MESH.surface)
+    sides = motion.smooth_parts(MESH.points, MESH.surface)
     assert np.array_equal(np.unique(sides, return_counts=True)[1], [2] * 12)  # of two triangles each
     ball = dv.mesh.capsule(0.1, 0.0, resolution=6)
-    assert len(np.unique(surfaces.smooth_parts(ball.points, ball.surface))) == 1
+    assert len(np.unique(motion.smooth_parts(ball.points, ball.surface))) == 1

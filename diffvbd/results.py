@@ -1,0 +1,29 @@
+"""Records that functions of the package return."""
+
+from .inspect.diagnose import Diagnosis
+from .inspect.forces import Stress
+from .inspect.gradcheck import GradientCheck
+from .rollout.refine import GradientTest, Refinement
+from .rollout.solve import Solution
+from .rollout.trajectory import Trajectory
+from .rollout.tune import Candidate, ErrorBudget, Prediction, Share
+from .step.integrators import History
+from .step.residual import ErrorEstimate
+from .step.step import Tape
+
+__all__ = [
+    "Candidate",
+    "Diagnosis",
+    "ErrorBudget",
+    "ErrorEstimate",
+    "GradientCheck",
+    "GradientTest",
+    "History",
+    "Prediction",
+    "Refinement",
+    "Share",
+    "Solution",
+    "Stress",
+    "Tape",
+    "Trajectory",
+]

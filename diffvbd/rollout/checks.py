@@ -1,0 +1,501 @@
+"""Checks: what a rollout looks at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import check_bool
+from ..energies import Anchor
+from ..mask import ELASTIC
+from ..model.material import rest_metric
+from ..model.model import Model
+from ..model.solver import Integrator
+from ..model.system import System
+from ..model.warnings import warn_of_bending
+from ..ops import SweepSettings
+from ..said import is_silent, page, percent, warn
+from ..scopes import is_captured, looks_at, may_copy
+from ..step.arguments import Prepared, acceleration_of, collider_state
+from ..step.contact_cycles import CUT
+from ..step.integrators import Solve
+from ..step.met import outcomes
+from ..step.predict import begin, energy_data
+from ..step.residual import (
+    UNBALANCED_FRICTION,
+    Unsolved,
+    check_estimable,
+    contact_of_step,
+    friction_left_over,
+    potential_of_step,
+    unsolved,
+    what_helps,
+)
+from ..step.stability import FAR, fault_of, reach_of, size_of
+from ..tuples import replaced
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What a rollout looks at and warns (UserWarning) of, each time, in one sentence that says what to do.
+
+    A rollout that ends with what is not finite, or too far away, always warns.
+
+    Args:
+        start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or vertices
+            behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs a quarter of
+            one detection or less on the CPU and, on CUDA, waits for the device once. Under torch.compile, and while a
+            CUDA graph is captured, nothing is checked: run the rollout once before the capture. On the CPU it also
+            warns where all tets of a body are inverted.
+        energy: Whether to warn where a scene that only gravity drives has 5 % more energy (where barriers push at the
+            start, twice as much) than it began with and gravity gave it; where, without pairs, the sweeps leave the
+            motion off by an estimated 2 %; where thin tets bend. True: energy after any step. None: on the CPU, of ten
+            steps or more, after six of them, most of them early (with a floor 12, with contact up to 64).
+        contact: Whether to warn where pairs truncated the motion of more than 1 % of vertices in a step, or the last
+            one left more than 5 % of what friction can bear unbalanced. None: on the CPU, after ten steps or more. A
+            look costs about a step and on CUDA waits for the device; nothing that is compiled or captured is looked at.
+        errors: Also return how far from converged each step ends (:class:`diffvbd.results.ErrorEstimate`). Each step is
+            swept twice for it, the second time without a tape, once under every schedule; states and gradients are the
+            same.
+
+    Raises:
+        TypeError: What is no bool (or, for energy and contact, None).
+    """
+
+    start: bool = True
+    energy: bool | None = None
+    contact: bool | None = None
+    errors: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("start", "errors"):
+            check_bool(name, getattr(self, name))
+        for name in ("energy", "contact"):
+            if not isinstance(getattr(self, name), bool | None):
+                raise TypeError(f"{name}: expected a bool or None, got {type(getattr(self, name)).__name__}")
+
+
+NONE = Checks(start=False, energy=False, contact=False)
+
+
+def check_checks(checks: Any, model: Any) -> Checks:
+    """The checks of a rollout; None stands for the default ones."""
+    if checks is None:
+        return Checks()
+    if not isinstance(checks, Checks):
+        raise TypeError(f"checks: expected a diffvbd.Checks or None, got {type(checks).__name__}")
+    if checks.errors and isinstance(model, Model):
+        check_estimable(model, "errors")
+    return checks
+
+
+# --- what every rollout says of its end -------------------------------------------------------------------------------
+
+WRONG = 0.02  # of the motion: an estimate above it is warned of; impacts were off by two to five times as much
+MADE_GOOD = 2.5  # with coarse corrections the next steps make good most of an error: it was 1 / 2.4 to 1 / 40 as large
+UNSEEN = 1e-6  # of the Model's size: by less nothing is wrong
+LEAST_STEPS = 10  # of a rollout that is looked at unasked: a look costs as much as some steps
+EVERY, MOST = 75, 4  # steps between two looks, and looks at most, beside that at the hardest step
+ENDED = "ended"  # of a Model's _derived, on CUDA: how its latest rollouts ended, on the way to the host
+
+
+@dataclass
+class EndLook:
+    """Looks at some steps of a rollout, the last among them, and the one in which forces did most.
+
+    A share e of what forces do in a step is left out by its sweeps, or comes on top of it. Over a time T it moves the
+    end by e a T^2 / 2, where a is the acceleration, and a vibration of frequency w out of its phase by e w T / 2; with
+    w^2 = a over the way the two are the same estimate, of the motion's relative error.
+    """
+
+    model: System
+    integrator: Integrator
+    start: tuple[Tensor, ...]  # positions and velocities
+    steps: int
+    time_step: float
+    asked: bool  # whether to look at more than whether the end is lost
+    at: frozenset[int]  # steps whose sweeps are looked at
+    kept: dict[int, tuple[Solve, Tensor]] = field(default_factory=dict)
+    hardest: tuple[int, float] = (0, 0.0)  # a step, and by how much its velocities changed, root sum of squares
+    forced: float = 0.0  # sum of the squares of that
+    seen: int = 0
+    last: tuple[Prepared, Tensor, Any] | None = None  # of the latest step: arguments, velocities before it, force
+
+    def see(self, step: int, prepared: Prepared, force: Any, solve: Solve, before: Tensor, x: Tensor, v: Tensor
+            ) -> None:  # fmt: skip
+        """After a step from velocities ``before``; one that runs again is not seen twice."""
+        if step <= self.seen:
+            return
+        self.seen, self.last = step, (prepared, before, force)
+        if not self.at:
+            return
+        change = float(torch.dist(v.detach(), before.detach()))
+        self.forced += change * change
+        harder = change > self.hardest[1]
+        if not harder and step not in self.at:
+            return
+        given = {k: t.detach() if isinstance(t, Tensor) else t for k, t in solve.given.items()}
+        if harder and self.hardest[0] not in self.at:
+            self.kept.pop(self.hardest[0], None)
+        if harder:
+            self.hardest = (step, change)
+        self.kept[step] = (replaced(solve, x=solve.x.detach(), v=solve.v.detach(), given=given), x.detach())
+
+    def warn(self, x: Tensor, v: Tensor, gravity: Any) -> None:
+        """Warns (UserWarning) of the end of a rollout."""
+        model, duration = self.model, self.steps * self.time_step
+        with torch.no_grad():
+            reach = reach_of(model, self.start, x, gravity, duration)
+            good = torch.stack([torch.isfinite(x).all() & torch.isfinite(v).all(), reach <= FAR])
+        if not looks_at(x) and not self.asked:
+            _say_later(model, good)
+            return
+        finite, near = good.tolist()
+        if not (finite and near):
+            _warn_of_loss("the rollout", finite, self.fault())
+            return
+        if self.at:
+            self._warn_of_sweeps(duration)
+        if self.asked:
+            warn_of_bending(model, x)
+
+    def forget(self) -> None:
+        """Lets go of tensors, which a segment that runs again in a backward would keep."""
+        self.kept, self.last, self.start = {}, None, ()
+
+    def fault(self) -> str:
+        """What is at fault where the state that the latest step has left is lost."""
+        if self.last is None or not looks_at(self.last[1]):
+            return "take a smaller time_step, more sweeps, or float64"
+        return fault_of(self.model, self.last[0], self.integrator, *self.last[1:])
+
+    def explain(self, error: Exception, x: Tensor, v: Tensor) -> str:
+        """The end of a message of a step that refuses the state that earlier ones have left."""
+        if self.last is None or not str(error).startswith(("x:", "v:", "x, v:")) or not looks_at(x):
+            return ""
+        largest = float(torch.stack([(x - self.start[0]).abs().amax(), v.abs().amax()]).amax())
+        if largest <= FAR * size_of(self.model):
+            return ""
+        return f", which the steps before made; {self.fault()}"
+
+    def _warn_of_sweeps(self, duration: float) -> None:
+        known: dict[tuple[int, int], np.ndarray] = {}
+        found: list[Unsolved] = []
+        way = 0.0
+        for solve, x in self.kept.values():
+            if (one := unsolved(self.model, solve, x, known)) is not None:
+                found.append(one)
+            way = max(way, float(torch.dist(x, self.start[0].detach())))
+        forced = math.fsum(u.forced**2 for u in found)
+        left = math.fsum(u.error**2 for u in found)
+        if not left > 0:
+            return
+        share = math.sqrt(left / forced) if forced > 0 else math.inf
+        acceleration = math.sqrt(self.forced / self.steps) / self.time_step
+        error = share * max(1.0, 0.5 * duration * math.sqrt(acceleration / way) if way > 0 else 1.0)
+        error /= 1.0 if self.model.coarse is None else MADE_GOOD
+        distance = max(
+            self.steps * math.sqrt(left / len(found)), error * way / math.sqrt(self.start[0][..., 0].numel())
+        )
+        if not (error > WRONG and distance > UNSEEN * size_of(self.model)):
+            return
+        worst = max(found, key=lambda u: u.error)
+        of = f", worst in body {worst.body}" if int(self.model.body.max()) else ""
+        of += f" of scene {worst.scene}" if worst.scene else ""
+        faster = "" if self.model.coarse is not None else ', subspace="coarse"'
+        warn(
+            f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
+            f"take more sweeps{faster} or a smaller time_step, and compare; " + page("numerics.md")
+        )
+
+
+def look_at_end(asked: bool | None, model: System, integrator: Integrator, x: Tensor, v: Tensor, steps: int,
+                settings: SweepSettings) -> EndLook | None:  # fmt: skip
+    """A look at a rollout; None where nothing may be looked at."""
+    if steps == 0 or x.numel() == 0 or is_silent() or not (looks_at(x) or may_copy(x)):
+        return None
+    looked = asked is not False and (asked or (not x.is_cuda and steps >= LEAST_STEPS))
+    looked = bool(looked and settings.sweeps and model.num_active and model.energy_mask & ELASTIC)
+    count = 0 if not looked or model.contact is not None else max(1, min(MOST, steps // EVERY))
+    at = frozenset(round(steps * k / count) for k in range(1, count + 1))
+    return EndLook(model, integrator, (x, v), steps, settings.numbers.time_step, looked, at)
+
+
+# --- on CUDA, where looking waits for the device ----------------------------------------------------------------------
+
+
+def _say_later(model: System, good: Tensor) -> None:
+    """Copies an answer to the host meanwhile; the Model's next rollout that finds it there says what it was."""
+    said = torch.empty(2, dtype=torch.bool, pin_memory=True)
+    said.copy_(good, non_blocking=True)
+    done = torch.cuda.Event()
+    done.record(torch.cuda.current_stream(good.device))
+    model._derived.setdefault(ENDED, []).append((said, done))
+
+
+def warn_of_last_end(model: System, x: Tensor) -> None:
+    """Warns of the Model's rollouts before this one, on CUDA, as far as they are done."""
+    if not model._derived.get(ENDED) or not may_copy(x):
+        return
+    ends = [(said, done.query()) for said, done in model._derived[ENDED]]
+    model._derived[ENDED] = [end for end, (_, there) in zip(model._derived[ENDED], ends, strict=True) if not there]
+    for said, there in ends:
+        if there and not bool(said.all()):
+            _warn_of_loss(
+                "a rollout of this Model before this one",
+                bool(said[0]),
+                "take a smaller time_step, more sweeps, or float64",
+            )
+            return
+
+
+def _warn_of_loss(which: str, finite: bool, fault: str) -> None:
+    how = f"vertices more than {FAR:g} body sizes from where motion and gravity would have taken them"
+    if not finite:
+        how = "positions or velocities that are not finite"
+    warn(f"x: {which} ended with {how}: {fault}; dv.debug_checks() says in which step what is not finite began; "
+         + page("numerics.md"))  # fmt: skip
+
+
+# --- what a rollout says of its energy --------------------------------------------------------------------------------
+
+GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
+GAIN_PRESSED = 1.0  # the same where barriers push at the start: what they hold comes in
+MANY = 100.0  # times as much as there was: then the gain is said in J, since there may have been next to nothing
+LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 6, 12, 64  # at a rollout, unasked
+CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
+ROUNDING = 64.0  # times the energy of strains that are rounding
+
+
+# What of the tets, chunk by chunk, no look changes: mu, lam, rest scalars [7, 1 | B, t] and corners [4, t].
+_Chunk = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _elastic_of(model: System, prepared: Prepared) -> Iterator[_Chunk]:
+    chunk = max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
+    for first in range(0, model.num_tets, chunk):
+        rows = slice(first, first + chunk)
+        mu, lam = (m[:, rows].double() if m.shape[1] > 1 else m.double() for m in (prepared.mu, prepared.lam))
+        rest = _rest_of(model, prepared, rows).double().movedim(-1, 0).contiguous()
+        yield mu, lam, rest, model.tets[rows].T.contiguous()
+
+
+@dataclass
+class EnergyLook:
+    """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps, [B] each."""
+
+    model: System
+    prepared: Prepared
+    gravity: Tensor
+    start: Tensor
+    had: Tensor  # at the start: kinetic and elastic energy, and what gravity does over the scene's length [J]
+    at: frozenset[int]  # numbers of steps that are looked at, the first among them
+    elastic: list[_Chunk] | None
+    pressed: Tensor  # scenes in which barriers push at the start, bool [B]; of pairs known after a step
+    found: dict[int, Tensor] = field(default_factory=dict)
+
+    def see(self, step: int, x: Tensor, v: Tensor) -> None:
+        """After a step; one that runs again is not seen twice."""
+        if step in self.at and step not in self.found:
+            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+                if not self.found and self.model.contact is not None and self.model.model in outcomes:
+                    self.pressed = self.pressed | (outcomes[self.model.model].smallest[0] < self.model.contact.dhat)
+                energy = mechanical_energy(self.model, self.prepared, x.detach(), v.detach(), self.elastic)
+                way = (x.detach().double() - self.start.double()) * self.gravity.double()
+                mass = _free_mass(self.model, self.prepared)
+                fallen = (mass * way.sum(-1).reshape(-1, mass.shape[-1])).sum(-1)  # what gravity has done [J]
+                self.found[step] = torch.stack([energy, fallen])
+
+    def warn(self) -> None:
+        """Warns (UserWarning) of a gain."""
+        energy, fallen = torch.stack(list(self.found.values())).unbind(1)  # [looks, B]
+        begun, room = self.had[:2]
+        gain = (energy - begun - fallen) / (begun + room + fallen.abs().amax(0)).clamp(min=math.ulp(0.0))
+        past = gain - torch.where(self.pressed, GAIN_PRESSED, GAIN)
+        if not float(past.max()) > 0:
+            return
+        look, scene = divmod(int(past.argmax()), gain.shape[-1])
+        most, all_of = float(gain[look, scene]), float((begun + room + fallen.abs().amax(0))[scene])
+        size = f"{percent(most)} of the energy that it had and that gravity gave it"
+        if most > MANY:
+            size = f"{most * all_of:.3g} J, where it had and gravity gave it {all_of:.3g} J"
+        of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
+        faster = "" if self.model.coarse is not None else ', subspace="coarse"'
+        pressed = ""
+        if bool(self.pressed[scene]):
+            pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
+            pressed += "farther apart, or take a smaller dhat"
+        warn(
+            f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
+            f"{pressed}; take more sweeps{faster} or a smaller time_step; " + page("numerics.md"),
+        )
+
+
+def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
+                   gravity: Any) -> EnergyLook | None:  # fmt: skip
+    """A look at a rollout of so many steps that nothing but gravity drives, or None where nobody asks for one.
+
+    prepared: Arguments that all steps share; None: there are none, and nothing is looked at.
+    """
+    if (
+        asked is False
+        or is_silent()
+        or steps == 0
+        or x.numel() == 0
+        or prepared is None
+        or not model.energy_mask & ELASTIC
+    ):
+        return None
+    if any(isinstance(e, Anchor) for e in model.energies):  # springs
+        return None
+    if asked is None:
+        if x.is_cuda or not looks_at(x) or steps < LEAST_STEPS:
+            return None
+    if not looks_at(x) and not may_copy(x):
+        return None
+    given = (x, v, prepared.mu, prepared.lam, prepared.mass)
+    taped = torch.is_grad_enabled() and any(t.requires_grad for t in given)
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        start, pull = x.detach(), acceleration_of(gravity, x).detach()
+        size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1).reshape(-1)  # [B]
+        room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
+        elastic = None if taped else list(_elastic_of(model, prepared))  # a tape should be all that a rollout keeps
+        begun = mechanical_energy(model, prepared, start, v.detach(), elastic)
+        had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])
+        pressed = torch.zeros_like(begun, dtype=torch.bool)
+        if model.floor is not None:
+            planes = energy_data(model, prepared, None)[:, : model.floor.count()]
+            gap, _, _, dhat = model.floor.gaps(start.reshape(-1, *start.shape[-2:]), planes, None)
+            pressed = pressed | (gap < dhat).flatten(1).any(-1)
+        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps), elastic, pressed)
+
+
+def _looked_at(asked: bool | None, model: System, steps: int) -> frozenset[int]:
+    """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
+    many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
+    meets = model.touches or model.floor is not None
+    looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
+    count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
+    return frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
+
+
+def _free_mass(model: System, prepared: Prepared) -> Tensor:
+    """Mass of what can move [kg], float64 [1 | B, V]."""
+    return torch.where(model._pinned, 0.0, prepared.mass.double())
+
+
+def mechanical_energy(model: System, prepared: Prepared, x: Tensor, v: Tensor, elastic: list[_Chunk] | None = None
+                      ) -> Tensor:  # fmt: skip
+    """Kinetic and elastic energy of each scene [J], float64 [B]; the rest shape has none of the latter.
+
+    With the rest scalars k_ab and c6 of docs/method.md, section 2, E = -mu/2 sum_ab k_ab |x_a - x_b|^2
+    + V [(mu + lam)/2 (J - 1)^2 - mu (J - 1) - 3/2 mu], J = c6 det(x_1 - x_0, x_2 - x_0, x_3 - x_0), V = 1/(6 c6).
+    """
+    x, v = (t.reshape(-1, *t.shape[-2:]).double() for t in (x, v))
+    moving = 0.5 * (_free_mass(model, prepared) * v.square().sum(-1)).sum(-1)
+    total, rows = torch.zeros_like(moving), x.permute(2, 0, 1).contiguous()  # [3, B, V]
+    for mu, lam, rest, tets in _elastic_of(model, prepared) if elastic is None else elastic:
+        corners = rows[:, :, tets].transpose(1, 2)  # [3, 4, B, t]: long rows are quick
+        edges = corners[:, 1:] - corners[:, :1]
+        others = edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]  # from 1 and 2 to 2 and 3
+        shear = -(rest[:6] * torch.cat([edges, others], 1).square_().sum(0)).sum(0)
+        c6 = rest[6]
+        change = c6 * (edges[:, 0] * torch.linalg.cross(edges[:, 1], edges[:, 2], dim=0)).sum(0) - 1
+        volume = 1 / (6 * c6)
+        density = 0.5 * mu * (shear - 3 * volume) + volume * (0.5 * (mu + lam) * change.square() - mu * change)
+        total = total + density.sum(-1)
+    return moving + total
+
+
+def _rest_of(model: System, prepared: Prepared, rows: slice) -> Tensor:
+    """Rest scalars of some tets, [1 | B, t, 7]. A Model that does not keep them is not made to."""
+    if prepared.rest is not None:
+        return prepared.rest[:, rows]
+    if "rest" in model.model._derived:
+        return model.rest_scalars[:, rows]
+    return rest_metric(model._rest_points[None, model.tets[rows]])[0]
+
+
+def _rounding(model: System, prepared: Prepared, x: Tensor) -> Tensor:
+    """Elastic energy of strains that rounding of the positions makes [J], float64 [1 | B]."""
+    volume = torch.tensor(model.mesh.volume, device=x.device)
+    strain = torch.finfo(x.dtype).eps * x.abs().amax().double() / volume.pow(1 / 3)
+    modulus = prepared.lam.double() + 2 * prepared.mu.double()
+    return ROUNDING * (volume * modulus * (strain.square() + torch.finfo(torch.float64).eps)).sum(-1)
+
+
+# --- what a rollout says of its contact -------------------------------------------------------------------------------
+
+
+def checks_contact(asked: bool | None, model: System, x: Tensor, steps: int) -> bool:
+    """Whether a rollout of so many steps ends with a look at its contact. A look reads values: never in what is
+    compiled, transformed or captured, and on CUDA, where it waits for the device, only where it is asked for."""
+    if asked is False or not model.touches or steps == 0 or x.numel() == 0 or torch.compiler.is_compiling():
+        return False
+    if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return False
+    if asked:
+        return not is_captured(x)
+    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and not is_silent()
+
+
+def unbalanced_friction(model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
+                        given: dict[str, Any]) -> float:  # fmt: skip
+    """What a step left unbalanced along the contact of a body, over the most that friction can bear there [-], the
+    largest; 0 where it cannot be told.
+
+    Args:
+        before: State (x, v) before the step.  x: Positions after it.  given: Its other arguments, as of advance().
+    """
+    if model.friction is None:
+        return 0.0
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        x0, v0, x = (t.detach() for t in (*before, x))
+        begun = begin(model, x0, v0, prepared, given["force"], acceleration_of(given["gravity"], x0),
+                      given["prescribed"]).detached()  # fmt: skip
+        where = collider_state(model, x0, given["colliders"], given.get("colliders_before"))
+        end = x.reshape(begun.y.shape)
+        end = end if begun.origin is None else end - begun.origin
+        try:
+            contact = contact_of_step(model, begun, prepared, where)
+            return float(friction_left_over(potential_of_step(model, end, begun, prepared, contact)).max())
+        except ValueError:  # a state that is lost; the next step says why
+            return 0.0
+
+
+def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
+                    given: dict[str, Any]) -> None:  # fmt: skip
+    """Warns (UserWarning) of the steps of a rollout.
+
+    cuts: cut_share() after each step. The others: of the last step, as above.
+    """
+    shares = torch.stack(cuts).tolist()
+    cut = max(shares)
+    left = unbalanced_friction(model, before, x, prepared, given)
+    if cut > CUT:
+        warn(
+            f"contact: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
+            f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
+            f"{percent(CUT)}); " + what_helps(model),
+        )
+    if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
+        faster = ' subspace="coarse",' if model.coarse is None else ""
+        warn(
+            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
+            f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
+            "smaller time_step or a larger Friction(velocity=); " + page("contact.md"),
+        )
+
+
+def _matters(
+    model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]
+) -> bool:
+    """Whether what a step has left unbalanced would have moved a body, beside what forces do in a step."""
+    found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
+    return found is not None and found.error > UNBALANCED_FRICTION * found.forced

@@ -1,0 +1,290 @@
+"""Whether steps let vibrations of a body grow, from one step to the next, measured on the Model's own mesh at rest.
+
+A vibration far shorter than a step should be gone after it. K sweeps leave a share of it, of either sign, and the next
+step extrapolates from that: with too few sweeps, of slivers above all, it grows. So the step itself is asked: noise
+that is far too small to bend anything goes through some steps about the rest shape, without loads. Steps that are
+solved never add to its energy, kinetic and elastic, and what steps amplify soon is all that is left of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..adjoint.potential import IncrementalPotential
+from ..energies import StableNeoHookean
+from ..mask import EXACT_BLOCK
+from ..mesh import TetMesh
+from ..model.model import Model
+from ..model.solver import Integrator
+from ..model.system import System, system_of
+from ..model.warnings import height_of_tets, warn_of_over_relaxation, warn_of_thin_tets, warn_of_units
+from ..ops import broadcast
+from ..said import is_silent, page, silence, warn
+from ..scopes import looks_at, unheard
+from ..tuples import replaced
+from .advance import advance
+from .arguments import Prepared, acceleration_of, material_of, prepare
+from .integrators import take
+from .predict import begin
+
+GROWS = 1.02  # times in a step: a hundred steps make seven of it
+BURN, STEPS = 8, 24  # steps in which what is damped goes; all steps
+MORE = 16  # what seems to grow is looked at for so many more
+NOISE = 1e-6  # displacements over the size of the body
+GONE = 1e-24  # of the energy: nothing is left that could grow
+MOST_TETS = 4000  # of a larger mesh the part about its stiffest tet is measured: what grows is rough, and local
+MOST_SWEEPS = 100  # of more it is not doubted
+SOFT = 0.2  # elements that a pressure wave crosses in a step, below which inertia does the work
+ALIKE = 8  # moduli that differ by less than 2^(1/8) are measured once
+CALMER = (1.7, 1.5, 1.3, 1.0)  # relaxations that are tried for a message
+EIGENVALUES = "growth at rest"  # of a Model's _derived: what was measured, by the arguments
+
+_proven: ContextVar[bool] = ContextVar("diffvbd.proven", default=False)
+
+
+@contextlib.contextmanager
+def proven() -> Iterator[None]:
+    """Inside, it is not doubted that vibrations stay small: a pilot run with these settings has ended well."""
+    token = _proven.set(True)
+    try:
+        yield
+    finally:
+        _proven.reset(token)
+
+
+class _Part(NamedTuple):
+    """What is measured of a Model: another one, elastic and on the CPU in float64, and which tets it has."""
+
+    model: System
+    tets: np.ndarray | None  # rows of the Model's; None: all
+
+
+def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) -> None:
+    """Warns (UserWarning) where the sweeps of steps are too few for a mesh and its material. On CUDA, where moduli
+    would be waited for, they are not looked at outside debug_checks()."""
+    if not (looks_at(prepared.mu) and looks_at(prepared.lam)) or is_silent():
+        return
+    h, sweeps = prepared.time_step_and_sweeps
+    if not sweeps or not model.num_tets:
+        return
+    warn_of_units(model, prepared.mu, prepared.lam, h)
+    warn_of_thin_tets(model, prepared.mu, prepared.lam, h, sweeps)
+    if warn_of_over_relaxation(model, prepared.mu, prepared.lam) or _proven.get():
+        return
+    if message := growth_message(model, prepared, integrator):
+        warn(message)
+
+
+def growth_message(model: System, prepared: Prepared, integrator: Integrator) -> str:
+    """What there is to say of steps that amplify vibrations; measured once for such arguments. Moduli are read."""
+    h, sweeps = prepared.time_step_and_sweeps
+    if not (0 < sweeps <= MOST_SWEEPS and model.num_tets and model.num_active):
+        return ""
+    if not any(isinstance(e, StableNeoHookean) for e in model.energies):
+        return ""
+    mu, lam = (m.detach().cpu() for m in (prepared.mu, prepared.lam))
+    if not (mu.numel() and lam.numel()):
+        return ""
+    key = (type(integrator).__name__, h, sweeps, *_mark(mu), *_mark(lam))
+    known = model._derived.setdefault(EIGENVALUES, {})
+    if key not in known:
+        with torch.no_grad(), torch.autocast("cpu", enabled=False), torch.inference_mode(False), unheard():
+            known[key] = _message(model, mu.double(), lam.double(), h, sweeps, integrator)
+    return known[key]
+
+
+def _mark(modulus: Tensor) -> tuple[float, ...]:
+    """What tells moduli apart, roughly."""
+    values = modulus.detach()
+    numbers = [values.item()] if values.numel() == 1 else [*torch.stack([*values.aminmax(), values.mean()]).tolist()]
+    return tuple(round(ALIKE * math.log2(abs(n))) if 0 < abs(n) < math.inf else 0.0 for n in numbers)
+
+
+def _message(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, integrator: Integrator) -> str:
+    if not bool((mu > 0).all() and (mu + lam > 0).all() and torch.isfinite(mu + lam).all()):  # perhaps refused later
+        return ""
+    crossed = _crossed(model, mu, lam, h)
+    if not float(crossed.max()) > SOFT:
+        return ""
+    # of many scenes those with the stiffest and the least compressible tet
+    scenes = sorted({int((lam + 2 * mu).amax(-1).argmax()), int((lam / mu).amax(-1).argmax())})
+    mu, lam = (m if len(m) == 1 else m[scenes] for m in (mu, lam))
+    part = _part_of(model, crossed)
+    mu, lam = (m if part.tets is None or m.shape[-1] == 1 else m[:, part.tets] for m in (mu, lam))
+    measure = partial(growth, mu=mu, lam=lam, time_step=h, integrator=integrator)
+    found = measure(part.model, sweeps=sweeps)
+    if not found > GROWS:
+        return ""
+    take_these = []
+    needed = sweeps
+    while needed < MOST_SWEEPS:
+        needed = min(MOST_SWEEPS, math.ceil(1.25 * needed))
+        if measure(part.model, sweeps=needed) <= 1:
+            take_these.append(f"{needed} sweeps")
+            break
+    calmer = (r for r in CALMER if r < model.relaxation)
+    take_these += [f"relaxation={r:g}" for r in calmer if measure(part.model, sweeps=sweeps, relaxation=r) <= 1][:1]
+    corrects = model.coarse is None and model.saturation is None and model.energy_mask & EXACT_BLOCK
+    if corrects and measure(part.model.with_solver(subspace="coarse"), sweeps=sweeps) <= 1:
+        take_these.append('subspace="coarse"')
+    advice = f"{', '.join(take_these)} or a shorter time step" if take_these else "a shorter time step"
+    return (
+        f"sweeps: {sweeps} with {type(integrator).__name__}(), relaxation={model.relaxation:g} and time_step = {h:.3g} "
+        f"s let vibrations of this mesh grow {found:.2f} times in every step; take {advice}; " + page("numerics.md")
+    )
+
+
+def _crossed(model: System, mu: Tensor, lam: Tensor, h: float) -> Tensor:
+    """How many of each tet a pressure wave crosses in a step, where most [T]."""
+    speed = ((lam + 2 * mu).amax(0) / model._density.double().cpu()).clamp(min=0).sqrt()
+    return h * speed / torch.from_numpy(height_of_tets(model))
+
+
+def _part_of(model: System, crossed: Tensor) -> _Part:
+    plain = model.dtype == torch.float64 and model.device.type == "cpu" and len(model.energies) == 1
+    if model.num_tets <= MOST_TETS:
+        if plain:
+            return _Part(model, None)
+        return _Part(model.derived("elastic", lambda: _elastic(model, model.mesh, model._pinned.cpu(), None)), None)
+    worst = int(crossed.argmax())
+
+    def build() -> _Part:
+        points, tets = model.mesh.points, model.mesh.tets
+        away = np.square(points[tets].mean(1) - points[tets[worst]].mean(0)).sum(-1)
+        rows = np.sort(np.argpartition(away, MOST_TETS)[:MOST_TETS])
+        used, corners = np.unique(tets[rows], return_inverse=True)
+        outside = np.ones(len(tets), dtype=bool)
+        outside[rows] = False
+        held = model._pinned.cpu().numpy().copy()
+        held[tets[outside]] = True
+        mesh = TetMesh(points[used], corners.reshape(-1, 4))
+        return _Part(_elastic(model, mesh, torch.from_numpy(held[used]), rows), rows)
+
+    return model.derived(f"elastic about {worst}", build)
+
+
+def _elastic(model: System, mesh: TetMesh, pinned: Tensor, rows: np.ndarray | None) -> System:
+    density = model._density.cpu()
+    with silence():  # nobody has made this one
+        own = Model(mesh, density if rows is None else density[rows], pinned, (StableNeoHookean(),))
+    return system_of(own, model.solver)
+
+
+def growth(model: System, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, integrator: Integrator,
+           relaxation: float | None = None) -> float:  # fmt: skip
+    """How many times noise about the rest shape has grown in a step, after some steps [-], the worst of scenes; 0:
+    nothing is left of it.
+
+    model: Elastic, in float64 on the CPU.  mu, lam: [1 | B, 1 | T].
+    """
+    lead = (max(len(mu), len(lam)),)
+    prepared = prepare(model, lead, material_of(mu=mu, lam=lam), time_step=time_step, sweeps=sweeps)
+    if relaxation is not None:
+        numbers = prepared.settings.numbers
+        numbers = replaced(numbers, relaxation=relaxation, last_relaxation=min(numbers.last_relaxation, relaxation))
+        prepared = replaced(prepared, settings=replaced(prepared.settings, numbers=numbers))
+    rest = model._rest_points.expand(*lead, -1, -1)
+    free = (~model._pinned)[:, None].double()
+    nothing: dict[str, Any] = {"force": None, "prescribed": None, "colliders": None, "colliders_before": None,
+                               "gravity": acceleration_of((0.0, 0.0, 0.0), rest)}  # fmt: skip
+    begun = begin(model, rest, torch.zeros_like(rest), prepared, None, nothing["gravity"], None)
+    at_rest = IncrementalPotential(model, rest, begun.fields(model, prepared), time_step)
+    mass = free * model._mass[:, None]
+
+    def energy(d: Tensor, v: Tensor) -> Tensor:
+        """Times 2 h^2 [kg m^2]."""
+        return (free * d * at_rest.elastic_product(free * d) + mass * (time_step * v).square()).sum((-2, -1))
+
+    generator = torch.Generator("cpu").manual_seed(0)
+    noise = torch.randn(rest.shape[1:], generator=generator, dtype=torch.float64, device="cpu")
+    size = float((rest[0].amax(0) - rest[0].amin(0)).norm())
+    x, v, history = rest + NOISE * size * free * noise, torch.zeros_like(rest), None
+    total, logs = torch.zeros(lead, dtype=torch.float64, device="cpu"), [energy(x - rest, v).log()]
+    run = partial(advance, adjoint=None)
+    last = STEPS
+    while len(logs) <= last:
+        x, v, history, _ = take(integrator, model, x, v, history, prepared, nothing, run)
+        now = energy(x - rest, v)
+        if not bool(torch.isfinite(now).all()):
+            return math.inf
+        logs.append(total + now.clamp(min=math.ulp(0.0)).log())
+        if float((logs[-1] - logs[0]).max()) < math.log(GONE):
+            return 0.0
+        moved = ((x - rest).square() + (time_step * v).square()).sum((-2, -1)).mean().sqrt()
+        scale = NOISE * size * math.sqrt(rest[0].numel()) / moved.clamp(min=math.ulp(0.0))
+        total = total - 2 * scale.log()
+        x, v = rest + scale * (x - rest), scale * v
+        if history is not None:
+            history = replaced(history, moved=scale * history.moved, v=scale * history.v)
+        if len(logs) == STEPS + 1 and _factor(logs, BURN, STEPS) > GROWS:
+            last = STEPS + MORE
+    return _factor(logs, last - (STEPS - BURN), last)
+
+
+def _factor(logs: list[Tensor], first: int, last: int) -> float:
+    return math.exp(min(500.0, float((logs[last] - logs[first]).max()) / (2 * (last - first))))
+
+
+# --- motion that is lost ----------------------------------------------------------------------------------------------
+
+FAR = 1e3  # sizes of the Model at rest
+
+
+def size_of(model: System) -> float:
+    """Diagonal of the Model's box at rest [m]."""
+    return model.derived("size", lambda: float((model._rest_points.amax(0) - model._rest_points.amin(0)).norm()))
+
+
+def reach_of(model: System, start: tuple[Tensor, ...], x: Tensor, gravity: Any, duration: float) -> Tensor:
+    """How far the farthest vertex is from where it began, over the Model's size, beside what its velocity, gravity and
+    its pins may have given it [-]."""
+    x0, v0 = (t.detach() for t in start)
+    moved = (x.detach() - x0).abs()
+    away = torch.where(model._pinned[:, None], 0.0, moved).amax()
+    carried = torch.where(model._pinned[:, None], moved, 0.0).amax() + duration * v0.abs().amax()
+    if isinstance(gravity, Tensor):
+        carried = carried + 0.5 * duration**2 * gravity.detach().abs().amax()
+    return (away - carried) / max(size_of(model), torch.finfo(x.dtype).tiny)
+
+
+def notice_loss(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any, end: Tensor) -> None:
+    """Warns (UserWarning) where a step made one by one ends at positions that are not finite, or spread over more than
+    FAR sizes of the Model; on the CPU. v: Before the step.
+
+    A rollout looks at its own end, and tells from where it began how far is too far.
+    """
+    if end.is_cuda or not end.numel() or not looks_at(end) or is_silent():
+        return
+    low, high = (t.item() for t in end.detach().aminmax())
+    if high - low <= FAR * size_of(model):
+        return
+    x = end.detach()
+    spread = float((x.amax(-2) - x.amin(-2)).amax()) if math.isfinite(high - low) else math.inf
+    if not spread <= FAR * size_of(model):
+        where = f"spread over {spread:.3g} m" if spread < math.inf else "not finite"
+        warn(f"x: this step ended with positions that are {where}: "
+             f"{fault_of(model, prepared, integrator, v, force)}; " + page("numerics.md"))  # fmt: skip
+
+
+def fault_of(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any) -> str:
+    """What made a step lose its bounds, and what to do. v: Before it."""
+    with torch.no_grad():
+        if isinstance(force, Tensor):
+            mass = prepared.mass[..., None].clamp(min=torch.finfo(v.dtype).tiny)
+            push = broadcast(force.detach(), v.shape).reshape(-1, *v.shape[-2:]) / mass
+            push = prepared.settings.numbers.time_step * torch.where(model._pinned[:, None], 0.0, push)
+            if not float(push.norm()) <= float(v.detach().norm()):
+                return ("force: in one step it changes velocities by more than they are, as an explicit drag or spring "
+                        "does that is too strong for the step; limit it, or take a smaller time_step")  # fmt: skip
+        if growth_message(model, prepared, integrator):
+            return "sweeps: so few let vibrations grow in every step; take more, or a smaller relaxation or time_step"
+    return "time step: too long for these speeds and loads; take a smaller time_step"
