@@ -29,31 +29,6 @@ __global__ void __launch_bounds__(kThreads) clear_kernel(const __grid_constant__
   for (int64_t i = 4 * words + first; i < bytes; i += step) static_cast<uint8_t*>(own.data)[i] = 0;
 }
 
-}  // namespace
-
-cudaError_t clear(const std::vector<Span>& given, cudaStream_t stream) {
-  Spans spans{};
-  unsigned count = 0;
-  int64_t most = 0;
-  const auto launch = [&] {
-    const auto wide = static_cast<int64_t>(kThreads * sizeof(uint4));
-    const auto blocks = static_cast<unsigned>(std::min(kBlocks, (most + wide - 1) / wide));
-    if (count > 0) clear_kernel<<<dim3(blocks, count), kThreads, 0, stream>>>(spans);
-    count = 0, most = 0;
-    return cudaGetLastError();
-  };
-  for (const Span& span : given) {
-    if (span.bytes == 0) continue;
-    spans.of[count++] = span;
-    most = std::max(most, span.bytes);
-    if (count < kMost) continue;
-    if (auto error = launch()) return error;
-  }
-  return launch();
-}
-
-namespace {
-
 constexpr int64_t kShortRow = 32;  // a row of at most this many columns is summed by one thread
 constexpr int64_t kChunk = 4096;   // a longer one by blocks of threads, each this many columns
 
@@ -120,60 +95,6 @@ __global__ void chunk_kernel(const T* values, int64_t columns, int64_t chunks, T
 }
 
 int64_t chunks_of(int64_t columns) { return (columns + kChunk - 1) / kChunk; }
-
-}  // namespace
-
-template <class T>
-cudaError_t pack_rest(const GroupPlan& plan, int64_t scenes, const T* rest, T* packed, cudaStream_t stream) {
-  const int64_t items = scenes * plan.slots * kSlice;
-  if (items > 0) pack_rest_kernel<<<blocks_for(items, kThreads), kThreads, 0, stream>>>(plan, scenes, rest, packed);
-  return cudaGetLastError();
-}
-
-template <class T>
-cudaError_t gather_rows(const T* values, const int64_t* index, int64_t scenes, int64_t vertices, int64_t n, int64_t c,
-                        T* out, cudaStream_t stream) {
-  const int64_t items = scenes * n * c;
-  if (items > 0)
-    gather_kernel<<<blocks_for(items, kThreads), kThreads, 0, stream>>>(values, index, scenes, vertices, n, c, out);
-  return cudaGetLastError();
-}
-
-template <class T>
-cudaError_t sum_segments(const T* values, const int64_t* ptr, const int32_t* entry, int64_t scenes, int64_t n,
-                         int64_t segments, int64_t c, T* out, cudaStream_t stream) {
-  const int64_t items = scenes * segments * c;
-  if (items > 0) {
-    segment_kernel<<<blocks_for(items, kThreads), kThreads, 0, stream>>>(values, ptr, entry, scenes, n, segments, c,
-                                                                         out);
-  }
-  return cudaGetLastError();
-}
-
-int64_t partial_sums(int64_t rows, int64_t columns) {
-  return columns <= kChunk ? 0 : rows * (chunks_of(columns) + partial_sums(1, chunks_of(columns)));
-}
-
-template <class T>
-cudaError_t sum_rows(const T* values, int64_t rows, int64_t columns, T* partial, T* out, cudaStream_t stream) {
-  if (rows == 0) return cudaSuccess;
-  if (columns <= kShortRow) {
-    short_rows_kernel<<<blocks_for(rows, kThreads), kThreads, 0, stream>>>(values, rows, columns, out);
-    return cudaGetLastError();
-  }
-  const int64_t chunks = chunks_of(columns);
-  T* sums = chunks == 1 ? out : partial;
-  chunk_kernel<<<static_cast<unsigned>(rows * chunks), kThreads, 0, stream>>>(values, columns, chunks, sums);
-  if (auto error = cudaGetLastError()) return error;
-  return chunks == 1 ? cudaSuccess : sum_rows(sums, rows, chunks, partial + rows * chunks, out, stream);
-}
-
-DIFFVBD_INSTANTIATE(pack_rest)
-DIFFVBD_INSTANTIATE(gather_rows)
-DIFFVBD_INSTANTIATE(sum_segments)
-DIFFVBD_INSTANTIATE(sum_rows)
-
-namespace {
 
 constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of up to so many terms; otherwise kThreads
 constexpr int64_t kFewTerms = 32;              // terms of a segment on average up to which a thread sums it
@@ -281,6 +202,72 @@ __global__ void __launch_bounds__(kThreads)
 
 }  // namespace
 
+cudaError_t clear(const std::vector<Span>& given, cudaStream_t stream) {
+  Spans spans{};
+  unsigned count = 0;
+  int64_t most = 0;
+  const auto launch = [&] {
+    const auto wide = static_cast<int64_t>(kThreads * sizeof(uint4));
+    const auto blocks = static_cast<unsigned>(std::min(kBlocks, (most + wide - 1) / wide));
+    if (count > 0) clear_kernel<<<dim3(blocks, count), kThreads, 0, stream>>>(spans);
+    count = 0, most = 0;
+    return cudaGetLastError();
+  };
+  for (const Span& span : given) {
+    if (span.bytes == 0) continue;
+    spans.of[count++] = span;
+    most = std::max(most, span.bytes);
+    if (count < kMost) continue;
+    if (auto error = launch()) return error;
+  }
+  return launch();
+}
+
+template <class T>
+cudaError_t pack_rest(const GroupPlan& plan, int64_t scenes, const T* rest, T* packed, cudaStream_t stream) {
+  const int64_t items = scenes * plan.slots * kSlice;
+  if (items > 0) pack_rest_kernel<<<blocks_for(items, kThreads), kThreads, 0, stream>>>(plan, scenes, rest, packed);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t gather_rows(const T* values, const int64_t* index, int64_t scenes, int64_t vertices, int64_t n, int64_t c,
+                        T* out, cudaStream_t stream) {
+  const int64_t items = scenes * n * c;
+  if (items > 0)
+    gather_kernel<<<blocks_for(items, kThreads), kThreads, 0, stream>>>(values, index, scenes, vertices, n, c, out);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t sum_segments(const T* values, const int64_t* ptr, const int32_t* entry, int64_t scenes, int64_t n,
+                         int64_t segments, int64_t c, T* out, cudaStream_t stream) {
+  const int64_t items = scenes * segments * c;
+  if (items > 0) {
+    segment_kernel<<<blocks_for(items, kThreads), kThreads, 0, stream>>>(values, ptr, entry, scenes, n, segments, c,
+                                                                         out);
+  }
+  return cudaGetLastError();
+}
+
+int64_t partial_sums(int64_t rows, int64_t columns) {
+  return columns <= kChunk ? 0 : rows * (chunks_of(columns) + partial_sums(1, chunks_of(columns)));
+}
+
+template <class T>
+cudaError_t sum_rows(const T* values, int64_t rows, int64_t columns, T* partial, T* out, cudaStream_t stream) {
+  if (rows == 0) return cudaSuccess;
+  if (columns <= kShortRow) {
+    short_rows_kernel<<<blocks_for(rows, kThreads), kThreads, 0, stream>>>(values, rows, columns, out);
+    return cudaGetLastError();
+  }
+  const int64_t chunks = chunks_of(columns);
+  T* sums = chunks == 1 ? out : partial;
+  chunk_kernel<<<static_cast<unsigned>(rows * chunks), kThreads, 0, stream>>>(values, columns, chunks, sums);
+  if (auto error = cudaGetLastError()) return error;
+  return chunks == 1 ? cudaSuccess : sum_rows(sums, rows, chunks, partial + rows * chunks, out, stream);
+}
+
 template <class T>
 cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                         int64_t segments, int64_t c, T* out, cudaStream_t stream) {
@@ -303,6 +290,10 @@ cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* pt
   return cudaGetLastError();
 }
 
+DIFFVBD_INSTANTIATE(pack_rest)
+DIFFVBD_INSTANTIATE(gather_rows)
+DIFFVBD_INSTANTIATE(sum_segments)
+DIFFVBD_INSTANTIATE(sum_rows)
 DIFFVBD_INSTANTIATE(segment_sum)
 
 }  // namespace diffvbd::cuda

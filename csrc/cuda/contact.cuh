@@ -203,54 +203,6 @@ cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t str
   return launch_pass(kernel, items, stream, false, arguments...);
 }
 
-}  // namespace
-
-template <class T>
-template <class... P, class... A>
-cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool dependent,
-                                   A... arguments) const {
-  return launch_pass(kernel, s.scenes * (end - begin) * warps * kSlice, stream, dependent, s, c, arguments..., begin,
-                     end);
-}
-template <class T>
-cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool dependent) const {
-  return over(assemble_contact<kShare, T>, begin, end, kShare, dependent, sweep);
-}
-template <class T>
-cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool dependent) const {
-  return over(limit_contact<kShare, T>, begin, end, kShare, dependent, sweep);
-}
-template <class T>
-cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool dependent) const {
-  return over(prepare_contact<kShare, T>, begin, end, kShare, dependent);
-}
-template <class T>
-cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool dependent) const {
-  if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, dependent, kRoles);
-  return over(reverse_contact<kShare, T>, begin, end, kShare, dependent, 1);
-}
-template <class T>
-cudaError_t ContactPasses<T>::collect(const StepAdjoints<T>& out) const {
-  return launch_contact(collect_contact<T>, s.scenes * c.in.corners * kCornerShare, stream, s, c.in, c.slots,
-                        out.collider);
-}
-template <class T>
-cudaError_t ContactPasses<T>::store(const StepAdjoints<T>& out) const {
-  const T *prev = c.slots.prev, *slots = c.slots.kappa;
-  if (auto error = launch_contact(store_contact<T>, s.scenes * c.in.corners, stream, s, c.in, out, prev)) return error;
-  return launch_sum(s.scenes, stream, c.in, s.base, slots, 4, 1, out.kappa);
-}
-
-template <class T>
-cudaError_t sum_lag(const ContactInputs<T>& in, int64_t scenes, const ContactAdjoints<T>& slots, int64_t pairs, T* lag,
-                    cudaStream_t stream) {
-  if (pairs == 0) return cudaSuccess;
-  const int64_t items = pairs * contact::kLagScalars;
-  const int32_t* entries = in.lagged.ptr + scenes * in.corners;
-  const T* from = slots.lag;
-  return launch_contact(sum_lag_slots<T>, items, stream, entries, from, items, lag);
-}
-
 // Clears the rows [from, to) that belong to the threads of the block. Neighbouring threads write neighbouring scalars.
 // All threads must call it.
 template <class T>
@@ -259,8 +211,6 @@ __device__ __forceinline__ void clear_rows(T* rows, int scalars, int64_t from, i
   const int64_t last = (end < to ? end : to) * scalars;
   for (int64_t i = (begin < from ? from : begin) * scalars + threadIdx.x; i < last; i += blockDim.x) rows[i] = T(0);
 }
-
-namespace {
 
 // Listed pair with the inputs of its lagged quantities.
 template <class T>
@@ -380,6 +330,52 @@ cudaError_t sum_slots(const ContactInputs<T>& in, int64_t scenes, const T* slots
 }
 
 }  // namespace
+
+template <class T>
+template <class... P, class... A>
+cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool dependent,
+                                   A... arguments) const {
+  return launch_pass(kernel, s.scenes * (end - begin) * warps * kSlice, stream, dependent, s, c, arguments..., begin,
+                     end);
+}
+template <class T>
+cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool dependent) const {
+  return over(assemble_contact<kShare, T>, begin, end, kShare, dependent, sweep);
+}
+template <class T>
+cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool dependent) const {
+  return over(limit_contact<kShare, T>, begin, end, kShare, dependent, sweep);
+}
+template <class T>
+cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool dependent) const {
+  return over(prepare_contact<kShare, T>, begin, end, kShare, dependent);
+}
+template <class T>
+cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool dependent) const {
+  if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, dependent, kRoles);
+  return over(reverse_contact<kShare, T>, begin, end, kShare, dependent, 1);
+}
+template <class T>
+cudaError_t ContactPasses<T>::collect(const StepAdjoints<T>& out) const {
+  return launch_contact(collect_contact<T>, s.scenes * c.in.corners * kCornerShare, stream, s, c.in, c.slots,
+                        out.collider);
+}
+template <class T>
+cudaError_t ContactPasses<T>::store(const StepAdjoints<T>& out) const {
+  const T *prev = c.slots.prev, *slots = c.slots.kappa;
+  if (auto error = launch_contact(store_contact<T>, s.scenes * c.in.corners, stream, s, c.in, out, prev)) return error;
+  return launch_sum(s.scenes, stream, c.in, s.base, slots, 4, 1, out.kappa);
+}
+
+template <class T>
+cudaError_t sum_lag(const ContactInputs<T>& in, int64_t scenes, const ContactAdjoints<T>& slots, int64_t pairs, T* lag,
+                    cudaStream_t stream) {
+  if (pairs == 0) return cudaSuccess;
+  const int64_t items = pairs * contact::kLagScalars;
+  const int32_t* entries = in.lagged.ptr + scenes * in.corners;
+  const T* from = slots.lag;
+  return launch_contact(sum_lag_slots<T>, items, stream, entries, from, items, lag);
+}
 
 template <class T>
 cudaError_t pair_lag(const ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,

@@ -10,55 +10,6 @@
 #include "contact_rigid_rows.cuh"
 
 namespace diffvbd::cuda {
-
-// Side stream of a device, one for each host thread. Capturing a graph captures it, too, until join().
-class SideStream {
- public:
-  SideStream() = default;
-  SideStream(const SideStream&) = delete;
-  SideStream& operator=(const SideStream&) = delete;
-  ~SideStream() {  // when the host thread ends
-    if (begun_) cudaEventDestroy(begun_);
-    if (ended_) cudaEventDestroy(ended_);
-    if (stream_) cudaStreamDestroy(stream_);
-  }
-
-  // Side stream of the current device.
-  static cudaError_t of_device(SideStream** out) {
-    thread_local std::map<int, SideStream> all;
-    int device = 0;
-    if (auto error = cudaGetDevice(&device)) return error;
-    *out = &all[device];
-    return (*out)->make();
-  }
-  cudaStream_t stream() const { return stream_; }
-  // Later work of this stream waits for earlier work of `main`.
-  cudaError_t fork(cudaStream_t main) const {
-    if (auto error = cudaEventRecord(begun_, main)) return error;
-    return cudaStreamWaitEvent(stream_, begun_, 0);
-  }
-  // Later work of `main` waits for earlier work of this stream.
-  cudaError_t join(cudaStream_t main) const {
-    if (auto error = cudaEventRecord(ended_, stream_)) return error;
-    return cudaStreamWaitEvent(main, ended_, 0);
-  }
-
- private:
-  cudaError_t make() {
-    if (ended_) return cudaSuccess;
-    if (!stream_) {
-      if (auto error = cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking)) return error;
-    }
-    if (!begun_) {
-      if (auto error = cudaEventCreateWithFlags(&begun_, cudaEventDisableTiming)) return error;
-    }
-    return cudaEventCreateWithFlags(&ended_, cudaEventDisableTiming);
-  }
-
-  cudaStream_t stream_ = nullptr;
-  cudaEvent_t begun_ = nullptr, ended_ = nullptr;
-};
-
 namespace {
 
 __global__ void __launch_bounds__(kOne) start_kernel(int64_t count, int32_t bodies, int32_t* label) {
@@ -159,30 +110,6 @@ __global__ void __launch_bounds__(kThreads)
   });
 }
 
-}  // namespace
-
-int64_t groups_bytes(int64_t scenes, int64_t bodies) { return 3 * scenes * bodies * sizeof(int32_t); }
-
-template <class T>
-cudaError_t find_groups(const RigidInputs<T>& in, const PairCapacity& capacity, const int32_t* sides, int32_t* groups,
-                        void* workspace, cudaStream_t stream) {
-  const int64_t bodies = in.scene.scenes * in.bodies();
-  auto *label = static_cast<int32_t*>(workspace), *work = label + bodies;
-  start_kernel<<<blocks_for(bodies, kOne), kOne, 0, stream>>>(bodies, in.bodies(), label);
-  if (capacity.rows() > 0)
-    join_kernel<T><<<blocks_for(capacity.rows(), kOne), kOne, 0, stream>>>(in, capacity, sides, label);
-  if (most_grouped(in.bodies()) > 1) {
-    places_kernel<<<static_cast<unsigned>(in.scene.scenes), kThreads, 0, stream>>>(in.bodies(), label, work, groups);
-  } else {
-    alone_kernel<<<blocks_for(bodies, kOne), kOne, 0, stream>>>(bodies, in.bodies(), label, groups);
-  }
-  return cudaGetLastError();
-}
-
-DIFFVBD_INSTANTIATE(find_groups)
-
-namespace {
-
 template <class T>
 __global__ void __launch_bounds__(kOne) force_kernel(const __grid_constant__ RigidInputs<T> in, PairCapacity capacity,
                                                      const __grid_constant__ GroupMemory memory, bool counts) {
@@ -259,6 +186,72 @@ struct SystemWork {
 
 }  // namespace
 
+// Side stream of a device, one for each host thread. Capturing a graph captures it, too, until join().
+class SideStream {
+ public:
+  SideStream() = default;
+  SideStream(const SideStream&) = delete;
+  SideStream& operator=(const SideStream&) = delete;
+  ~SideStream() {  // when the host thread ends
+    if (begun_) cudaEventDestroy(begun_);
+    if (ended_) cudaEventDestroy(ended_);
+    if (stream_) cudaStreamDestroy(stream_);
+  }
+
+  // Side stream of the current device.
+  static cudaError_t of_device(SideStream** out) {
+    thread_local std::map<int, SideStream> all;
+    int device = 0;
+    if (auto error = cudaGetDevice(&device)) return error;
+    *out = &all[device];
+    return (*out)->make();
+  }
+  cudaStream_t stream() const { return stream_; }
+  // Later work of this stream waits for earlier work of `main`.
+  cudaError_t fork(cudaStream_t main) const {
+    if (auto error = cudaEventRecord(begun_, main)) return error;
+    return cudaStreamWaitEvent(stream_, begun_, 0);
+  }
+  // Later work of `main` waits for earlier work of this stream.
+  cudaError_t join(cudaStream_t main) const {
+    if (auto error = cudaEventRecord(ended_, stream_)) return error;
+    return cudaStreamWaitEvent(main, ended_, 0);
+  }
+
+ private:
+  cudaError_t make() {
+    if (ended_) return cudaSuccess;
+    if (!stream_) {
+      if (auto error = cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking)) return error;
+    }
+    if (!begun_) {
+      if (auto error = cudaEventCreateWithFlags(&begun_, cudaEventDisableTiming)) return error;
+    }
+    return cudaEventCreateWithFlags(&ended_, cudaEventDisableTiming);
+  }
+
+  cudaStream_t stream_ = nullptr;
+  cudaEvent_t begun_ = nullptr, ended_ = nullptr;
+};
+
+int64_t groups_bytes(int64_t scenes, int64_t bodies) { return 3 * scenes * bodies * sizeof(int32_t); }
+
+template <class T>
+cudaError_t find_groups(const RigidInputs<T>& in, const PairCapacity& capacity, const int32_t* sides, int32_t* groups,
+                        void* workspace, cudaStream_t stream) {
+  const int64_t bodies = in.scene.scenes * in.bodies();
+  auto *label = static_cast<int32_t*>(workspace), *work = label + bodies;
+  start_kernel<<<blocks_for(bodies, kOne), kOne, 0, stream>>>(bodies, in.bodies(), label);
+  if (capacity.rows() > 0)
+    join_kernel<T><<<blocks_for(capacity.rows(), kOne), kOne, 0, stream>>>(in, capacity, sides, label);
+  if (most_grouped(in.bodies()) > 1) {
+    places_kernel<<<static_cast<unsigned>(in.scene.scenes), kThreads, 0, stream>>>(in.bodies(), label, work, groups);
+  } else {
+    alone_kernel<<<blocks_for(bodies, kOne), kOne, 0, stream>>>(bodies, in.bodies(), label, groups);
+  }
+  return cudaGetLastError();
+}
+
 template <class T>
 int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairCapacity& capacity) {
   return SystemWork(in, capacity, nullptr).bytes;
@@ -297,6 +290,7 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairCapacity& capacity,
   return few ? few : many ? many : joined;
 }
 
+DIFFVBD_INSTANTIATE(find_groups)
 DIFFVBD_INSTANTIATE(rigid_system_bytes)
 DIFFVBD_INSTANTIATE(rigid_system)
 

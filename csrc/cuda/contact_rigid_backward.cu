@@ -170,54 +170,6 @@ unsigned blocks_of_bodies(const RigidInputs<T>& in) {
   return static_cast<unsigned>(in.scene.scenes * in.bodies());
 }
 
-}  // namespace
-
-template <class T>
-cudaError_t solve_groups(const RigidInputs<T>& in, const double* factor, double* x, cudaStream_t stream) {
-  const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
-  solve_groups_kernel<T><<<blocks, kThreads, 0, stream>>>(in, factor, x);
-  return cudaGetLastError();
-}
-
-template <class T>
-cudaError_t rigid_end_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
-  body_kernel<T, kEnd><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
-  if (auto error = solve_groups(in, r.factor, r.solutions, stream)) return error;
-  body_kernel<T, kMotion><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
-  return cudaGetLastError();
-}
-
-template <class T>
-cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
-  body_kernel<T, kVertices><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
-  const int64_t points = in.scene.scenes * (in.gate.corners - in.gate.vertices);
-  if (points > 0) colliders_kernel<T><<<blocks_for(points, kOne), kOne, 0, stream>>>(in, r);
-  return cudaGetLastError();
-}
-
-template <class T>
-cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
-                           const PointWork<T>& sums, int32_t* pushing, cudaStream_t stream) {
-  if (auto error = clear({{pushing, sizeof(*pushing)}}, stream)) return error;
-  const dim3 rows(blocks_for(std::max(out.listed, out.lagged), kOne), out.lagged > 0 ? 2 : 1);
-  if (rows.x > 0) rows_kernel<T><<<rows, kOne, 0, stream>>>(in, given, out, pushing);
-  if (out.listed > 0) {
-    const auto blocks =
-        static_cast<unsigned>(std::min<int64_t>(blocks_for(kPartsApart * out.listed, kOne), kBlocksOfPushing));
-    barrier_kernel<T><<<blocks, kOne, 0, stream>>>(in, given, out, pushing);
-  }
-  const int64_t points = in.scene.scenes * in.gate.corners;
-  if (points > 0) point_kernel<T><<<blocks_for(32 * points, kOne), kOne, 0, stream>>>(in, out, sums);
-  return cudaGetLastError();
-}
-
-DIFFVBD_INSTANTIATE(solve_groups)
-DIFFVBD_INSTANTIATE(rigid_end_backward)
-DIFFVBD_INSTANTIATE(rigid_vertices_backward)
-DIFFVBD_INSTANTIATE(rigid_backward)
-
-namespace {
-
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
@@ -269,6 +221,45 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class T>
+cudaError_t solve_groups(const RigidInputs<T>& in, const double* factor, double* x, cudaStream_t stream) {
+  const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
+  solve_groups_kernel<T><<<blocks, kThreads, 0, stream>>>(in, factor, x);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t rigid_end_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
+  body_kernel<T, kEnd><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  if (auto error = solve_groups(in, r.factor, r.solutions, stream)) return error;
+  body_kernel<T, kMotion><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
+  body_kernel<T, kVertices><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  const int64_t points = in.scene.scenes * (in.gate.corners - in.gate.vertices);
+  if (points > 0) colliders_kernel<T><<<blocks_for(points, kOne), kOne, 0, stream>>>(in, r);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
+                           const PointWork<T>& sums, int32_t* pushing, cudaStream_t stream) {
+  if (auto error = clear({{pushing, sizeof(*pushing)}}, stream)) return error;
+  const dim3 rows(blocks_for(std::max(out.listed, out.lagged), kOne), out.lagged > 0 ? 2 : 1);
+  if (rows.x > 0) rows_kernel<T><<<rows, kOne, 0, stream>>>(in, given, out, pushing);
+  if (out.listed > 0) {
+    const auto blocks =
+        static_cast<unsigned>(std::min<int64_t>(blocks_for(kPartsApart * out.listed, kOne), kBlocksOfPushing));
+    barrier_kernel<T><<<blocks, kOne, 0, stream>>>(in, given, out, pushing);
+  }
+  const int64_t points = in.scene.scenes * in.gate.corners;
+  if (points > 0) point_kernel<T><<<blocks_for(32 * points, kOne), kOne, 0, stream>>>(in, out, sums);
+  return cudaGetLastError();
+}
+
+template <class T>
 cudaError_t rigid_contact_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
   const int64_t scenes = in.scene.scenes, rows = r.work.listed + r.work.lagged;
   if (scenes == 0 || in.bodies() == 0) return cudaSuccess;
@@ -281,6 +272,10 @@ cudaError_t rigid_contact_backward(const RigidInputs<T>& in, const RigidReverse<
   return rigid_vertices_backward(in, r, stream);
 }
 
+DIFFVBD_INSTANTIATE(solve_groups)
+DIFFVBD_INSTANTIATE(rigid_end_backward)
+DIFFVBD_INSTANTIATE(rigid_vertices_backward)
+DIFFVBD_INSTANTIATE(rigid_backward)
 DIFFVBD_INSTANTIATE(rigid_contact_backward)
 
 }  // namespace diffvbd::cuda

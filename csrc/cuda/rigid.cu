@@ -39,36 +39,6 @@ __global__ void __launch_bounds__(kVertexThreads)
   if (row.exists) reverse_kept(in, a, row.scene, row.vertex);
 }
 
-}  // namespace
-
-int64_t bodies_workspace(const BodyGroups& groups, int64_t scenes, int64_t vertices) {
-  if (groups.large == 0 || by_block(groups, scenes, vertices)) return 0;
-  return int64_t{2} * multiprocessors() * kMostSums;
-}
-
-template <class T>
-cudaError_t rigid_correct(const rigid::Inputs<T>& in, const BodyGroups& groups, bool others, T* x, T* velocity,
-                          double* workspace, cudaStream_t stream) {
-  if (in.scenes * in.vertices == 0) return cudaSuccess;
-  if (others) keep_vertices<T><<<blocks_of(in), kVertexThreads, 0, stream>>>(in, x, velocity);
-  if (in.data.data) return run_bodies(in, groups, Forward<T, true>{x, velocity}, workspace, stream);
-  return run_bodies(in, groups, Forward<T, false>{x, velocity}, workspace, stream);
-}
-
-template <class T>
-cudaError_t rigid_reverse(const rigid::Inputs<T>& in, const BodyGroups& groups, bool others,
-                          const rigid::Adjoints<T>& a, double* workspace, cudaStream_t stream) {
-  if (in.scenes * in.vertices == 0) return cudaSuccess;
-  if (others) reverse_vertices<T><<<blocks_of(in), kVertexThreads, 0, stream>>>(in, a);
-  if (in.data.data) return run_bodies(in, groups, Reverse<T, true>{a}, workspace, stream);
-  return run_bodies(in, groups, Reverse<T, false>{a}, workspace, stream);
-}
-
-DIFFVBD_INSTANTIATE(rigid_correct)
-DIFFVBD_INSTANTIATE(rigid_reverse)
-
-namespace {
-
 using coarse::kBlockTets, coarse::kDegree, coarse::RiseInputs;
 using rigid::Body, rigid::Vector;
 
@@ -141,6 +111,29 @@ __global__ void __launch_bounds__(kThreads)
 
 }  // namespace
 
+int64_t bodies_workspace(const BodyGroups& groups, int64_t scenes, int64_t vertices) {
+  if (groups.large == 0 || by_block(groups, scenes, vertices)) return 0;
+  return int64_t{2} * multiprocessors() * kMostSums;
+}
+
+template <class T>
+cudaError_t rigid_correct(const rigid::Inputs<T>& in, const BodyGroups& groups, bool others, T* x, T* velocity,
+                          double* workspace, cudaStream_t stream) {
+  if (in.scenes * in.vertices == 0) return cudaSuccess;
+  if (others) keep_vertices<T><<<blocks_of(in), kVertexThreads, 0, stream>>>(in, x, velocity);
+  if (in.data.data) return run_bodies(in, groups, Forward<T, true>{x, velocity}, workspace, stream);
+  return run_bodies(in, groups, Forward<T, false>{x, velocity}, workspace, stream);
+}
+
+template <class T>
+cudaError_t rigid_reverse(const rigid::Inputs<T>& in, const BodyGroups& groups, bool others,
+                          const rigid::Adjoints<T>& a, double* workspace, cudaStream_t stream) {
+  if (in.scenes * in.vertices == 0) return cudaSuccess;
+  if (others) reverse_vertices<T><<<blocks_of(in), kVertexThreads, 0, stream>>>(in, a);
+  if (in.data.data) return run_bodies(in, groups, Reverse<T, true>{a}, workspace, stream);
+  return run_bodies(in, groups, Reverse<T, false>{a}, workspace, stream);
+}
+
 template <class T>
 cudaError_t energy_increase(const RiseInputs<T>& in, double* workspace, double* out, cudaStream_t stream) {
   const int64_t bodies = in.bodies.scenes * in.bodies.bodies;
@@ -153,6 +146,8 @@ cudaError_t energy_increase(const RiseInputs<T>& in, double* workspace, double* 
   return cudaGetLastError();
 }
 
+DIFFVBD_INSTANTIATE(rigid_correct)
+DIFFVBD_INSTANTIATE(rigid_reverse)
 DIFFVBD_INSTANTIATE(energy_increase)
 
 }  // namespace diffvbd::cuda
