@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def test_every_source_is_in_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(ROOT)
     # of setup.py only what comes before the list is executed
-    names: dict[str, Any] = {"os": os, "runpy": runpy}
+    names: dict[str, Any] = {"os": os, "runpy": runpy, "glob": glob}
     for node in ast.parse((ROOT / "setup.py").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign | ast.FunctionDef) and "CPU_SOURCES" not in names:
             exec(ast.unparse(node), names)
