@@ -15,7 +15,7 @@ from torch import Tensor
 from bench.common import markdown_table
 from bench.gpu_measure import Card
 from diffvbd.inspect.penalty import PAIRS_PER_BODY, Bodies, center_of_mass_penalty
-from diffvbd.ops import neighbors as ops_neighbors
+from diffvbd.ops import contact as ops_neighbors
 
 RADIUS, VERTICES = 1.0, 8
 SHARPNESS = 100.0  # [1/m]: the search reaches 1.36 radii in float64

@@ -26,7 +26,7 @@ from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, SUBSPACES, Observation,
 from diffvbd.viz.server import require_viser
 from diffvbd.viz.values import QUANTITIES
 
-from .rollout.tune import ERROR, PATIENCE
+from .rollout.tune import ERROR, TIME_BUDGET
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
@@ -46,8 +46,8 @@ EXAMPLES = """examples:
                                                    solver (time step, sweeps, ...) that stays within an error of 1 %
 
 `diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. `identify` ends with status 1
-where it stalled, and warns wherever it did not converge; `advise` where the error cannot be reached. An interrupted `run`
-or `identify` continues where it stopped when the same command is given again.
+where it stalled, and warns wherever it did not converge; `advise` where the error cannot be reached. An interrupted
+`run` or `identify` continues where it stopped when the same command is given again.
 """
 ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "subspace")  # what advise chooses
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
@@ -133,7 +133,9 @@ def _parser() -> argparse.ArgumentParser:
         "--error", type=float, default=ERROR, help=f"fraction of the motion, below 1 (default {ERROR:g})"
     )
     advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
-    advice.add_argument("--time-budget", type=float, default=PATIENCE, help=f"of trial runs [s] (default {PATIENCE:g})")
+    advice.add_argument(
+        "--time-budget", type=float, default=TIME_BUDGET, help=f"of trial runs [s] (default {TIME_BUDGET:g})"
+    )
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
     _add_material(advice)
     _add_scene(advice, ADVISED)

@@ -2,19 +2,23 @@
 
 import io
 import json
+import re
 import subprocess
 import sys
 import warnings
 import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
+from typing import Any
 
+import meshio
 import numpy as np
 import pytest
 import torch
 
 import diffvbd as dv
 from diffvbd import cli
+from diffvbd import mesh as dm
 from diffvbd.cli import main
 from diffvbd.tasks import folder as archive
 from diffvbd.tasks.folder import alone_in
@@ -42,14 +46,6 @@ def test_help_shows_examples_and_every_command(capsys: pytest.CaptureFixture) ->
     text = capsys.readouterr().out
     for word in ("run", "list", "simulate", "identify", "info", "examples:", "--save-target"):
         assert word in text
-
-
-def test_list_and_info(capsys: pytest.CaptureFixture) -> None:
-    assert run("list") == 0
-    assert "beam-mu-lam" in capsys.readouterr().out
-    assert run("info") == 0
-    text = capsys.readouterr().out
-    assert "torch" in text and "_C" in text
 
 
 def test_run_quick_prints_a_table_and_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -106,35 +102,10 @@ def test_identify_recovers_the_material_of_a_motion(mesh_file: Path, tmp_path: P
     assert all(float(error) < 0.01 for error in errors)  # [%]
 
 
-def test_another_time_step_keeps_the_times_of_the_observations(mesh_file: Path, tmp_path: Path) -> None:
-    target = tmp_path / "target.npz"
-    options = [*SCENE, "--stride", 4, "--save-target", target]
-    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *options) == 0
-    mesh = dv.mesh.load(mesh_file)
-    for time_step, steps in ((0.01, [0, 4, 8, 12]), (0.04, [0, 1, 2, 3]), (0.0025, [0, 16, 32, 48])):
-        found = Observation.load(target, mesh, time_step=time_step)
-        assert found.scene.time_step == time_step
-        assert found.steps.tolist() == steps
-    both = Observation.load(target, mesh, time_step=0.02, steps=[0, 1, 2, 3])  # said by who calls
-    assert both.steps.tolist() == [0, 1, 2, 3]
-
-
 def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 2
     told = capsys.readouterr().out
     assert "identify  recover mu and lam" in told and "examples:" in told
-
-
-def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
-    target = tmp_path / "target.npz"
-    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, "--mu", 4e4, "--save-target", target) == 0
-    content = dict(np.load(target))
-    np.savez(tmp_path / "shape.npz", x=content["x"][-1])
-    options = ["--start", 1e4, 1e5, "--fixed-lam", "--out", tmp_path / "run"]
-    assert run("identify", mesh_file, tmp_path / "shape.npz", *SCENE, *options) == 0
-    log = (tmp_path / "run" / "log.json").read_text()
-    mu = float(log.split('"estimates": {')[1].split('"mu": ')[1].split(",")[0])
-    assert mu == pytest.approx(4e4, rel=tolerance("identified"))
 
 
 @pytest.mark.parametrize(
@@ -249,38 +220,6 @@ def test_simulate_makes_folders_and_asks_before_it_overwrites(
     assert run(*arguments, "--force") == 0 and len(asked) == 3
 
 
-def test_friction_and_relaxation_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
-    low = dv.mesh.load(mesh_file).points[:, 1].min()
-    ends = {}
-    options = ["--floor", low - 0.002, "--dhat", 0.005, "--velocity", 1, 0, 0, "--steps", 12, "--time-step", 0.01]
-    for name, more in {"smooth": [], "rough": ["--friction", 0.8], "relaxed": ["--relaxation", 1.5]}.items():
-        target = tmp_path / f"{name}.npz"
-        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target]
-        assert run("simulate", mesh_file, *out, *options, *more) == 0
-        content = np.load(target)
-        ends[name] = content["x"][-1]
-        assert ("friction" in content, "relaxation" in content) == (name == "rough", name == "relaxed")
-        scene = Observation.load(target, dv.mesh.load(mesh_file)).scene
-        assert (scene.friction, scene.relaxation) == (0.8 if name == "rough" else None, 1.5 if name == "relaxed" else 1)
-    assert ends["rough"][:, 0].mean() < ends["smooth"][:, 0].mean() - 0.01
-    assert not np.array_equal(ends["relaxed"], ends["smooth"])
-
-
-def test_the_integrator_is_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
-    """Of free fall, which second order has exactly."""
-    falls = {}
-    for name in ("implicit-euler", "sdirk2", "bdf2"):
-        target = tmp_path / f"{name}.npz"
-        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target]
-        assert run("simulate", mesh_file, *out, "--steps", 5, "--time-step", 0.02, "--integrator", name) == 0
-        found = Observation.load(target, dv.mesh.load(mesh_file))
-        assert found.scene.integrator == name
-        falls[name] = float((found.x[-1] - found.x[0])[:, 1].mean())
-    exact = -0.5 * 9.81 * 0.1**2
-    assert abs(falls["implicit-euler"] - exact) > 0.1 * abs(exact)
-    assert all(abs(falls[name] - exact) < tolerance("closed_form") * abs(exact) for name in ("sdirk2", "bdf2"))
-
-
 def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
     """With two sweeps they change where a stiff body ends, and its file says that they were there."""
     ends = {}
@@ -301,17 +240,6 @@ def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Pat
         assert Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), coarse=given).scene.coarse
 
 
-def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
-    target = tmp_path / "target.npz"
-    material = ["--young", 1e5, "--poisson", 0.3]
-    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, *material, "--save-target", target) == 0
-    start = ["--start-young", 2.6e4, "--start-poisson", 0.3, "--iterations", 60, "--out", tmp_path / "run"]
-    assert run("identify", mesh_file, target, *start) == 0
-    log = json.loads((tmp_path / "run" / "log.json").read_text())
-    assert [log["history"][0][name] for name in ("mu", "lam")] == pytest.approx([1e4, 1.5e4])
-    assert "Young's modulus 1" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("rate", "status", "message"),
     [(0.0, 1, "warning: identify stalled: "), (1e-3, 0, "warning: identify did not converge in 3 evaluations: ")],
@@ -328,6 +256,7 @@ def test_identify_says_where_it_did_not_converge(
     assert message in output.err and "Young's modulus" in output.out
 
 
+@pytest.mark.slow
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "run"
     code = "import sys; from pathlib import Path; from diffvbd.tasks.folder import alone_in\n"
@@ -365,3 +294,184 @@ def test_a_warning_is_one_line_without_a_place(mesh_file: Path, monkeypatch: pyt
     )
     assert run("simulate", mesh_file, "--out", "part.pvd") == 0
     assert said == ["warning: sweeps: few\n"] and warnings.formatwarning is shown
+
+
+# --- `diffvbd advise` prints settings to use, and says which options do not go together ---
+
+
+@pytest.fixture
+def beam_file(tmp_path: Path) -> Path:
+    path = tmp_path / "part.msh"
+    dv.mesh.save(path, dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)))
+    return path
+
+
+def test_advise(beam_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["advise", str(beam_file), "--pin", "x-", "--duration", "0.1", "--error", "0.1"]
+    assert main(common) == 0
+    told = capsys.readouterr().out
+    made = re.search(r"in Python: settings=(dv\.Settings\(.*\))", told)
+    assert made is not None and "pilot runs took" in told
+    settings = eval(made[1])
+    assert isinstance(settings, dv.Settings) and 0 < settings.time_step <= 0.1
+    assert main([*common, "--sweeps", "3"]) == 2
+    assert "--sweeps: expected none" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["advise", "--help"])
+    shown = capsys.readouterr().out
+    assert "--sweeps" not in shown and "--time-step" not in shown and "--floor" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--kappa", "100"], "--kappa: expected --floor beside it"),
+        (["--friction", "0.5"], "--friction: expected --floor beside it"),
+        (["--floor", "nan"], "--floor: expected finite numbers, got nan"),
+        (["--gravity", "0", "inf", "0"], "--gravity: expected finite numbers"),
+    ],
+)
+def test_options_of_a_scene(beam_file: Path, options: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["advise", str(beam_file), "--duration", "0.1", *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+# --- `diffvbd mesh` makes tets of a scan, shows what it found, and writes over nothing unasked ---
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """A box in cm that stands on its z axis, as a .ply file."""
+    box = dm.box(3, (10.0, 10.0, 20.0))
+    meshio.Mesh(box.points, [("triangle", box.surface.astype(np.int32))]).write(tmp_path / "scan.ply")
+    return tmp_path / "scan.ply"
+
+
+def test_a_scan_becomes_tets(scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for package in ("pytetwild", "pyvista", "trimesh"):
+        pytest.importorskip(package, reason="needs the extra [mesh]")
+    part = tmp_path / "part.msh"
+    assert run("mesh", scan, "--size", 0.2, "--up", "z", "--edge", 0.05, "-o", part) == 0
+    told = capsys.readouterr().out
+    for words in (
+        "0.1 x 0.2 x 0.1 m (x, y, z; y is up), 0.01 m per unit",
+        "closed",
+        "quality",
+        "median",
+        f"wrote {part}",
+    ):
+        assert words in told
+    mesh = dm.load(part)
+    assert np.ptp(mesh.points, axis=0) == pytest.approx([0.1, 0.2, 0.1], rel=tolerance("meshed_anew"))
+    np.testing.assert_allclose(mesh.volume.sum(), 2e-3, rtol=tolerance("meshed_anew"))
+    assert "decimated" not in told
+    assert run("mesh", scan, "-o", part) == 2
+    assert "would be overwritten; give --force, or another name" in capsys.readouterr().err
+
+
+def test_a_scan_without_its_unit_is_warned_of(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("trimesh", reason="needs the extra [mesh]")
+    monkeypatch.setattr(dm, "tetrahedralize", lambda *given: dm.cube(3))
+    with pytest.warns(
+        UserWarning, match=r"largest extent is 20 m.* scale=0\.001 \(--scale 0\.001\), or size= \(--size\)"
+    ):
+        assert run("mesh", scan, "-o", scan.with_name("part.vtu")) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["-o", "part.stl"], "--out: expected a name that ends in .msh, .vtu, .vtk, .mesh, .inp, got part.stl"),
+        (["-o", "nowhere/part.msh"], "directory nowhere does not exist"),
+        (["-o", "scan.ply"], "--out: expected another file than scan.ply"),
+    ],
+)
+def test_refusals_are_one_line(
+    scan: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
+) -> None:
+    monkeypatch.chdir(scan.parent)
+    assert run("mesh", scan.name, *arguments) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+
+
+def test_simulate_writes_gltf_and_says_early_what_usd_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dm.beam(3, 2, 2).save(tmp_path / "part.msh")
+    common = ["simulate", tmp_path / "part.msh", "--steps", 2, "--pin", "x-:0.1"]
+    (tmp_path / "part_0000.vtu").touch()  # of a series of the same name, which is not written here
+    assert run(*common, "--out", tmp_path / "part.glb") == 0
+    assert (tmp_path / "part.glb").read_bytes()[:4] == b"glTF"
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    monkeypatch.setattr("diffvbd.cli_scene.scene", lambda *_: pytest.fail("simulated first"))
+    assert run(*common, "--out", tmp_path / "part.usdc") == 2
+    assert "pip install 'diffvbd[exchange]'" in capsys.readouterr().err
+    assert run(*common, "--out", tmp_path / "part.avi") == 2
+    assert "--out: expected a name that ends in .pvd, .usd" in capsys.readouterr().err
+
+
+# --- `diffvbd view` shows files and runs, `diffvbd run --view` shows a run and changes no result ---
+
+
+pytest.importorskip("viser")
+
+
+def test_view_serves_a_file_until_it_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    dv.mesh.cube(3, 0.2).save(tmp_path / "part.vtu")
+    seen: list[str] = []
+
+    def stop(viewer: dv.viz.Viewer) -> None:
+        seen.append(viewer.url)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(dv.viz.Viewer, "wait", stop)
+    assert cli.main(["view", str(tmp_path / "part.vtu"), "--port", "8111"]) == 0
+    assert seen[0] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["none.pvd"], "none.pvd does not exist"),
+        (["part.vtu", "--color", "stress"], "color: stress needs a dv.Model, or a mesh with mu and lam"),
+        (
+            ["part.glb"],
+            "a mesh with tets or the folder of a run; .glb is for other programs",
+        ),
+        (["part.vtu", "--time-step", "-1"], "time_step: expected"),
+    ],
+)
+def test_view_says_what_is_wrong(
+    arguments: list[str], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    dv.mesh.cube(3, 0.2).save("part.vtu")
+    Path("part.glb").touch()
+    monkeypatch.setattr(dv.viz.Viewer, "wait", lambda viewer: None)
+    assert cli.main(["view", *arguments]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_run_that_is_viewed_finds_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    shown: list[tuple[Any, ...]] = []
+    update = dv.viz.Viewer.update
+
+    def counted(self: dv.viz.Viewer, x: Any = None, loss: Any = None, **parameters: Any) -> None:
+        shown.append((None if x is None else tuple(x.x.shape), loss, *parameters))
+        update(self, x, loss, **parameters)
+
+    monkeypatch.setattr(dv.viz.Viewer, "update", counted)
+    for name, more in (("plain", []), ("viewed", ["--view", "--port", "8112"])):
+        assert cli.main(["run", "beam-mu", "--quick", "--out", str(tmp_path / name), *more]) == 0
+    assert "live view at http://127.0.0.1:" in capsys.readouterr().err
+    plain, viewed = (json.loads((tmp_path / name / "log.json").read_text())["history"] for name in ("plain", "viewed"))
+    assert [row | {"seconds": 0} for row in plain] == [row | {"seconds": 0} for row in viewed]
+    assert len(shown) == len(viewed) and shown[0] == ((16, 54, 3), viewed[0]["loss"], "gradient_norm", "mu")
+    names = [*dv.viz.opened.opened(tmp_path / "viewed").motions]  # pyright: ignore[reportAttributeAccessIssue]
+    assert names == ["initial", "target", "recovered"]

@@ -61,8 +61,8 @@ class Throw:
         down = torch.tensor([0.0, -3.0, 0.0], dtype=torch.float64)  # which some parts detect more often
         v = (self.network(self.goals[part]) + self.goals[part, :1] * down)[:, None]
         v = v.expand(-1, self.model.num_vertices, -1)
-        end = dv.rollout(self.model, self.model.rest_points.expand_as(v), v, steps=3, mu=1e4, lam=1e4, time_step=0.02,
-                         sweeps=5, save="last")  # fmt: skip
+        end = dv.rollout(self.model, self.model.rest_points.expand_as(v), v, dv.VBD(0.02, 5), steps=3, mu=1e4, lam=1e4,
+                         save="last")  # fmt: skip
         return (end.x[-1].mean(-2) - self.goals[part]).square().sum() / SCENES
 
 
@@ -210,7 +210,8 @@ def check_not_zero(found: dict[str, Any]) -> None:
     assert "at [0, 40, 0]" in found["forces"]["error"]
 
 
-@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [2, 3])
 def test_ranks_have_the_bits_of_one(ranks: int, tmp_path: Path) -> None:
     alone = work(tmp_path)
     check_not_zero(alone)

@@ -18,6 +18,8 @@ namespace diffvbd {
 
 using torch::headeronly::ScalarType;
 
+constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes on CUDA; a batch that needs more is worked on in chunks
+
 inline void require(bool condition, const char* message) {
   if (!condition) throw std::invalid_argument(message);
 }

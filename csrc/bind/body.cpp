@@ -7,8 +7,8 @@
 namespace diffvbd {
 namespace {
 
-// The rigid correction of each body that is listed, and the velocity (x - x_prev) / h. groups: how many bodies a thread,
-// a part of a warp, a block and the whole device work on (CUDA).
+// The rigid correction of each body that is listed, and the velocity (x - x_prev) / h. groups: how many bodies a
+// thread, a part of a warp, a block and the whole device work on (CUDA).
 DIFFVBD_OPERATOR(Out<2>, rigid, DIFFVBD_PARAMETERS(RIGID) Ints groups, Ints data_count, double time_step) {
   const Device device(x);
   const RigidFields f{DIFFVBD_ITEMS(RIGID)};
@@ -16,8 +16,8 @@ DIFFVBD_OPERATOR(Out<2>, rigid, DIFFVBD_PARAMETERS(RIGID) Ints groups, Ints data
     const auto in = rigid_inputs<T>(f, data_count, time_step);
     const Tensor out = device.like_x(), v = device.like_x();
     DIFFVBD_ON_CUDA(const Teams teams(groups, in.bodies, device, x);)
-    DIFFVBD_RUN(device, rigid_correct<T>, in, DIFFVBD_ON_CUDA(teams.groups, ) order.numel() < in.vertices,
-                data<T>(out), data<T>(v) DIFFVBD_ON_CUDA(, teams.work()));
+    DIFFVBD_RUN(device, rigid_correct<T>, in, DIFFVBD_ON_CUDA(teams.groups, ) order.numel() < in.vertices, data<T>(out),
+                data<T>(v) DIFFVBD_ON_CUDA(, teams.work()));
     return Out<2>(out, v);
   });
 }

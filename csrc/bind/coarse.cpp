@@ -1,4 +1,5 @@
-// Operators of a coarse space: its matrices, and what they are made of. The corrections themselves belong to the sweeps.
+// Operators of a coarse space: its matrices, and what they are made of. The corrections themselves belong to the
+// sweeps.
 #include "coarse.h"
 
 namespace diffvbd {
@@ -21,8 +22,8 @@ coarse::MatrixInputs<T> matrix_inputs(const CoarseFields& f, Ints sizes, double 
   return in;
 }
 
-// The matrices of all bodies, one after the other, or if factored their Cholesky factors (CUDA: inverses: a product with
-// one is many small sums at once, where factors are solved row after row).
+// The matrices of all bodies, one after the other, or if factored their Cholesky factors (CUDA: inverses: a product
+// with one is many small sums at once, where factors are solved row after row).
 DIFFVBD_OPERATOR(Tensor, coarse_matrix, DIFFVBD_PARAMETERS(COARSE) Ints sizes, double time_step, bool factored) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   const Device device(x_prev);

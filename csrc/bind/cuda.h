@@ -55,9 +55,9 @@ inline Tensor empty(const Tensor& like, Ints sizes, ScalarType dtype) {
   std::vector<int64_t> strides(sizes.size(), 1);
   for (size_t i = sizes.size(); i-- > 1;) strides[i - 1] = strides[i] * std::max<int64_t>(1, sizes[i]);
   AtenTensorHandle handle = nullptr;
-  const auto status = aoti_torch_empty_strided(static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(),
-                                               code->second, aoti_torch_device_type_cuda(), like.get_device_index(),
-                                               &handle);
+  const auto status =
+      aoti_torch_empty_strided(static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(), code->second,
+                               aoti_torch_device_type_cuda(), like.get_device_index(), &handle);
   if (status != AOTI_TORCH_SUCCESS) {
     const cudaError_t last = cudaPeekAtLastError();
     if (last != cudaSuccess && last != cudaErrorMemoryAllocation) check(last, "an allocation");

@@ -1,5 +1,6 @@
-// Lists of what the operators of a step read: their parameters and the structs that carry them follow from these, and so
-// do the NamedTuples in diffvbd/ops/fields.py. ADJOINT: what is differentiated, in the order of what a backward returns.
+// Lists of what the operators of a step read: their parameters and the structs that carry them follow from these, and
+// so do the NamedTuples in diffvbd/ops/fields.py. ADJOINT: what is differentiated, in the order of what a backward
+// returns.
 #pragma once
 
 #include <tuple>

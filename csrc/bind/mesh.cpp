@@ -10,9 +10,9 @@ namespace {
 DIFFVBD_OPERATOR(Tensor, pack_rest, In rest, In plan, Ints sizes) {
   const Device device(rest);
   const HostPlan host = plan_of(plan, rest, sizes);
-  require(rest.dim() == 3 && rest.size(1) == view_of(host).num_tets && rest.size(2) == kRestScalars &&
-              rest.is_contiguous(),
-          "diffvbd::pack_rest: expected contiguous rest of shape [scenes, tets, 7]");
+  require(
+      rest.dim() == 3 && rest.size(1) == view_of(host).num_tets && rest.size(2) == kRestScalars && rest.is_contiguous(),
+      "diffvbd::pack_rest: expected contiguous rest of shape [scenes, tets, 7]");
   return dispatch_float(rest, [&]<class T>(T) {
     Tensor out = device.empty({rest.size(0), view_of(host).slots, kRestRowOfPlan, kLanesOfPlan});
     DIFFVBD_RUN(device, pack_rest<T>, view_of(host), rest.size(0), data<const T>(rest), data<T>(out));
@@ -59,8 +59,8 @@ DIFFVBD_OPERATOR(Tensor, row_sum, In values) {
     const int64_t rows = values.size(0), columns = values.size(1);
     Tensor out = device.empty({rows});
     DIFFVBD_ON_CUDA(const Tensor partial = device.empty({cuda::partial_sums(rows, columns)});)
-    DIFFVBD_RUN(device, sum_rows<T>, data<const T>(values), rows, columns, DIFFVBD_ON_CUDA(data<T>(partial), )
-                data<T>(out));
+    DIFFVBD_RUN(device, sum_rows<T>, data<const T>(values), rows, columns,
+                DIFFVBD_ON_CUDA(data<T>(partial), ) data<T>(out));
     return out;
   });
 }

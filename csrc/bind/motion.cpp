@@ -47,7 +47,8 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In ma
     const Reader<T> read(x);
     in.held_bodies = read.flags("held_bodies", held_bodies, in.bodies);
     Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
-    const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)};
+    const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
+                                         data<T>(mass_bar)};
     DIFFVBD_RUN(device, reverse_motion<T>, in, out);
     return Out<3>(x_bar, mass_bar, move_bar);
   });
@@ -76,7 +77,8 @@ DIFFVBD_OPERATOR(Out<3>, contact_coast_backward, In bar, In x, In mass, In move,
     const Reader<T> read(x);
     in.held_bodies = read.flags("held_bodies", held_bodies, in.bodies);
     Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
-    const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)};
+    const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
+                                         data<T>(mass_bar)};
     DIFFVBD_RUN(device, reverse_coast<T>, in, chord, out);
     return Out<3>(x_bar, mass_bar, move_bar);
   });
@@ -170,14 +172,14 @@ contact::UnsupportedInputs<T> unsupported_inputs(const Tensor& x, const Tensor& 
 }
 
 // What is left of lift once forces have borne their part of each body's acceleration, see contact/unsupported.h; origin
-// and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by body [scenes,
-// bodies, 7 planes] where wanted.
+// and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by body
+// [scenes, bodies, 7 planes] where wanted.
 DIFFVBD_OPERATOR(Tensor, contact_unsupported, In x, In origin, In lift, In force, In mass, In planes, In held_bodies,
                  In body_order, In body_ptr, double time_step) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr,
-                                          time_step);
+    const auto in =
+        unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
     Tensor out = device.like_x();
     DIFFVBD_RUN(device, residual_acceleration<T>, in, data<T>(out));
     return out;
@@ -187,8 +189,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_unsupported_backward, In bar, In x, In origin, 
                  In held_bodies, In body_order, In body_ptr, double time_step, bool wants_planes) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr,
-                                          time_step);
+    const auto in =
+        unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
     const int64_t b = in.scene.scenes, v = in.scene.vertices;
     const Tensor x_bar = device.empty({in.planes > 0 ? b : 0, v, 3}), lift_bar = device.like_x(),
                  force_bar = device.zeros({b, in.corners, 3}), mass_bar = device.empty({b, v});

@@ -1,5 +1,5 @@
-// One entry for each operator: DIFFVBD_OPERATOR(returns, name, parameters) { body }. Its schema follows from the text of
-// its parameters, and each backend that compiles the entry registers it.
+// One entry for each operator: DIFFVBD_OPERATOR(returns, name, parameters) { body }. Its schema follows from the text
+// of its parameters, and each backend that compiles the entry registers it.
 #pragma once
 
 #include <torch/csrc/stable/library.h>
@@ -38,8 +38,8 @@ constexpr size_t returns(const std::tuple<T...>*) {
 // "In x, double h" -> "name(Tensor x, float h) -> (Tensor, Tensor)"
 inline std::string schema_of(const char* name, const std::string& parameters, size_t tensors) {
   const std::pair<const char*, const char*> types[] = {
-      {"In", "Tensor"},     {"Tensors", "Tensor[]"}, {"Ints", "int[]"},  {"Numbers", "float[]"},
-      {"Flags", "bool[]"},  {"int64_t", "int"},      {"double", "float"}, {"bool", "bool"},
+      {"In", "Tensor"},    {"Tensors", "Tensor[]"}, {"Ints", "int[]"},   {"Numbers", "float[]"},
+      {"Flags", "bool[]"}, {"int64_t", "int"},      {"double", "float"}, {"bool", "bool"},
   };
   std::string out = std::string(name) + "(";
   for (size_t begin = 0; begin < parameters.size();) {
@@ -68,17 +68,17 @@ inline std::string schema_of(const char* name, const std::string& parameters, si
 #define DIFFVBD_SCHEMA(Returns, name, ...)
 #else
 #define DIFFVBD_BACKEND CPU
-#define DIFFVBD_SCHEMA(Returns, name, ...)                                                                          \
-  STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {                                                                       \
+#define DIFFVBD_SCHEMA(Returns, name, ...)                                                                           \
+  STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {                                                                        \
     m.def(::diffvbd::schema_of(#name, DIFFVBD_TEXT(__VA_ARGS__), ::diffvbd::returns(static_cast<Returns*>(nullptr))) \
-              .c_str());                                                                                            \
+              .c_str());                                                                                             \
   }
 #endif
 
-#define DIFFVBD_OPERATOR(Returns, name, ...)                                      \
-  static Returns name##_operator(__VA_ARGS__);                                    \
-  DIFFVBD_SCHEMA(Returns, name, __VA_ARGS__)                                      \
-  DIFFVBD_IMPLEMENTATION(DIFFVBD_BACKEND, name)                                   \
+#define DIFFVBD_OPERATOR(Returns, name, ...)    \
+  static Returns name##_operator(__VA_ARGS__);  \
+  DIFFVBD_SCHEMA(Returns, name, __VA_ARGS__)    \
+  DIFFVBD_IMPLEMENTATION(DIFFVBD_BACKEND, name) \
   static Returns name##_operator(__VA_ARGS__)
 #define DIFFVBD_IMPLEMENTATION(backend, name) DIFFVBD_IMPLEMENTATION_(backend, name)
 #define DIFFVBD_IMPLEMENTATION_(backend, name) \

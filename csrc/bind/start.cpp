@@ -11,9 +11,11 @@
 namespace diffvbd {
 namespace {
 
-// --- translations of islands ------------------------------------------------------------------------------------------
+// --- translations of islands
+// ------------------------------------------------------------------------------------------
 
-// The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of FloorBarrier.
+// The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of
+// FloorBarrier.
 DIFFVBD_OPERATOR(Tensor, contact_lowest, In x, In origin, In planes, In body_order, In body_ptr, In island) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
@@ -54,7 +56,8 @@ DIFFVBD_OPERATOR(Tensor, contact_translation, In move, In mass, In x, In origin,
                  In body_order, In body_ptr, In island, In lowest) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = translation_inputs<T>(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest);
+    const auto in =
+        translation_inputs<T>(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest);
     Tensor out = device.empty({in.scenes, in.bodies, 3});
     const Tensor sums = device.empty({in.scenes, in.bodies, 4});
     DIFFVBD_RUN(device, translation<T>, in, data<T>(sums), data<T>(out));
@@ -65,7 +68,8 @@ DIFFVBD_OPERATOR(Out<4>, contact_translation_backward, In u_bar, In move, In mas
                  In body, In body_order, In body_ptr, In island, In lowest) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = translation_inputs<T>(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest);
+    const auto in =
+        translation_inputs<T>(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest);
     const int64_t b = in.scenes, v = in.vertices, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
     const T* given = Reader<T>(x).like("u_bar", u_bar, 3 * b * in.bodies);
     Tensor move_bar = device.like_x(), mass_bar = device.empty({b, v});
@@ -116,7 +120,8 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
   });
 }
 
-// --- lists of pairs ---------------------------------------------------------------------------------------------------
+// --- lists of pairs
+// ---------------------------------------------------------------------------------------------------
 
 // constants with the gaps of the pairs where the vertices are now, see contact/narrow.h.
 DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, In pairs, In constants, In ptr) {
@@ -159,7 +164,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
     for (int64_t i = 0; i < in.count; ++i) kept[i + 1] = kept[i] + contact::stays(in, i);
     if (exact) capacity = kept.back();
 #endif
-    const Tensor rows = device.empty({capacity}, ScalarType::Long), constants_out = device.empty({capacity, contact::kConstants}),
+    const Tensor rows = device.empty({capacity}, ScalarType::Long),
+                 constants_out = device.empty({capacity, contact::kConstants}),
                  pairs_out = device.empty({capacity, contact::kPairRow}, ScalarType::Int),
                  ptr_out = device.empty({ptr.numel()}, ScalarType::Int),
                  entry_out = device.empty({4 * capacity}, ScalarType::Int);
@@ -184,7 +190,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
   });
 }
 
-// --- what sweeps keep of the start of a step --------------------------------------------------------------------------
+// --- what sweeps keep of the start of a step
+// --------------------------------------------------------------------------
 
 // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of where corner points are
 // [B, N, 3] and of kappa.
@@ -242,9 +249,9 @@ DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x
     const Reader<T> read(x);
     const auto by = lag_coefficients(friction, damping, read);
     const int64_t b = x.size(0), rows = pairs.size(0) * contact::kLagScalars;
-    const contact::RubbingBars<T> given{lag_bar.numel() ? read.like("lag_bar", lag_bar, rows) : nullptr,
-                                        push_bar.numel() ? read.like("push_bar", push_bar, 3 * b * in.corners) : nullptr,
-                                        in.corners};
+    const contact::RubbingBars<T> given{
+        lag_bar.numel() ? read.like("lag_bar", lag_bar, rows) : nullptr,
+        push_bar.numel() ? read.like("push_bar", push_bar, 3 * b * in.corners) : nullptr, in.corners};
     Tensor points = device.empty({b, in.corners, 3}), kappa_bar = device.empty({b});
     Tensor friction_bar = device.empty({friction.numel() ? b : 0});
     Tensor damping_bar = device.empty({damping.numel() ? b : 0});
@@ -256,7 +263,8 @@ DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x
   });
 }
 
-// --- ways above a floor, and shares of ways ---------------------------------------------------------------------------
+// --- ways above a floor, and shares of ways
+// ---------------------------------------------------------------------------
 
 template <class T>
 contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u, const Tensor& way,
@@ -300,8 +308,8 @@ DIFFVBD_OPERATOR(Out<4>, contact_above_floor_backward, In bar, In x, In u, In wa
   });
 }
 
-// Of most entries that follow: which vertices are held, bodies of which one is, the body of each vertex, and vertices by
-// body.
+// Of most entries that follow: which vertices are held, bodies of which one is, the body of each vertex, and vertices
+// by body.
 #define DIFFVBD_BODIES In held, In held_bodies, In body, In body_order, In body_ptr
 struct IndexTensors {
   const Tensor &held, &held_bodies, &body, &order, &ptr;
@@ -353,9 +361,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_frames, In x, In move, In u, In way, In left, I
     Tensor rooms = device.empty({b, v}), own_rooms = device.empty({own ? b : 0, v});
     device.bodies(contact::Frames<T>{in, read.vectors("way", way), read.like("stretch", stretch, b * bodies),
                                      read.like("room", room, b * (bodies + 1)),
-                                     own ? read.like("own_room", own_room, b * (bodies + 1)) : nullptr,
-                                     data<T>(limit), data<T>(ways), data<T>(center), data<T>(rooms),
-                                     data<T>(own_rooms)});
+                                     own ? read.like("own_room", own_room, b * (bodies + 1)) : nullptr, data<T>(limit),
+                                     data<T>(ways), data<T>(center), data<T>(rooms), data<T>(own_rooms)});
     return Out<5>(limit, ways, center, rooms, own_rooms);
   });
 }
@@ -419,8 +426,8 @@ DIFFVBD_OPERATOR(Out<3>, contact_falls, In x, In move, In fall, In u, In left, I
     const Reader<T> read(x);
     in.fall = read.vectors("fall", fall), in.share = read.of_vertices("share", share);
     Tensor went = device.empty({read.b, read.v}), at = device.like_x(), way = device.like_x();
-    device.vertices(contact::Falls<T>{in, read.bytes("state", state, read.b * read.v), data<T>(went), data<T>(at),
-                                      data<T>(way)});
+    device.vertices(
+        contact::Falls<T>{in, read.bytes("state", state, read.b * read.v), data<T>(went), data<T>(at), data<T>(way)});
     return Out<3>(went, at, way);
   });
 }
@@ -454,10 +461,10 @@ DIFFVBD_OPERATOR(Out<6>, contact_start_backward, In bar, In x, In move, In fall,
     const Tensor x_bar = device.like_x(), move_bar = device.like_x(), fall_bar = device.like_x(),
                  u_bar = device.like_x(), left_bar = device.like_x(),
                  planes_bar = device.empty({read.b, read.v, wants_planes ? in.floor_scalars : 0});
-    device.vertices(contact::ReverseStarts<T>{
-        in,
-        {read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar), data<T>(fall_bar), data<T>(u_bar),
-         data<T>(left_bar), data_or_null<T>(planes_bar)}});
+    device.vertices(
+        contact::ReverseStarts<T>{in,
+                                  {read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar), data<T>(fall_bar),
+                                   data<T>(u_bar), data<T>(left_bar), data_or_null<T>(planes_bar)}});
     return Out<6>(x_bar, move_bar, fall_bar, u_bar, left_bar, planes_bar);
   });
 }

@@ -13,7 +13,7 @@ namespace {
 // data_count: scalars per scene, or per vertex, of each energy of one vertex
 // launch: on CUDA the regime of the sweeps, that of their reverse, the threads per vertex of both; else empty
 // coarse: sizes of the plan of a coarse space, and 1 where the first sweep of the step comes before these; else empty
-#define DIFFVBD_SETTINGS                                                                                              \
+#define DIFFVBD_SETTINGS                                                                                             \
   In plan, Ints sizes, int64_t energies, Ints data_count, Numbers numbers, int64_t sweeps, Ints launch, Ints coarse, \
       int64_t tape_policy
 struct SweepSettings {
@@ -25,8 +25,7 @@ struct SweepSettings {
   Ints launch, coarse;
   int64_t tape_policy;
 };
-#define DIFFVBD_SETTINGS_ITEMS \
-  { sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy }
+#define DIFFVBD_SETTINGS_ITEMS {sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy}
 constexpr size_t kNumbers = 8, kFrictionEps = 7;
 
 #ifdef USE_CUDA
@@ -105,7 +104,8 @@ struct Given {
       const bool elastic = (in.energies & kElastic) != 0;
       require(!elastic || f.corners_prev.numel() == kPrevScalars * in.scenes * tets,
               "diffvbd::sweep: expected the corners' positions at the start of the step");
-      const Batched<const T> all = batched_or_null<T>("corners_prev", f.corners_prev, x, kPrevScalars, in.scenes * tets);
+      const Batched<const T> all =
+          batched_or_null<T>("corners_prev", f.corners_prev, x, kPrevScalars, in.scenes * tets);
       for (int i = 0; elastic && i < kPrevScalars; ++i) {
         in.material[kMaterialScalars + i] = {all.data + i * in.scenes * tets, tets, 1};
       }
@@ -195,8 +195,6 @@ int64_t product(Ints sizes) {
 }
 
 #ifdef USE_CUDA
-
-constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes; a batch that needs more is worked on in chunks
 
 // The regime and threads per vertex that Python chose for one direction, and what the device adds. A tape of one regime
 // is that of any other, but for a scene per thread.
@@ -288,9 +286,7 @@ void make_body_bars(Bars& bars, const In& in, const HostPlan& host, const bool (
   DIFFVBD_ON_CUDA(const bool shared = one_for_items(in.material);)
   const int64_t materials = DIFFVBD_ON_CUDA(shared ? 1 :) tets;
   const bool clear = !kOnCuda || (in.energies & kElastic) == 0;  // nothing writes what no tet has
-  const auto wanted = [&](bool wish, Ints shape, bool zero) {
-    return wish ? device(shape, zero) : device.empty({0});
-  };
+  const auto wanted = [&](bool wish, Ints shape, bool zero) { return wish ? device(shape, zero) : device.empty({0}); };
   bars.mu = wanted(wants[0], {b, materials}, clear), bars.lam = wanted(wants[0], {b, materials}, clear);
   bars.mass = wanted(wants[1], {b, vertices}, !kOnCuda);
   bars.rest = wanted(wants[2], {b, tets, kRestScalars}, clear);

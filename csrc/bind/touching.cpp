@@ -12,8 +12,8 @@ struct TouchingSettings {
   double time_step, friction_eps;
 };
 
-// move: what is tried, memory of the operator, or null. groups [B, 4, bodies]: as contact/groups.h has them; empty where
-// they do not matter, or all bodies are one.
+// move: what is tried, memory of the operator, or null. groups [B, 4, bodies]: as contact/groups.h has them; empty
+// where they do not matter, or all bodies are one.
 template <class T>
 contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q, const T* move,
                                         const Tensor& groups) {
@@ -69,10 +69,10 @@ DIFFVBD_ON_CUDA(cuda::PairCapacity room_of(const TouchingFields& f) {
 })
 
 // The Newton step of the rigid motions of all bodies of a scene, float64: centers of mass [scenes, bodies, 3], motion
-// [scenes, bodies, 6], the factors of groups that touch, in the memory [scenes, bodies, 6, 6 most] that contact/groups.h
-// says, and groups [scenes, 4, bodies]; of few bodies one factor [scenes, 6 bodies, 6 bodies], and no groups. moving
-// [scenes, bodies]: only groups of these bodies move; or [0]: all do. alone: of many bodies only groups of one do, with
-// factors [scenes, bodies, 6, 6].
+// [scenes, bodies, 6], the factors of groups that touch, in the memory [scenes, bodies, 6, 6 most] that
+// contact/groups.h says, and groups [scenes, 4, bodies]; of few bodies one factor [scenes, 6 bodies, 6 bodies], and no
+// groups. moving [scenes, bodies]: only groups of these bodies move; or [0]: all do. alone: of many bodies only groups
+// of one do, with factors [scenes, bodies, 6, 6].
 DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
                  double friction_eps, In moving, bool alone) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -80,15 +80,16 @@ DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints
   require_positions(x);
   const int64_t b = x.size(0), n = ptr.numel() - 1, six = contact::kUnknowns;
   const bool few = n <= contact::kFew;
-  Tensor groups = device.empty(few ? std::vector<int64_t>{0} : std::vector<int64_t>{b, contact::kGroupRows, n},
-                               ScalarType::Int);
+  Tensor groups =
+      device.empty(few ? std::vector<int64_t>{0} : std::vector<int64_t>{b, contact::kGroupRows, n}, ScalarType::Int);
   return dispatch_float(x, [&]<class T>(T) {
     auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, nullptr, groups);
     set_moving(in, moving, alone, x);
-    Tensor centers = device.empty({b, n, 3}, ScalarType::Double), motion = device.empty({b, n, six}, ScalarType::Double);
-    Tensor factor = device.empty(few ? std::vector<int64_t>{b, six * n, six * n}
-                                     : std::vector<int64_t>{b, n, six, six * int64_t{in.room}},
-                                 ScalarType::Double);
+    Tensor centers = device.empty({b, n, 3}, ScalarType::Double),
+           motion = device.empty({b, n, six}, ScalarType::Double);
+    Tensor factor = device.empty(
+        few ? std::vector<int64_t>{b, six * n, six * n} : std::vector<int64_t>{b, n, six, six * int64_t{in.room}},
+        ScalarType::Double);
     DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_system_bytes(in, room_of(f)));)
     DIFFVBD_RUN(device, rigid_system<T>, in, DIFFVBD_ON_CUDA(room_of(f), ) data<double>(centers), data<double>(motion),
                 data<double>(factor), in.groups ? data<int32_t>(groups) : nullptr DIFFVBD_ON_CUDA(, work.data_ptr()));
@@ -96,9 +97,9 @@ DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints
   });
 }
 
-// The state after each body has taken what it may of its motion [scenes, bodies, 6]; that share [scenes, bodies], zero of
-// what does not move beside a mask `moving`; whether it has a motion; whether it was held up where others that were have
-// gone on; and how much of its shift is left [m].
+// The state after each body has taken what it may of its motion [scenes, bodies, 6]; that share [scenes, bodies], zero
+// of what does not move beside a mask `moving`; whether it has a motion; whether it was held up where others that were
+// have gone on; and how much of its shift is left [m].
 DIFFVBD_OPERATOR(Out<5>, contact_rigid_move, DIFFVBD_PARAMETERS(TOUCHING) In centers, In motion, Ints data_count,
                  double time_step, double friction_eps, In moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -146,10 +147,10 @@ struct WorkTensors {
   }
 };
 
-// Of the virtual work of two motions p and q of all corner points [scenes, N, 3] that pairs do: its derivatives by where
-// these points are, by p and by q [scenes, N, 3] each; since [scenes, N, 3]: the first of lagged pairs alone, or empty;
-// by kappa for each listed pair; and less those by what is lagged [lagged, 9]. This part of contact_rigid_reverse can so
-// be tested by itself.
+// Of the virtual work of two motions p and q of all corner points [scenes, N, 3] that pairs do: its derivatives by
+// where these points are, by p and by q [scenes, N, 3] each; since [scenes, N, 3]: the first of lagged pairs alone, or
+// empty; by kappa for each listed pair; and less those by what is lagged [lagged, 9]. This part of
+// contact_rigid_reverse can so be tested by itself.
 DIFFVBD_OPERATOR(Out<6>, contact_rigid_backward, DIFFVBD_PARAMETERS(TOUCHING) In p, In q, In groups, Ints data_count,
                  double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -169,8 +170,8 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_backward, DIFFVBD_PARAMETERS(TOUCHING) In
 
 // The adjoint of corrections one after another, each from `at` [scenes, V, 3], by its motion, share, factor and groups,
 // of that of where the last one led, x_bar [scenes, V, 3]: of the first `at`, x_prev, y and mass, of data as of
-// rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed pair adds
-// to that of kappa, and of lag.
+// rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed pair
+// adds to that of kappa, and of lag.
 DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors motion, Tensors share,
                  Tensors factor, Tensors groups, In x_bar, Ints data_count, double time_step, double friction_eps,
                  bool wants_data) {
@@ -200,7 +201,8 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
     const Tensor p = device.zeros({b, corners, 3}), q = device.zeros({b, corners, 3}), way = device.empty({b, v, 3});
     const RigidBars bars(last.scene, true, wants_data, [&](Ints sizes, bool) { return device.zeros(sizes); });
     const Tensor floor_out = device.zeros({last.planes > 0 ? b : 0, v, last.planes, contact::kFloorLag});
-    const Tensor collider_out = device.zeros({b, corners - v, 3}), collider_prev_out = device.zeros({b, corners - v, 3});
+    const Tensor collider_out = device.zeros({b, corners - v, 3}),
+                 collider_prev_out = device.zeros({b, corners - v, 3});
     const contact::CorrectionAdjoints<T> out{bars.pointers<T>(nullptr, nullptr), data_or_null<T>(floor_out),
                                              data<T>(collider_out), data<T>(collider_prev_out)};
     const Tensor solution = device.empty({b, last.bodies(), contact::kUnknowns}, ScalarType::Double);
@@ -214,8 +216,18 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
                  *factors = data<const double>(factor[k]);
       double* l = data<double>(solution);
 #ifdef USE_CUDA
-      const cuda::RigidReverse<T> own{motions,    shares,    factors,      end_bar, l,    data<T>(p),
-                                      data<T>(q), data<T>(way), work, sums, data<int32_t>(pushing), out};
+      const cuda::RigidReverse<T> own{motions,
+                                      shares,
+                                      factors,
+                                      end_bar,
+                                      l,
+                                      data<T>(p),
+                                      data<T>(q),
+                                      data<T>(way),
+                                      work,
+                                      sums,
+                                      data<int32_t>(pushing),
+                                      out};
       DIFFVBD_RUN(device, rigid_contact_backward<T>, in, own);
 #else
       rigid_end_backward<T>(in, motions, shares, end_bar, l, data<T>(way), out.vertices.mass);

@@ -31,7 +31,8 @@ void for_items(int64_t scenes, int64_t items, int64_t grain, const F& f) {
   });
 }
 
-// --- the start of a step, the rigid correction, potentials ------------------------------------------------------------
+// --- the start of a step, the rigid correction, potentials
+// ------------------------------------------------------------
 
 // others: whether some vertices are in no body that is corrected
 template <class T>
@@ -146,17 +147,17 @@ void energy_increase(const coarse::RiseInputs<T>& in, double* out) {
   });
 }
 
-// --- contact ----------------------------------------------------------------------------------------------------------
+// --- contact
+// ----------------------------------------------------------------------------------------------------------
 
 template <class T>
 void residual_acceleration(const contact::UnsupportedInputs<T>& in, T* out) {
-  for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
-    contact::leave_unsupported(in, b, team, out);
-  });
+  for_bodies(in.scene,
+             [&](const rigid::Body<T>& b, const Threads& team) { contact::leave_unsupported(in, b, team, out); });
 }
 template <class T>
 void residual_acceleration_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
-                          const contact::UnsupportedAdjoints<T>& out) {
+                                    const contact::UnsupportedAdjoints<T>& out) {
   for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
     contact::reverse_unsupported(in, b, team, bar, out);
   });
@@ -257,8 +258,7 @@ void for_pairs(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, 
 }
 // Adds what the corners of a pair receive to points [B, N, 3].
 template <class T>
-void add_at_corners(const contact::ContactInputs<T>& in, const int32_t* record, const Vec3<T> (&values)[4],
-                    T* points) {
+void add_at_corners(const contact::ContactInputs<T>& in, const int32_t* record, const Vec3<T> (&values)[4], T* points) {
   for (int k = 0; k < 4; ++k) contact::add_at(points + 3 * (record[5] * in.corners + record[k]), values[k]);
 }
 
@@ -281,8 +281,8 @@ void pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t 
   });
 }
 template <class T>
-void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x, int64_t scenes,
-             int64_t pairs, T* values, T* push) {
+void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
+                     int64_t scenes, int64_t pairs, T* values, T* push) {
   std::fill_n(values, pairs * contact::kLagScalars, T(0)), std::fill_n(push, 3 * scenes * in.corners, T(0));
   for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
     const auto state = contact::lag_state(record[4], corners, a, stiffness);
@@ -296,8 +296,8 @@ void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoef
 // friction and damping may be null
 template <class T>
 void lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                      const contact::RubbingBars<T>& given, const T* x, int64_t scenes, T* points, T* kappa,
-                      T* friction, T* damping) {
+                              const contact::RubbingBars<T>& given, const T* x, int64_t scenes, T* points, T* kappa,
+                              T* friction, T* damping) {
   std::fill_n(points, 3 * scenes * in.corners, T(0));
   for (T* bars : {kappa, friction, damping}) {
     if (bars) std::fill_n(bars, scenes, T(0));
@@ -313,7 +313,8 @@ void lagged_friction_backward(const contact::ContactInputs<T>& in, const contact
   });
 }
 
-// --- sums over a mesh -------------------------------------------------------------------------------------------------
+// --- sums over a mesh
+// -------------------------------------------------------------------------------------------------
 
 template <class T>
 void gather_rows(const T* values, const int64_t* index, int64_t scenes, int64_t vertices, int64_t n, int64_t c,
@@ -323,7 +324,8 @@ void gather_rows(const T* values, const int64_t* index, int64_t scenes, int64_t 
 template <class T>
 void sum_segments(const T* values, const int64_t* ptr, const int32_t* entry, int64_t scenes, int64_t n,
                   int64_t segments, int64_t c, T* out) {
-  for (int64_t i = 0; i < scenes; ++i) sum_segments(values + i * n * c, ptr, entry, segments, c, out + i * segments * c);
+  for (int64_t i = 0; i < scenes; ++i)
+    sum_segments(values + i * n * c, ptr, entry, segments, c, out + i * segments * c);
 }
 template <class T>
 void sum_rows(const T* values, int64_t rows, int64_t columns, T* out) {

@@ -454,7 +454,7 @@ class TrialRuns:
 def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
               quantity: Quantity | None, gradient: bool, given: dict[str, Any], progress: bool = False
               ) -> TrialRuns:  # fmt: skip
-    """Trial runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises of
+    """Trial runs of a scene, with the gradients that are asked for. A first short step raises what rollout raises of
     the arguments."""
     refuse_transforms("dv.advise and dv.error_budget, which look at values")
     sorted_inputs(model, given)
@@ -651,7 +651,7 @@ class _Search:
     # --- the refinement -----------------------------------------------------------------------------------------------
 
     def _climb(self) -> tuple[bool, str]:
-        """Runs with more steps each time until the last one has half of the wanted error; or why it cannot be reached."""
+        """Runs with more steps each time until the last one has half of the wanted error, or why it cannot be."""
         p, settings = self.trials, start_of(self.trials)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []

@@ -124,8 +124,8 @@ class Throw:
     ) -> dv.results.Trajectory:
         bars = self.x + (self.heights(raw)[:steps] @ self.lifts.flatten(1)).unflatten(-1, (-1, 3))
         solver = dv.VBD(self.time_step, SWEEPS, start="predictor")
-        return dv.rollout(model, self.x, torch.zeros_like(self.x), solver, steps=steps, save=save, checkpoint_every=None,
-                          mu=self.mu, lam=self.mu, prescribed=dv.per_step(bars))  # fmt: skip
+        return dv.rollout(model, self.x, torch.zeros_like(self.x), solver, steps=steps, save=save,
+                          checkpoint_every=None, mu=self.mu, lam=self.mu, prescribed=dv.per_step(bars))  # fmt: skip
 
     def loss(self) -> Tensor:
         ball = self.simulate(self.raw, self.model, self.steps).x[-1, self.part]

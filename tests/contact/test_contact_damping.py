@@ -28,8 +28,7 @@ def landing(gap: float, damping: float, support: str = "pairs", **options: Any) 
     model = dv.Model(mesh, energies=(dv.StableNeoHookean(), barrier), density=100.0)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     v[-upper.num_vertices :, 1] = -0.5
-    return dv.step(model, x, v, mu=1e4, lam=1e4, time_step=0.005, sweeps=5, gravity=(0, 0, 0),
-                   **options)[0]  # fmt: skip
+    return dv.step(model, x, v, dv.VBD(0.005, 5), mu=1e4, lam=1e4, gravity=(0, 0, 0), **options)[0]  # fmt: skip
 
 
 @pytest.mark.parametrize("support", SUPPORTS)
@@ -50,7 +49,7 @@ def test_a_barrier_that_is_none_damps_nothing_and_has_a_gradient(support: str, n
     assert torch.equal(*slopes) and slopes[0] != 0
 
 
-@pytest.mark.parametrize("name", ("pair_barrier.damping", "friction.coefficient"))
+@pytest.mark.parametrize("name", ("pair_damping", "friction"))
 def test_none_is_as_much_as_zero(name: str) -> None:
     """Of damping or of friction, beside the other."""
 
@@ -64,7 +63,7 @@ def test_none_is_as_much_as_zero(name: str) -> None:
         end = dv.step(model, model.rest_points, v, **STEP, **options)[0]
         return end, torch.autograd.grad(end.square().sum(), v)[0]
 
-    damps = name == "friction.coefficient"
+    damps = name == "friction"
     none = ends(rubs=not damps, damping=5.0 if damps else 0.0)
     zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
     given = ends(rubs=True, damping=5.0 if damps else 0.0, parameters={name: zero})
@@ -102,13 +101,15 @@ def test_speed_and_gradient_of_a_damped_bounce() -> None:
     points = [[0.0, 0.03, 0.0], [0.0, 0.03, 0.1], [0.1, 0.03, 0.0], [0.03, 0.13, 0.02]]
     kappa, damping, seconds = 200.0, 3.0, 0.05
     barrier = dv.FloorBarrier(kappa=kappa, dhat=DHAT, damping=damping)
-    model = dv.Model(dv.mesh.TetMesh(points, [[0, 1, 2, 3]]), energies=(dv.StableNeoHookean(), barrier), rigid=False)
+    model = dv.Model(dv.mesh.TetMesh(points, [[0, 1, 2, 3]]), energies=(dv.StableNeoHookean(), barrier))
     x = model.rest_points
 
     def end(steps: int) -> torch.Tensor:
         speed = torch.tensor(-1.0, dtype=torch.float64, requires_grad=True)
         v = torch.stack([0 * speed, speed, 0 * speed]).expand(4, 3)
-        last = dv.rollout(model, x, v, steps=steps, mu=0.0, lam=0.0, time_step=seconds / steps, sweeps=5, save="last")
+        last = dv.rollout(
+            model, x, v, dv.VBD(seconds / steps, 5, subspace=None), steps=steps, mu=0.0, lam=0.0, save="last"
+        )
         reached = last.v[-1][0, 1]
         return torch.stack([reached.detach(), torch.autograd.grad(reached, speed)[0]])
 

@@ -10,7 +10,6 @@ from conftest import DEVICES
 
 import diffvbd as dv
 from diffvbd.mesh import box, join
-from diffvbd.ops.contact_rigid import MOST_COUPLED
 from diffvbd.step.contact_cycles import MOST_DETECTIONS, parts_of
 from diffvbd.testing.tolerances import tolerance
 
@@ -44,8 +43,8 @@ def test_only_fast_motion_beside_others_takes_more_than_one(dtype: torch.dtype, 
             v[:, 1] = -speed
         out = []
         for _ in range(3):
-            with dv.contact.record() as found:
-                x, v = dv.step(model, x, v, time_step=1 / 60, sweeps=4, **MATERIAL)
+            with dv.record("contact") as found:
+                x, v = dv.step(model, x, v, dv.VBD(1 / 60, 4), **MATERIAL)
             out.append(len(found))
             assert len(dv.contact.intersections(model, x)) == 0
         return out
@@ -64,7 +63,7 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
         mass = model.mass[:, None]
         first = (mass * v).sum(0)
         for _ in range(STEPS):
-            x, v = dv.step(model, x, v, time_step=1 / 60, sweeps=sweeps, **MATERIAL)
+            x, v = dv.step(model, x, v, dv.VBD(1 / 60, sweeps), **MATERIAL)
         assert float((mass * v)[: len(v) - 64].sum(0).norm()) > 0.2 * float(first.norm())  # they did collide
         return float(((mass * v).sum(0) - first).norm() / first.norm())
 
@@ -94,8 +93,8 @@ def test_a_row_that_is_struck_keeps_its_momentum(count: int, gap: float, speed: 
     mass = model.mass[:, None]
     first, shares = (mass * v).sum(0), []
     for _ in range(math.ceil((count - 1) * gap / speed / 0.01) + count):
-        with dv.contact.record() as found:
-            x, v = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))
+        with dv.record("contact") as found:
+            x, v = dv.step(model, x, v, dv.VBD(0.01, 10), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
         assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
         shares += [part.corrections for part in found]
     assert float(v[-1, 0]) > 0.05 * speed
@@ -108,8 +107,8 @@ def test_a_step_goes_on_for_the_scenes_of_which_pairs_hold_something_up(device: 
     scenes = torch.stack([v, 0.1 * v])
 
     def ends(v: torch.Tensor) -> tuple[torch.Tensor, list[Any]]:
-        with dv.contact.record() as found:
-            _, v = dv.step(model, x.expand_as(v), v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10,
+        with dv.record("contact") as found:
+            _, v = dv.step(model, x.expand_as(v), v, dv.VBD(0.01, 10), mu=4e5, lam=4e5,
                            gravity=(0.0, 0.0, 0.0))  # fmt: skip
         return v, found
 
@@ -128,64 +127,9 @@ def test_no_body_passes_through_one_that_could_turn_inside_out(device: str) -> N
     """In free flight they would have passed each other within the step, with the least potential of all."""
     model, x, v = meeting(40.0, device)
     v[:64, 1] = 40.0
-    end, _ = dv.step(model, x, v, time_step=1 / 60, sweeps=20, **MATERIAL)
+    end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 20), **MATERIAL)
     assert dv.contact.status(model).cut[0] > 0
     assert float((end - (x + v / 60)).abs().max()) > 0.1
-
-
-def apart(rows: list[tuple[int, float]], device: str) -> tuple[dv.Model, torch.Tensor, list[int]]:
-    """Rows of so many cubes 5 mm apart in one scene, 5 m from each other, and their vertices; velocities [V, 3] of the
-    first ones."""
-    cubes, v, sizes = [], [], []
-    for n, (count, speed) in enumerate(rows):
-        one = box(2, 0.1, split="kuhn")
-        cubes += [one.translate((0.105 * i, 0.003 * i, 5.0 * n + 0.002 * i)) for i in range(count)]
-        own = torch.zeros(count * one.num_vertices, 3, dtype=torch.float64)
-        own[: one.num_vertices, 0] = speed
-        v.append(own)
-        sizes.append(len(own))
-    barrier = dv.PairBarrier(kappa=1e5, dhat=1e-3, self_contact=False, detections=1)
-    model = dv.Model(join(cubes), energies=(dv.StableNeoHookean(), barrier), device=device)
-    return model, torch.cat(v).to(device), sizes
-
-
-def stepped(model: dv.Model, x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    return dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=5, gravity=(0.0, 0.0, 0.0))[1]
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("speed", (1.0, 3.0, 5.0))
-def test_what_rests_far_away_changes_no_row(speed: float, device: str) -> None:
-    alone, v, (size,) = apart([(3, speed)], device)
-    beside, w, _ = apart([(3, speed), (2, 0.0)], device)
-    ends = stepped(alone, alone.rest_points, v), stepped(beside, beside.rest_points, w)[:size]
-    assert float((ends[0] - v).abs().max()) > 0.1
-    assert float((ends[0] - ends[1]).abs().max()) <= tolerance("contact_forward") * speed
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_row_has_the_same_bits_in_a_batch(device: str) -> None:
-    model, v, _ = apart([(4, 3.0)], device)
-    scenes = torch.stack([v, 0.0 * v, 0.3 * v, 7.0 * v])
-    together = stepped(model, model.rest_points.expand(4, -1, -1), scenes)
-    for one, many in zip(scenes, together, strict=True):
-        assert torch.equal(stepped(model, model.rest_points, one), many)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_row_that_is_held_up_counts_as_cut_beside_a_pile(device: str) -> None:
-    """Of which each body is left alone, and corrected longer than the row."""
-    row, pile = (10, 5.0), (MOST_COUPLED + 2, 0.0)
-    counts = []
-    for rows in ([row], [row, pile]):
-        model, v, sizes = apart(rows, device)
-        x = model.rest_points.clone()
-        if len(sizes) > 1:  # so that they touch
-            pushed = torch.arange(sizes[1] // 8, dtype=x.dtype, device=x.device).repeat_interleave(8)
-            x[sizes[0] :, 0] -= 0.0045 * pushed
-        stepped(model, x, v)
-        counts.append(dv.contact.status(model).cut[0])
-    assert 0 < counts[0] <= counts[1]
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -195,21 +139,15 @@ def test_corrections_of_a_row_that_is_struck_are_differentiated(device: str) -> 
     aside = torch.linspace(1.0, -0.5, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape).sin()
 
     def end(v: torch.Tensor) -> torch.Tensor:
-        _, after = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=3, gravity=(0.0, 0.0, 0.0))
+        _, after = dv.step(model, x, v, dv.VBD(0.01, 3), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
         return (weights * after).sum()
 
     v = v + 1e-3 * aside.flip(0)  # alike velocities are a tie, where a step may jump
     start = v.clone().requires_grad_()
-    with dv.contact.record() as found:
+    with dv.record("contact") as found:
         (slope,) = torch.autograd.grad(end(start), start)
     assert len(found[-1].corrections) > 2
     eps = 1e-6
     difference = float(end(v + eps * aside) - end(v - eps * aside)) / (2 * eps)
     assert abs(difference) > 1e-3
     assert abs(float((slope * aside).sum()) - difference) <= tolerance("finite_difference") * abs(difference)
-
-
-def test_a_rollout_says_where_a_row_lost_momentum() -> None:
-    model, x, v = row(10, 0.002, 5.0, "cpu", detections=1)
-    with pytest.warns(UserWarning, match="pairs held up .* lost velocity and momentum .* smaller time_step"):
-        dv.rollout(model, x, v, steps=10, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))

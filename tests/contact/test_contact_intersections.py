@@ -12,12 +12,11 @@ from helpers.two_boxes import STEP
 
 import diffvbd as dv
 from diffvbd import colliders
-from diffvbd.ops import detect as ops_contact
+from diffvbd.ops import contact as ops_contact
 from diffvbd.reference import intersections
 from diffvbd.testing.scenes import generator
 
 DTYPES = (torch.float64, torch.float32)
-TRIANGLE = Surface.of(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
 
 
 def arguments(s: Scene, device: str, dtype: torch.dtype, capacity: int) -> tuple:
@@ -84,26 +83,6 @@ def test_origins_are_added_in_double_precision(device: str, dtype: torch.dtype) 
     assert len(rows) > 20 and int(near.counts[0, 0]) > 20
 
 
-def test_one_edge_and_one_triangle(device: str) -> None:
-    """Numbers whose signs are exact. An end that touches is no crossing, a border that is met is one."""
-    cases = [
-        ([0.25, 0.25, -1], [0.25, 0.25, 1], True),
-        ([0.25, 0.25, 1], [0.25, 0.25, 2], False),  # above
-        ([0.75, 0.75, -1], [0.75, 0.75, 1], False),  # beside
-        ([0.25, 0.25, 0], [0.25, 0.25, 1], False),  # an end touches
-        ([0.25, 0.25, 0], [5, 5, 0], False),  # in the plane
-        ([0.5, 0.5, -1], [0.5, 0.5, 1], True),  # through a border
-        ([0.0, 0.0, -1], [0, 0, 1], True),  # through a corner
-        ([0.25, 0.25, 1], [0.25, 0.25, 1], False),  # without length
-        ([0.25, 0.25, np.nan], [0.25, 0.25, 1], False),  # nowhere
-    ]
-    for p, q, crossing in cases:
-        for ends in ([p, q], [q, p]):
-            edge = Surface(np.array(ends), edges=[[0, 1]], lone=[0, 1])
-            s = Scene.of([edge, TRIANGLE])
-            assert find(s, device).counts.tolist() == [[int(crossing), 0]], (p, q)
-
-
 def test_places_that_coincide_at_rest_do_not_cross(device: str) -> None:
     """A crack: the two triangles of a square share no vertex, and one border is doubled."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
@@ -131,42 +110,6 @@ def test_points_behind_planes(device: str, dtype: torch.dtype) -> None:
     assert find(Scene.of([sphere((0, 1, 0), 0.1)], [plane((0, 0, 0), (0, 0, 1), (1, 0, 0))])).counts[0, 1] == 0
 
 
-def test_capacity_threads_and_nothing(device: str) -> None:
-    s = tangled()
-    whole = find(s, device)
-    rows = {tuple(row) for row in whole.pairs.tolist()}
-    for capacity in (0, 3):
-        few = find(s, device, capacity=capacity)
-        assert torch.equal(few.counts, whole.counts) and torch.equal(few.first, whole.first)
-        assert len(few.pairs) == capacity and {tuple(row) for row in few.pairs.tolist()} <= rows
-    if device == "cpu":
-        assert torch.equal(find(s, capacity=3).pairs, whole.pairs[:3])
-        threads = torch.get_num_threads()
-        try:
-            for number in (2, 5):
-                torch.set_num_threads(number)
-                assert all(torch.equal(a, b) for a, b in zip(find(s), whole, strict=True))
-        finally:
-            torch.set_num_threads(threads)
-    edge = Scene.of([Surface(np.array([[0.0, 0, 0], [1, 1, 1]]), edges=[[0, 1]], lone=[0, 1])])
-    assert find(edge, device).counts.tolist() == [[0, 0]]
-    nobody = replace(s, x=s.x[:0], collider=s.collider[:0], collider_next=s.collider[:0])
-    assert find(nobody, device).first.shape == (0, 2, 2)
-
-
-def test_bad_input_opcheck_and_no_gradient(device: str) -> None:
-    good = arguments(tangled(), device, torch.float64, 500)
-    torch.library.opcheck(torch.ops.diffvbd.contact_intersections.default, good)
-    for place in (0, 2, 3, 4, 5, 6, 7, 8, 9, 10):
-        for bad in (good[place][None], good[place].to(torch.int64)):
-            with pytest.raises(ValueError, match="expected"):
-                ops_contact.contact_intersections(*good[:place], bad, *good[place + 1 :])
-    with pytest.raises(ValueError, match="capacity"):
-        ops_contact.contact_intersections(*good[:-1], -1)
-    found = ops_contact.contact_intersections(good[0].clone().requires_grad_(), *good[1:])
-    assert not any(value.requires_grad for value in found)
-
-
 # --- models ----------------------------------------------------------------------------------------------------------
 
 
@@ -179,7 +122,7 @@ def overlapping(device: str = "cpu", dtype: torch.dtype = torch.float64, shift: 
                     dtype=dtype)  # fmt: skip
 
 
-def run(model: dv.Model, x: Any = None, steps: int = 1, **options: Any) -> dv.Trajectory:
+def run(model: dv.Model, x: Any = None, steps: int = 1, **options: Any) -> dv.results.Trajectory:
     x = model.rest_points if x is None else x
     return dv.rollout(model, x, torch.zeros_like(x), steps=steps, **STEP, **options)
 
@@ -204,17 +147,6 @@ def test_a_rollout_refuses_a_start_that_intersects(device: str, dtype: torch.dty
         dv.step(model, model.rest_points, torch.zeros_like(model.rest_points), **STEP)
 
 
-def test_one_scene_of_many(device: str) -> None:
-    model = overlapping(device)
-    apart = model.rest_points.clone()
-    apart[27:, 1] += 0.05
-    x = torch.stack([apart, apart, model.rest_points])
-    with pytest.raises(ValueError, match="in scene 2"):
-        run(model, x)
-    run(model, x[:2])
-    assert set(dv.contact.intersections(model, x)[:, 0].tolist()) == {2}
-
-
 def test_what_contact_does_not_keep_apart_may_overlap() -> None:
     run(overlapping(between_bodies=False))
     dv.rollout(dv.Model(overlapping().mesh), overlapping().rest_points, 0 * overlapping().rest_points, steps=1, **STEP)
@@ -236,22 +168,6 @@ def test_colliders(device: str) -> None:
     model = overlapping(device, shift=0.21, things=[colliders.Plane((0, 0.05, 0), (0, 1, 0))])
     with pytest.raises(ValueError, match=r"got 9 points behind planes: corner point 0 lies behind the plane \[35, 36"):
         run(model)
-
-
-def test_bad_check_start() -> None:
-    with pytest.raises(TypeError, match="check_start: expected a bool, got int"):
-        run(overlapping(), check_start=1)
-
-
-def test_a_compiled_rollout_is_not_checked() -> None:
-    torch._dynamo.reset()
-    model = overlapping()
-    x = model.rest_points
-
-    def end() -> Any:
-        return run(model, x).x[-1]
-
-    assert torch.equal(torch.compile(end, backend="eager")(), run(model, check_start=False).x[-1])
 
 
 @pytest.mark.cuda

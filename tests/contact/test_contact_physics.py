@@ -53,7 +53,7 @@ def test_resting_gap(device: str, support: str) -> None:
         colliders.append(dv.colliders.Plane((3.0, -0.05, 0.0)))
     model = dv.Model(box(2, 0.2), density=100.0, energies=energies, colliders=colliders, device=device)
     x = model.rest_points
-    end = dv.rollout(model, x, torch.zeros_like(x), steps=300, mu=0.0, lam=0.0, time_step=0.02, sweeps=5, save="last")
+    end = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(0.02, 5), steps=300, mu=0.0, lam=0.0, save="last")
     gaps, times = end.x[-1, :, 1] + 0.05, 2.0 if support == "both" else 1.0
 
     def excess(d: float, weight: float) -> float:
@@ -76,10 +76,10 @@ def test_stacked_blocks_carry_each_other(support: str) -> None:
     blocks = join([box(2, 0.2), box(2, 0.1).translate((0.06, 0.215, 0.04))])
     model = dv.Model(blocks, density=500.0, energies=energies, colliders=colliders)
     x = model.rest_points
-    step: dict[str, Any] = {"mu": 2e4, "lam": 2e4, "time_step": h, "sweeps": 200}
+    step: dict[str, Any] = {"mu": 2e4, "lam": 2e4, "solver": dv.VBD(h, 200)}
     for _ in range(100):
         x, _ = dv.step(model, x, torch.zeros_like(x), **step)
-    with dv.contact.record() as found:
+    with dv.record("contact") as found:
         x, v = dv.step(model, x, torch.zeros_like(x), **step)
     assert dv.contact.status(model).cut == [0]
     forces, slopes = pair_forces(model, x, found[0])
@@ -119,8 +119,8 @@ def approaching(detections: int, **options: Any) -> tuple[dv.Model, Tensor, Tens
 def test_pair_forces_are_equal_and_opposite() -> None:
     model, x, v = approaching(1)
     for _ in range(16):
-        with dv.contact.record() as found:
-            x, v = dv.step(model, x, v, mu=1e4, lam=1e4, time_step=5e-3, sweeps=20, gravity=(0.0, 0.0, 0.0))
+        with dv.record("contact") as found:
+            x, v = dv.step(model, x, v, dv.VBD(5e-3, 20), mu=1e4, lam=1e4, gravity=(0.0, 0.0, 0.0))
     forces, _ = pair_forces(model, x, found[0])
     on_bodies = per_body(model, forces)
     size = float(forces.abs().sum())
@@ -141,7 +141,7 @@ def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
         mass, size = model.mass[:, None], float((model.mass * v.norm(dim=-1)).sum())
         first, linear, angular = per_body(model, mass * v), 0.0, 0.0
         for _ in range(40):
-            x1, v1 = dv.step(model, x, v, mu=1e4, lam=1e4, time_step=h, sweeps=sweeps, gravity=(0.0, 0.0, 0.0))
+            x1, v1 = dv.step(model, x, v, dv.VBD(h, sweeps), mu=1e4, lam=1e4, gravity=(0.0, 0.0, 0.0))
             assert dv.contact.status(model).cut == [0]
             linear = max(linear, float((mass * (v1 - v)).sum(0).norm()))
             gained = torch.linalg.cross(x1, mass * v1) - torch.linalg.cross(x, mass * v)
@@ -171,7 +171,7 @@ def test_collision_in_one_dimension() -> None:
         v = torch.zeros_like(x)
         v[model.body == 0, 0] = speed
         for _ in range(round(duration / h)):
-            x, v = dv.step(model, x, v, mu=2e5, lam=0.0, time_step=h, sweeps=20, gravity=(0.0, 0.0, 0.0))
+            x, v = dv.step(model, x, v, dv.VBD(h, 20), mu=2e5, lam=0.0, gravity=(0.0, 0.0, 0.0))
             assert dv.contact.status(model).cut == [0]
         assert dv.contact.status(model).smallest_gap[0] > 0.05  # they have parted
         ends = per_body(model, model.mass[:, None] * v)[:, 0] / masses

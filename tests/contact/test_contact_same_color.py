@@ -8,7 +8,6 @@ the same gap at once must not overshoot.
 
 import functools
 import itertools
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -19,7 +18,7 @@ from helpers.spreads import assert_near_contact
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.mesh import TetMesh, cube, join
+from diffvbd.mesh import TetMesh, join
 from diffvbd.reference.contact import Part
 from diffvbd.reference.distance import distance
 from diffvbd.testing import contact_scenes, relative_error, tolerance
@@ -150,33 +149,3 @@ def test_the_order_inside_a_color_does_not_matter(name: str) -> None:
 
 def _members(model: dv.Model) -> list[set[int]]:
     return [set(model.color_vertices[a:b].tolist()) for a, b in itertools.pairwise(model.color_ptr.tolist())]
-
-
-def corner_on_corner() -> dv.Model:
-    """Two cubes, mirrored, that touch with one corner each, a little off each other's axis."""
-    angle, c = math.atan(math.sqrt(0.5)), math.sqrt(0.5)
-    about_z = torch.tensor([[c, c, 0.0], [-c, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    about_y = torch.tensor([[math.cos(angle), 0.0, math.sin(angle)], [0.0, 1.0, 0.0],
-                            [-math.sin(angle), 0.0, math.cos(angle)]], dtype=torch.float64)  # fmt: skip
-    one = cube(4, size=0.2)
-    points = torch.tensor(one.points)
-    points = (points - points.amax(0)) @ (about_y @ about_z).T - torch.tensor([0.006, 0.0, 0.0])
-    mirrored = points * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.0, 0.002, 0.0012])
-    mesh = join([TetMesh(points, one.tets), TetMesh(mirrored, one.tets[:, [0, 2, 1, 3]])])
-    return dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(1e5, 0.02, self_contact=False)))
-
-
-def test_corners_of_one_color_do_not_overshoot(device: str) -> None:
-    """With the stiffness that one corner alone needs, 3 % of the forces stayed unbalanced for good."""
-    model = corner_on_corner().to(device)
-    same = colors(model, model.num_vertices)
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    half = len(x) // 2
-    assert same[x[:half, 0].argmax()] == same[half + x[half:, 0].argmin()]
-    v[:half, 0], v[half:, 0] = 2.0, -2.0
-    options = {"mu": 5e4, "lam": 5e4, "time_step": 0.01, "gravity": (0.0, 0.0, 0.0)}
-    for _ in range(4):
-        x, v = dv.step(model, x, v, sweeps=100, **options)
-    end, _ = dv.step(model, x, v, sweeps=400, **options)
-    left = dv.diagnose(model, end, previous=(x, v), warn=False, **options).residuals
-    assert left is not None and left.max() < tolerance("contact_residual")

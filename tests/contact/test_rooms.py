@@ -10,8 +10,9 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.contact.surface import ContactSurface
-from diffvbd.ops import detect as ops_detect
-from diffvbd.ops.motion import WAYS, RoomsOfBodies
+from diffvbd.ops import contact as ops_detect
+from diffvbd.ops.contact import RoomsOfBodies
+from diffvbd.ops.fields import WAYS
 from diffvbd.step.motion import Motion, motion_of
 from diffvbd.step.rooms import LEAST_ROOM, ROOM, rooms
 from diffvbd.testing import generator, tolerance
@@ -179,26 +180,6 @@ def test_as_plain_torch_says(device: str, speed: float, pinned: bool, plane: boo
 @pytest.mark.parametrize(("bodies", "points"), [(1, 2), (12, 2), (40, 2), (2, 7), (2, 14)])
 def test_in_scenes_of_other_sizes(device: str, bodies: int, points: int) -> None:
     check(given(device, speed=0.5, pinned=True, plane=True, self_contact=True, bodies=bodies, points=points))
-
-
-def test_bodies_far_from_others_get_the_room_of_one_alone(device: str) -> None:
-    """And more than among others; what goes together is one island, and what may reach a collider none."""
-    near, far = (given(device, speed=3.0, pinned=False, plane=False, self_contact=False, floor=False, apart=apart)
-                 for apart in (1.3, 300.0))  # fmt: skip
-    s, alone = far.surface, far.found()
-    assert (alone.island[:, 1:] == torch.arange(1, 4, device=device)).all() and (alone.island[:, 0] == -1).all()
-    assert (alone.room[:, 1:4] > s.most_room[1:]).all()
-    assert (near.found().island == -1).all()
-    assert (near.found().room[:, 1:4] < alone.room[:, 1:4]).all()
-
-
-def test_a_collider_far_away_gives_no_room(device: str) -> None:
-    """However far it goes in a step: such rooms would fill lists of pairs."""
-    g = given(device, speed=0.03, pinned=False, plane=False, self_contact=False, floor=False, bodies=2)
-    far = g.was + 100.0
-    still, moved = (g._replace(was=far, now=far + way).found() for way in (0.0, 1.0))
-    assert (still.island >= 0).all() and torch.equal(still.island, moved.island)
-    torch.testing.assert_close(moved.room, still.room, rtol=tolerance("sums_of_bodies"), atol=0.0)
 
 
 def test_what_is_not_finite_does_not_pass_for_a_room(device: str) -> None:

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.compiler import cxx
-from helpers.paths import CSRC
+from helpers.paths import CSRC, needs_csrc
 
-import diffvbd as dv
 from diffvbd import energies, ops
 from diffvbd.mask import CONTACT, FIRST_VERTEX_BIT
 from diffvbd.testing import generator, tolerance
@@ -326,19 +325,6 @@ def test_solve_of_a_rank_one_block(headers: Any, stiff: float) -> None:
 # --- the lists in C++ and in Python ----------------------------------------------------------------------------------
 
 
-def test_python_lists_the_energies_of_the_headers(headers: Any) -> None:
-    listed = headers.vertex_energies()
-    python = {e.__name__: (e.bit, e.per_vertex) for e in energies.VERTEX_ENERGIES}
-    assert list(python) == list(listed)
-    for name, (bit, stride, per_vertex, _) in listed.items():
-        assert python[name] == (bit, per_vertex)
-        energy: Any = next(e for e in energies.VERTEX_ENERGIES if e.__name__ == name)
-        assert energy().count() == stride
-    assert energies.FloorBarrier(height=(0.0, 1.0)).count() == 2 * listed["FloorBarrier"][1]
-    assert energies.EXACT_BLOCK == headers.exact_block and energies.PAPER_BLOCK == headers.paper_block
-    assert energies.MAX_PLANES * listed["FloorBarrier"][1] + listed["Anchor"][1] <= headers.max_energy_data
-
-
 def test_python_tape_is_the_compiled_one(headers: Any) -> None:
     for mask in range(masks()):
         filters = any(mask & bit and has_filter for bit, _, _, has_filter in headers.vertex_energies().values())
@@ -352,15 +338,31 @@ def masks() -> int:
     return 1 << (FIRST_VERTEX_BIT + len(energies.VERTEX_ENERGIES))
 
 
-def test_each_set_of_energies_is_one_variant(headers: Any) -> None:
-    """With one of the two elastic blocks; a scene without tets runs one of these, too."""
-    every, free = headers.variant_masks()
-    one = (energies.EXACT_BLOCK, energies.PAPER_BLOCK)
-    assert sorted(every) == [mask for mask in range(masks()) if mask & sum(one) in one]
-    assert sorted(free) == [mask for mask in sorted(every) if not mask & CONTACT]
+# --- scalars ----------------------------------------------------------------------------------------------------------
 
 
-def test_no_two_energies_share_a_bit(headers: Any) -> None:
-    bits = [energies.EXACT_BLOCK, energies.PAPER_BLOCK, dv.PairBarrier.bit, *(e.bit for e in energies.VERTEX_ENERGIES)]
-    assert bits == [1 << k for k in range(len(bits))]  # contact before the list: a new energy moves no bit
-    assert dv.PairBarrier.bit == dv.Friction.bit == headers.contact == CONTACT
+@needs_csrc
+def test_one_formula_of_every_scalar(tmp_path: Path) -> None:
+    program, source = tmp_path / "scalars", Path(__file__).with_name("scalars.cpp")
+    subprocess.run([*cxx(), "-std=c++17", "-w", f"-I{CSRC}", str(source), "-o", str(program)], check=True)
+    found = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    assert found.split("\n")[:2] == ["10 10 10 10 7", "8 8 8 8 1"]
+
+
+# --- distances --------------------------------------------------------------------------------------------------------
+
+
+@needs_csrc
+def test_the_derivative_of_the_closest_feature(tmp_path: Path) -> None:
+    program = tmp_path / "distance"
+    source = Path(__file__).with_name("distance.cpp")
+    flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-w", f"-I{CSRC}"]
+    subprocess.run([*cxx(), *flags, str(source), "-o", str(program)], check=True)
+    *features, different, moving = map(
+        int, subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
+    )
+    point_triangle, edge_edge, plane = features[:5], features[5:10], features[10:]
+    # inside a face, and the three edges around it; inside both edges, and the four ends; a plane has no end
+    assert min(point_triangle[:4]) > 500 and point_triangle[4] == 0 and min(edge_edge) > 500
+    assert plane == [20000, 0, 0, 0, 0]
+    assert different == 0 and moving > 40000

@@ -70,24 +70,23 @@ class Measurement:
 MEASURED: dict[tuple, Measurement] = {}
 
 
-def compiled_result(model: Any, inputs: dict, sweeps: int, steps: int, tape: str) -> dict[str, Tensor]:
+def compiled_result(model: Any, inputs: dict, solver: dv.VBD, steps: int) -> dict[str, Tensor]:
     """`testing.evaluate` of the package's own step or rollout, on the CPU whatever the model's device."""
-    adjoint = dv.ReverseSweep(tape=tape)
 
-    def run(**options: Any) -> tuple[Tensor, Tensor]:
+    def run(**given: Any) -> tuple[Tensor, Tensor]:
         if steps == 1:
-            return dv.step(model, sweeps=sweeps, adjoint=adjoint, **options)
-        end = dv.rollout(model, steps=steps, sweeps=sweeps, adjoint=adjoint, save="last", **options)
+            return dv.step(model, solver=solver, **given)
+        end = dv.rollout(model, solver=solver, steps=steps, save="last", **given)
         return end.x[-1], end.v[-1]
 
-    return testing.on_device(evaluate(run, inputs), "cpu")
+    return testing.on_device(evaluate(run, inputs, solver.time_step), "cpu")
 
 
 @functools.cache
 def expectation(case: str, kind: str, size: str, sweeps: int, steps: int) -> dict[str, Tensor]:
     """Result of the reference."""
     scene = build_scene(case, kind, size)
-    return testing.reference_result(scene.model(), scene.inputs(), sweeps, steps)
+    return testing.reference_result(scene.model(), scene.inputs(), scene.solver(sweeps), steps)
 
 
 @functools.cache
@@ -95,7 +94,7 @@ def disagreements(case: str, kind: str, size: str, sweeps: int, steps: int) -> d
     """Spreads of the reference."""
     scene = build_scene(case, kind, size)
     expected = expectation(case, kind, size, sweeps, steps)
-    return testing.spread(scene.model(), scene.inputs(), sweeps, steps, expected)
+    return testing.spread(scene.model(), scene.inputs(), scene.solver(sweeps), steps, expected)
 
 
 @functools.cache
@@ -103,7 +102,7 @@ def sensitivities(case: str, kind: str, size: str, sweeps: int, steps: int) -> d
     """How far an ulp in the inputs moves the reference."""
     scene = build_scene(case, kind, size)
     expected = expectation(case, kind, size, sweeps, steps)
-    return testing.sensitivity(scene.model(), scene.inputs(), sweeps, steps, expected)
+    return testing.sensitivity(scene.model(), scene.inputs(), scene.solver(sweeps), steps, expected)
 
 
 @functools.cache
@@ -115,7 +114,7 @@ def measure(place: str, case: str, kind: str, size: str, sweeps: int, steps: int
     device, _, regime = place.partition(" ")
     model, inputs = scene.model(device), scene.inputs(device=device)
     with forced(regime or None):
-        results = [compiled_result(model, inputs, sweeps, steps, tape) for tape in TAPES]
+        results = [compiled_result(model, inputs, scene.solver(sweeps, tape=tape), steps) for tape in TAPES]
     full, _, recompute = results
     assert all(torch.equal(full[name], recompute[name]) for name in full), "recompute must repeat full to the bit"
     zeros = frozenset(name for name in expected if not any(r[name].any() for r in (expected, *results)))
@@ -131,11 +130,12 @@ def may_vanish(name: str, case: str, kind: str, size: str, sweeps: int, steps: i
     """Whether an argument has no say: with another value of it the reference ends in the same bits."""
     scene = build_scene(case, kind, size)
     model, inputs = scene.model(), scene.inputs()
-    place = inputs["parameters"] if "." in name else inputs
-    value = place[name]
+    value = inputs[name]
     scale = float(value.nan_to_num().abs().max()) or 1.0
-    place[name] = value + 1e-6 * scale * torch.as_tensor(generator("another", name).uniform(0.5, 1, tuple(value.shape)))
-    moved = reference.rollout(model, steps=steps, sweeps=sweeps, **inputs)
+    inputs[name] = value + 1e-6 * scale * torch.as_tensor(
+        generator("another", name).uniform(0.5, 1, tuple(value.shape))
+    )
+    moved = reference.rollout(model, solver=scene.solver(sweeps), steps=steps, **inputs)
     expected = expectation(case, kind, size, sweeps, steps)
     return torch.equal(moved.x[-1], expected["x"]) and torch.equal(moved.v[-1], expected["v"])
 
@@ -158,14 +158,14 @@ def check(place: str, case: str, kind: str, size: str, sweeps: int, steps: int) 
 BATCHED = {  # shapes of each argument over scenes [2, 3]; V vertices, T tets, P planes
     "own": {"mu": (2, 3, "T"), "lam": (2, 3, "T"), "density": (2, 3, "T"), "force": (2, 3, "V", 3),
             "gravity": (2, 3, "V", 3), "prescribed": (2, 3, "V", 3), "rest_points": (2, 3, "V", 3),
-            "floor_barrier.kappa": (2, 3), "floor_barrier.height": (2, 3, "P"), "floor_barrier.normal": (2, 3, "P", 3),
-            "anchor.stiffness": (2, 3, "V"), "anchor.points": (2, 3, "V", 3)},
+            "floor_kappa": (2, 3), "floor_height": (2, 3, "P"), "floor_normal": (2, 3, "P", 3),
+            "anchor_stiffness": (2, 3, "V"), "anchor_points": (2, 3, "V", 3)},
     "shared": {"mu": (1,), "lam": ("T",), "density": (1,), "force": (1, 3), "gravity": (3,), "prescribed": ("V", 3),
-               "rest_points": ("V", 3), "floor_barrier.kappa": (), "floor_barrier.height": ("P",),
-               "floor_barrier.normal": ("P", 3), "anchor.stiffness": ("V",), "anchor.points": ("V", 3)},
+               "rest_points": ("V", 3), "floor_kappa": (), "floor_height": ("P",),
+               "floor_normal": ("P", 3), "anchor_stiffness": ("V",), "anchor_points": ("V", 3)},
     "mixed": {"mu": (2, 3, 1), "lam": (3, 1), "density": (2, 1, 1), "force": (3, 1, 3), "gravity": (2, 1, 1, 3),
-              "prescribed": (3, "V", 3), "rest_points": (2, 1, "V", 3), "floor_barrier.dhat": (3,),
-              "floor_barrier.damping": (2, 1), "floor_barrier.height": (3, "P"), "anchor.points": (2, 1, "V", 3)},
+              "prescribed": (3, "V", 3), "rest_points": (2, 1, "V", 3), "floor_dhat": (3,),
+              "floor_damping": (2, 1), "floor_height": (3, "P"), "anchor_points": (2, 1, "V", 3)},
 }  # fmt: skip
 
 
@@ -190,22 +190,21 @@ def scene_of_shapes(shapes: str, sweeps: int) -> tuple[dv.Model, dict[str, Any],
         return values * torch.as_tensor(rng.uniform(0.999, 1.001, shape))
 
     base: dict[str, Any] = scene.inputs()
-    time_step, parameters = base.pop("time_step"), base.pop("parameters")
-    parameters |= {"floor_barrier.normal": torch.tensor(planes), "floor_barrier.height": torch.tensor([-0.06, -0.7]),
-                   "floor_barrier.damping": torch.tensor(20.0)}  # fmt: skip
+    base |= {"floor_normal": torch.tensor(planes), "floor_height": torch.tensor([-0.06, -0.7]),
+             "floor_damping": torch.tensor(20.0)}  # fmt: skip
     base["gravity"] = base["gravity"].expand_as(base["force"])
-    inputs: dict[str, Any] = {"time_step": time_step, "parameters": {}}
+    inputs: dict[str, Any] = {}
     inputs |= {name: shaped(base[name], (2, 3, "V", 3)) for name in ("x", "v")}
     for name, shape in BATCHED[shapes].items():
-        place = inputs["parameters"] if "." in name else inputs
-        place[name] = shaped((parameters if "." in name else base)[name].double(), shape)
-    return model, inputs, testing.reference_result(model, inputs, sweeps)
+        inputs[name] = shaped(base[name].double(), shape)
+    return model, inputs, testing.reference_result(model, inputs, scene.solver(sweeps))
 
 
 def check_shapes(device: str, shapes: str, sweeps: int, regime: str | None = None) -> None:
     model, inputs, expected = scene_of_shapes(shapes, sweeps)
     with forced(regime):
-        result = compiled_result(model.to(device), testing.on_device(inputs, device), sweeps, 1, "full")
+        solver = build_scene("anchored", "random", "small").solver(sweeps, tape="full")
+        result = compiled_result(model.to(device), testing.on_device(inputs, device), solver, 1)
     assert relative_error(result["x"], expected["x"]) <= tolerance("forward")
     for name in expected:
         assert result[name].any(), name

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 import diffvbd as dv
+from diffvbd import testing
 from diffvbd.testing import generator, structured
 
 REGIMES = ("thread", "block", "grid", "color")
@@ -15,14 +16,19 @@ ANY_SIZE = ("grid", "color")
 
 def forced(regime: str | None) -> contextlib.AbstractContextManager:
     """The CUDA regime in which everything inside runs; None: the package chooses."""
-    return contextlib.nullcontext() if regime is None else dv.regime(regime)
+    return contextlib.nullcontext() if regime is None else testing.regime(regime)
+
+
+def large_solver(sweeps: int, **options: Any) -> dv.VBD:
+    """The solver of the scenes of large_inputs."""
+    return dv.VBD(1 / 60, sweeps, relaxation=1.2, **options)
 
 
 def large_inputs(cells: int, *lead: int, dtype: torch.dtype = torch.float64) -> tuple[dv.Model, dict[str, Any]]:
     """Scenes of (cells + 1)^3 vertices over a floor on the GPU, with a material for each tet of each scene."""
     points, tets = structured((cells,) * 3)
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.01, kappa=1e3, dhat=0.05, damping=5.0))
-    model = dv.Model(dv.TetMesh(points, tets), pinned=points[:, 0] == 0, energies=energies, relaxation=1.2)
+    model = dv.Model(dv.TetMesh(points, tets), pinned=points[:, 0] == 0, energies=energies)
     rng = generator("large", cells)
     shape = (*lead, *points.shape)
     inputs: dict[str, Any] = {
@@ -32,13 +38,9 @@ def large_inputs(cells: int, *lead: int, dtype: torch.dtype = torch.float64) -> 
         "lam": torch.tensor(2e4, dtype=torch.float64),
         "density": torch.tensor(1e3, dtype=torch.float64),
         "rest_points": model.rest_points,
-        "parameters": {"floor_barrier.kappa": torch.tensor(1e3, dtype=torch.float64)},
+        "floor_kappa": torch.tensor(1e3, dtype=torch.float64),
     }
-
-    def cast(value: Any) -> Any:
-        return {k: cast(t) for k, t in value.items()} if isinstance(value, dict) else value.to("cuda", dtype)
-
-    return model.to("cuda", dtype), cast(inputs) | {"time_step": 1 / 60}
+    return model.to("cuda", dtype), {name: value.to("cuda", dtype) for name, value in inputs.items()}
 
 
 def captured(run: Callable[[], None], warm: int = 3) -> torch.cuda.CUDAGraph:

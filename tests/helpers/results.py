@@ -12,9 +12,9 @@ from diffvbd.testing import evaluate
 TAPES = ("full", "compact", "recompute")
 
 
-def evaluated(model: dv.Model, inputs: dict[str, Any], sweeps: int = 3, tape: str = "full") -> dict[str, Tensor]:
+def evaluated(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD) -> dict[str, Tensor]:
     """State and gradients of one step, by `testing.evaluate`."""
-    return evaluate(lambda **o: dv.step(model, sweeps=sweeps, adjoint=dv.ReverseSweep(tape), **o), inputs)
+    return evaluate(lambda **given: dv.step(model, solver=solver, **given), inputs, solver.time_step)
 
 
 def assert_same_bits(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:

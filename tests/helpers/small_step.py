@@ -9,9 +9,9 @@ import diffvbd as dv
 from diffvbd.testing import relative_error, tolerance
 
 Arguments = dict[str, Tensor]
-STEP = {"time_step": 0.3, "sweeps": 2}
-PARAMETERS = ("floor_barrier.kappa", "floor_barrier.dhat", "floor_barrier.damping", "floor_barrier.height",
-              "floor_barrier.normal", "anchor.stiffness", "anchor.points")  # fmt: skip
+STEP = {"solver": dv.VBD(0.3, 2)}
+PARAMETERS = ("floor_kappa", "floor_dhat", "floor_damping", "floor_height",
+              "floor_normal", "anchor_stiffness", "anchor_points")  # fmt: skip
 ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_points", "density", *PARAMETERS)
 
 
@@ -44,20 +44,18 @@ def small_inputs(model: dv.Model, seed: int = 0) -> Arguments:
         "prescribed": torch.where(model.pinned[:, None].to(x.device), x + noise(n, 3, size=0.1), torch.nan),
         "rest_points": model.rest_points + noise(n, 3, size=0.05),
         "density": 2.0 + noise(tets, size=0.5),
-        "floor_barrier.kappa": given(2.0),
-        "floor_barrier.dhat": given(0.5),
-        "floor_barrier.damping": given(0.5),
-        "floor_barrier.height": given([-0.2]),
-        "floor_barrier.normal": given([[0.1, 1.0, 0.0]]),
-        "anchor.stiffness": 0.7 + noise(n, size=0.2),
-        "anchor.points": model.rest_points + noise(n, 3, size=0.1),
+        "floor_kappa": given(2.0),
+        "floor_dhat": given(0.5),
+        "floor_damping": given(0.5),
+        "floor_height": given([-0.2]),
+        "floor_normal": given([[0.1, 1.0, 0.0]]),
+        "anchor_stiffness": 0.7 + noise(n, size=0.2),
+        "anchor_points": model.rest_points + noise(n, 3, size=0.1),
     }
 
 
 def run_step(model: dv.Model, arguments: Arguments, **options: Any) -> tuple[Tensor, Tensor]:
-    given = {k: t for k, t in arguments.items() if k not in PARAMETERS}
-    parameters = {k: t for k, t in arguments.items() if k in PARAMETERS}
-    return dv.step(model, given.pop("x"), given.pop("v"), **given, parameters=parameters, **{**STEP, **options})
+    return dv.step(model, **{**arguments, **STEP, **options})
 
 
 def scalar(x: Tensor, v: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import diffvbd as dv
 SOFT: dict[str, Any] = {"young": 1e5, "poisson": 0.3, "gravity": (0.0, 0.0, 0.0)}
 
 
-def tilted_box(coarse: Any = None) -> tuple[dv.Model, Tensor, Tensor]:
+def tilted_box() -> tuple[dv.Model, Tensor, Tensor]:
     box = dv.mesh.box(3, 0.1)
     points = torch.tensor(box.points) - 0.05
     c, s = torch.tensor(0.3).double().cos(), torch.tensor(0.3).double().sin()
@@ -19,7 +19,7 @@ def tilted_box(coarse: Any = None) -> tuple[dv.Model, Tensor, Tensor]:
     points = points @ (about_z @ about_x).T
     points[:, 1] += 0.006 - points[:, 1].min()
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=2e5, dhat=5e-3))
-    model = dv.Model(dv.TetMesh(points.numpy(), box.tets), energies=energies, coarse=coarse)
+    model = dv.Model(dv.TetMesh(points.numpy(), box.tets), energies=energies)
     v = torch.zeros_like(model.rest_points)
     v[:, 1] = -2.0
     return model, model.rest_points, v

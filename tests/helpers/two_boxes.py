@@ -6,7 +6,7 @@ import diffvbd as dv
 from diffvbd import colliders
 from diffvbd.mesh import box, join
 
-STEP: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.01, "sweeps": 3}
+STEP: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "solver": dv.VBD(0.01, 3)}
 
 
 def two_boxes(device: str = "cpu", *, things: Any = (), **options: Any) -> dv.Model:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
+from diffvbd.model.system import system_of
 from diffvbd.reference import distance
 from diffvbd.reference.scene import build_layout, build_scene
 from diffvbd.testing import generator
@@ -40,7 +41,8 @@ RADII = torch.tensor([0.0] * 8 + [0.08, 0.1, 0.1, 0, 0, 0], dtype=torch.float64)
 def stand_in(model: dv.Model, **changes: Any) -> Any:
     """A model with what the step with contact reads."""
     names = ("tets", "rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation")
-    values = {name: getattr(model, name) for name in (*names, "regularization", "relaxation")}
+    model = system_of(model, dv.VBD(0.01, 1))
+    values = {name: getattr(model, name) for name in (*names, "regularization", "relaxation", "block", "coarse")}
     values |= {"rigid": False, "starts_from": "predictor"}
     detections = changes.pop("detections", 1)
     barrier = {"kappa": 200.0, "dhat": DHAT, "damping": 3.0, "detections": detections}

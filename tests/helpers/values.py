@@ -5,7 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-STEP = {"time_step": 1 / 60, "sweeps": 3}
+import diffvbd as dv
+
+STEP = {"solver": dv.VBD(1 / 60, 3)}
 
 
 def uniform(*shape: int, low: float = 0.5, high: float = 1.5) -> Tensor:

@@ -85,14 +85,6 @@ def test_shape_is_a_valid_closed_body(name):
     assert num_components(mesh) == mesh.num_bodies
 
 
-@pytest.mark.parametrize("name", SHAPES)
-def test_shapes_are_deterministic(name):
-    build = SHAPES[name][0]
-    first, second = build(), build()
-    assert np.array_equal(first.points, second.points)
-    assert np.array_equal(first.tets, second.tets)
-
-
 def test_box_fills_its_size_and_numbers_vertices_as_documented():
     for split in ("kuhn", "five"):
         mesh = dm.box((3, 4, 5), (1, 2, 3), split=split)
@@ -101,30 +93,11 @@ def test_box_fills_its_size_and_numbers_vertices_as_documented():
     assert np.ptp(dm.cube(4, size=2.0, split="kuhn").volume) < tolerance("ulps")
 
 
-@pytest.mark.parametrize("n", [(4, 3, 5), (2, 5, 3)])
-def test_a_box_has_no_direction(n: tuple[int, int, int]) -> None:
-    """A mirror leaves the tets as they are where it halves an even number of cells: a bar bends straight down."""
-    tets = dm.box(n).tets
-    number = np.arange(np.prod(n)).reshape(n)
-    for axis in [axis for axis in range(3) if n[axis] % 2]:
-        mirrored = np.flip(number, axis).reshape(-1)[tets]
-        assert {*map(frozenset, mirrored.tolist())} == {*map(frozenset, tets.tolist())}, axis
-
-
 def test_sheet_lies_in_the_xz_plane_lower_layer_first():
     mesh = dm.sheet(5, 4, size=(0.8, 0.3), thickness=0.02)
     assert (mesh.points[:20, 1] == -0.01).all() and (mesh.points[20:, 1] == 0.01).all()
     np.testing.assert_allclose(mesh.points[1 * 4 + 2], [0.2, -0.01, 0.2])
     np.testing.assert_allclose(mesh.volume.sum(), 0.8 * 0.3 * 0.02)
-
-
-def test_disk_and_capsule_approach_their_volume():
-    disk = dm.disk(0.5, 0.1, resolution=12)
-    assert disk.points[:, 1].min() == -0.05
-    np.testing.assert_allclose(disk.volume.sum(), np.pi * 0.25 * 0.1, rtol=tolerance("inscribed_disk"))
-    capsule = dm.capsule(0.1, 0.3, resolution=12)
-    volume = np.pi * 0.01 * (0.3 + 0.4 / 3)
-    np.testing.assert_allclose(capsule.volume.sum(), volume, rtol=tolerance("inscribed_capsule"))
 
 
 def test_boundary_of_a_filled_body_lies_on_the_surface():
@@ -189,20 +162,6 @@ def test_subdivide_levels_and_labels():
         dm.subdivide(two, levels=-1)
 
 
-def test_join_keeps_bodies_apart():
-    a = TetMesh(UNIT_POINTS, UNIT_TET, body=[7, 7, 7, 7])
-    b = dm.join([a, dm.cube(split="kuhn")])
-    assert b.body.tolist() == [0] * 4 + [1] * 8
-    c = dm.join([b, a, b])
-    assert np.unique(c.body).tolist() == [0, 1, 2, 3, 4]
-    assert c.num_vertices == 28 and c.num_tets == 15
-    assert np.array_equal(c.tets[8 + np.arange(7)] - 16, b.tets)
-    np.testing.assert_allclose(c.volume.sum(), 2 * (1 + 1 / 6) + 1 / 6)
-    assert dm.join([]).num_vertices == 0
-    with pytest.raises(TypeError, match="meshes"):
-        dm.join([a, "b"])
-
-
 def test_replicate_equals_join_of_moved_copies():
     source = dm.join([dm.cube(), dm.cube().translate((2, 0, 0))])
     offsets = np.array([[0.0, 0, 0], [0, 5, 0], [0, 0, -7]])
@@ -254,15 +213,6 @@ def test_repr_and_empty_mesh():
         assert "0 vertices" in repr(empty)
     lonely = TetMesh(UNIT_POINTS, [])
     assert lonely.num_vertices == 4 and lonely.surface.shape == (0, 3)
-
-
-def test_tensors_are_accepted():
-    torch = pytest.importorskip("torch")
-    points = torch.tensor(UNIT_POINTS, dtype=torch.float32)
-    mesh = TetMesh(points, torch.tensor(UNIT_TET))
-    assert mesh.points.dtype == np.float64 and mesh.volume[0] == pytest.approx(1 / 6)
-    with pytest.raises(TypeError, match="points: expected numbers, got a tensor that requires grad"):
-        TetMesh(points.requires_grad_(), torch.tensor(UNIT_TET))
 
 
 def test_translate_and_transform():

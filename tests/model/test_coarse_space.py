@@ -75,19 +75,6 @@ def test_bodies_together_and_alone(space: CoarseSpace) -> None:
         assert_same(found[b], built(mesh.points, mesh.tets, space, np.zeros(mesh.num_vertices, dtype=np.int64)))
 
 
-def test_copies_have_the_same_functions() -> None:
-    """Positions that differ by rounding alone decide nothing."""
-    one, thin = dv.mesh.box((5, 5, 4), (0.1, 0.1, 0.08)), dv.mesh.box((6, 6, 2), (1.0, 1.0, 0.01))
-    for mesh in (one, thin):
-        for space in (CoarseSpace(), CoarseSpace(functions=40), CoarseSpace(functions=60, degree=2)):
-            points, tets, body = joined([mesh.translate((0.3 * k, -0.7 * k, 0.0)) for k in range(6)])
-            found = parts(built(points, tets, space, body), body, body[tets[:, 0]])
-            for b in range(1, 6):
-                one_entries, other = (np.stack((f.vertex, f.function)) for f in (found[0], found[b]))
-                assert np.array_equal(one_entries, other)
-                assert np.abs(found[0].weight - found[b].weight).max() <= tolerance("closed_form")
-
-
 @pytest.mark.parametrize(
     ("options", "name", "got"),
     [

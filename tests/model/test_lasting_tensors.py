@@ -3,7 +3,6 @@ reaches them."""
 
 import copy
 import pickle
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ import diffvbd as dv
 
 NAMES = ("rest_points", "density", "mass", "pinned", "tets", "surface", "color_ptr", "color_vertices", "body",
          "collider_points", "plane_points", "collider_radius")  # fmt: skip
-GIVEN: dict[str, Any] = {"lam": 1e4, "time_step": 0.01, "sweeps": 3}
+GIVEN: dict[str, Any] = {"lam": 1e4, "solver": dv.VBD(0.01, 3)}
 
 
 def two_cubes() -> dv.TetMesh:
@@ -70,20 +69,6 @@ def test_a_tensor_of_a_model_cannot_be_replaced(name: str) -> None:
         setattr(model, name, getattr(model, name))
 
 
-def test_masks_and_densities_of_the_user_are_not_kept(device: str) -> None:
-    mesh = two_cubes()
-    pinned, density = torch.zeros(mesh.num_vertices, dtype=torch.bool), torch.full((mesh.num_tets,), 1e3).double()
-    anchored = pinned.clone()
-    pinned[0], anchored[5] = True, True
-    energies = (dv.StableNeoHookean(), dv.Anchor(10.0, vertices=anchored))
-    model = dv.Model(mesh, density=density, pinned=pinned, energies=energies, device=device)
-    expected = motion(model)
-    pinned.fill_(True)
-    anchored.fill_(True)
-    density.fill_(1.0)
-    assert same(motion(model), expected)
-
-
 # --- modes of torch ---------------------------------------------------------------------------------------------------
 
 
@@ -104,56 +89,3 @@ def test_a_model_made_without_gradients_can_be_differentiated(device: str, conta
                 assert not any(t.is_inference() for t in vars(made).values() if isinstance(t, Tensor))
                 assert same(motion(made), expected)
             assert motion(dv.Model(two_cubes(), density, mask, device=device))[2] != 0
-
-
-def test_a_penalty_made_without_gradients_can_be_differentiated() -> None:
-    mesh = two_cubes()
-    with torch.inference_mode():
-        bodies = dv.contact.Bodies(torch.from_numpy(mesh.body.copy()), torch.ones(mesh.num_vertices).double())
-    x = torch.from_numpy(mesh.points.copy()).requires_grad_()
-    (slope,) = torch.autograd.grad(dv.contact.center_of_mass_penalty(x, bodies, 0.3, 10.0)[0].sum(), x)
-    assert slope.any()
-
-
-@pytest.fixture
-def defaults() -> Iterator[None]:
-    kept = torch.get_default_dtype()
-    yield
-    torch.set_default_device(None)
-    torch.set_default_dtype(kept)
-
-
-ROUTES: list[Callable[[dv.Model, Tensor, Tensor, dict[str, Any]], Any]] = [
-    lambda m, x, v, o: dv.step(m, x, v, force=torch.zeros_like(x), rest_points=x, **o)[0],
-    lambda m, x, v, o: dv.rollout(m, x, v, steps=3, checkpoint_every=2, **o).x,
-    lambda m, x, v, o: dv.step(m, x, v, adjoint=dv.GlobalAdjoint(), **o)[0],
-    lambda m, x, v, o: dv.step(m, x, v, adjoint=dv.GlobalAdjoint(assembled=False), **o)[0],
-    lambda m, x, v, o: dv.step(m, x, v, adjoint=dv.Unrolled(), **o)[0],
-    lambda m, x, v, o: dv.solve(m, x, v, tolerance=1e-3, **{k: o[k] for k in ("mu", "lam", "time_step")}).x,
-]
-
-
-@pytest.mark.usefixtures("defaults")
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("default", ["meta", torch.float16, torch.float64])
-def test_defaults_of_torch_change_nothing(default: Any, dtype: torch.dtype) -> None:
-    def run() -> list[Tensor]:
-        """Building included; the tensors that a user makes say where they live."""
-        out = []
-        for contact in (False, True):
-            model = build("cpu", contact).to(dtype=dtype)
-            x = model.rest_points
-            mu = torch.full((), 1e4, dtype=dtype, device="cpu", requires_grad=True)
-            for route in ROUTES[: 2 if contact else None]:
-                end = route(model, x, torch.zeros_like(x), {"mu": mu, **GIVEN})
-                out += [end.detach(), *torch.autograd.grad(end.square().sum(), mu)]
-            found = dv.diagnose(model, x, mu=mu, lam=1e4, time_step=0.01, warn=False)
-            out.append(torch.full((), found.largest_strain, dtype=dtype, device="cpu"))
-            out.append(dv.contact.center_of_mass_penalty(x, model, 0.3, 10.0))
-        return out
-
-    expected = run()
-    torch.set_default_device(default) if default == "meta" else torch.set_default_dtype(default)
-    found = run()
-    torch.set_default_device(None)
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 import torch
 from helpers.grouped import grouped
 from torch import Tensor
 
-from diffvbd.ops import motion as ops_motion
+from diffvbd.ops import contact as ops_motion
 from diffvbd.testing import generator, tolerance
 
 SIZES = [[4, 300, 20], [8] * 7, [6000, 5], []]
@@ -89,23 +88,6 @@ def test_adjoint_is_that_of_autograd(device: str, chord: float) -> None:
         assert torch.equal(one, same) and float(want.abs().max()) > 0
 
 
-def test_a_turn_leaves_the_shape(device: str) -> None:
-    """Of a body that an implicit Euler step has turned, x = R x_before: each edge keeps its length, and the way is that
-    of the nearest rotation, R itself to first order."""
-    c = case([30], device)
-    angle = 0.3
-    turn = torch.tensor([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]],
-                        dtype=c.x.dtype, device=device)  # fmt: skip
-    shift = torch.tensor([0.4, -0.1, 0.2], dtype=c.x.dtype, device=device)
-    move = c.x - (c.x - shift) @ turn  # x_before = R^-1 (x - shift)
-    ends = c.x + ops_motion.contact_coast(*c._replace(move=move), 1.0)
-    straight = c.x + move
-    edges, now, stretched = ((a[:, :, None] - a[:, None]).norm(dim=-1) for a in (c.x, ends, straight))
-    assert float((now - edges).abs().max()) <= tolerance("sums_of_bodies")
-    assert float((stretched - edges).abs().max()) > 0.02
-    assert float((ends - straight).abs().max()) < 0.25 * float(move.abs().max())
-
-
 def test_without_a_turn_ways_stay_to_the_bit(device: str) -> None:
     """Of bodies that are shifted, of those that are held, and of points and lines, which have no turn."""
     c = case([20, 1, 6], device, held=0.0)
@@ -122,26 +104,3 @@ def test_without_a_turn_ways_stay_to_the_bit(device: str) -> None:
     assert not torch.equal(out[:, rows[0]], c.move[:, rows[0]])
     bars = ops_motion.contact_coast_backward(torch.ones_like(c.x), *some, 1.0)
     assert not bars[0][:, rows[2]].any() and torch.equal(bars[2][:, rows[2]], torch.ones_like(c.x)[:, rows[2]])
-
-
-def test_a_turn_that_no_step_should_make_stays_as_it_is(device: str) -> None:
-    """Its turn is over 0.7 rad in a step; at twice as short steps the same motion is turned."""
-    c = case([30], device)
-    axis = torch.tensor([0.0, 0.0, 1.0], dtype=c.x.dtype, device=device)
-    move = torch.linalg.cross(axis.expand_as(c.x), c.x)
-    for chord in CHORDS:
-        assert torch.equal(ops_motion.contact_coast(*c._replace(move=move), chord), move)
-        assert not torch.equal(ops_motion.contact_coast(*c._replace(move=0.5 * move), chord), 0.5 * move)
-
-
-def test_opcheck_and_bad_input(device: str) -> None:
-    c = case([3, 5], device)
-    torch.library.opcheck(torch.ops.diffvbd.contact_coast.default, (*c, 1.0))
-    torch.library.opcheck(torch.ops.diffvbd.contact_coast_backward.default, (c.move, *c, 1.0))
-    for place, value in enumerate(c):
-        other = value.float() if value.is_floating_point() else value.double()
-        for bad in (value[..., :-1], other):
-            with pytest.raises(ValueError, match="expected"):
-                ops_motion.contact_coast(*c[:place], bad, *c[place + 1 :], 1.0)
-    with pytest.raises(ValueError, match="chord"):
-        ops_motion.contact_coast(*c, 0.0)

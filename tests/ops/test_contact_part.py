@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from diffvbd.contact.above_floor import above_floor
-from diffvbd.contact.start import Decided, _Start
-from diffvbd.ops import contact_part as ops_part
-from diffvbd.ops.contact_part import ASKS, PartBodies, Whole
-from diffvbd.reference.energies import FloorBarrier
+from diffvbd.ops import contact as ops_part
+from diffvbd.ops.contact import PartBodies, Whole
+from diffvbd.ops.fields import ASKS
 from diffvbd.testing import generator, relative_error, tolerance
 
 SHORT, BENT, DEEP_BENT = 0.99, 0.1, 0.5
@@ -141,73 +140,6 @@ def test_the_adjoint_of_that(device: str, name: str) -> None:
     assert relative_error(without, by_torch(still)[0]) <= tolerance("formula")
 
 
-@pytest.mark.parametrize("name", PLANES)
-def test_single_precision_agrees(device: str, name: str) -> None:
-    (left, stopped), (expected, stops) = case(name, device, torch.float32).by_operator(), by_torch(case(name, device))
-    assert relative_error(left.double(), expected) <= tolerance("float32_forward") and torch.equal(stopped, stops)
-
-
-@pytest.mark.parametrize("name", PLANES)
-def test_a_way_that_is_no_number_stays_one(device: str, name: str) -> None:
-    given = case(name, device)
-    given.way[0, 30], given.x[1, 5] = float("nan"), float("nan")
-    (left, stopped), (expected, stops) = given.by_operator(), by_torch(given)
-    assert torch.equal(left.isnan(), expected.isnan()) and left.isnan().any() and torch.equal(stopped, stops)
-    assert relative_error(left.nan_to_num(), expected.nan_to_num()) <= tolerance("formula")
-
-
-def filtered(c: Case, x: Tensor, way: Tensor) -> Tensor:
-    """Where a floor lets vertices go from x, which something else holds nowhere."""
-    if not c.planes.numel():
-        return x + way
-    planes = c.planes.reshape(len(c.planes), -1, 7)
-    floor = object.__new__(FloorBarrier)
-    floor.normal, floor.height, floor.dhat = planes[..., :3, None], planes[..., 3, None], planes[..., 5, None]
-    return torch.where(c.held[:, None], x + way, x + floor.start(x.mT, way.mT).mT)
-
-
-def path_by_torch(c: Case, fall: Tensor, left: Tensor, decided: Decided) -> Tensor:
-    held, carried = c.held[:, None], c.u[:, c.body]
-    share, last = (s[..., None] for s in decided.shares)
-    at = torch.where(held, c.x, c.x + carried)
-    target = filtered(c, at, torch.where(held, c.way, c.way - carried))
-    base = at + decided.frames[:, c.body, None] * left
-    at = torch.where(held, target, base + share * (target - base))
-    target = filtered(c, at, fall)
-    return torch.where(held, target, at + last * (target - at))
-
-
-@pytest.mark.parametrize("name", PLANES)
-def test_where_a_part_starts(device: str, name: str) -> None:
-    """Above the floor, where gaps are those of starts; with the adjoint."""
-    rng, given = generator("start", name), case(name, device)
-    given = given._replace(
-        x=given.x + torch.tensor([0.03125, 0.25, 0.0], device=device), origin=given.u.new_empty((0,))
-    )
-    fall, left = (torch.tensor(0.125 * rng.normal(size=given.x.shape), device=device) for _ in range(2))
-    shares = tuple(torch.tensor(rng.uniform(size=given.x.shape[:2]), device=device) for _ in range(2))
-    frames = torch.tensor(rng.uniform(size=(2, 5)), device=device)
-    decided = Decided(frames, shares, frames > 0.5, given.origin, given.bodies)
-    weight, out = torch.tensor(rng.normal(size=given.x.shape), device=device), []
-    for by in ("operator", "torch"):
-        c, more = given.leaves(), [t.clone().requires_grad_() for t in (fall, left)]
-        if by == "operator":
-            end, short = _Start.apply(c.x, c.way, more[0], c.u, more[1], c.planes, decided)
-        else:
-            end, again = (
-                path_by_torch(c, *more, decided),
-                ~c.held & ~(~c.bodies.held_bodies & decided.stopped)[:, c.body],
-            )
-            short = again & (torch.minimum(*shares) < SHORT)
-        wanted = [c.x, c.way, c.u, *more, *([c.planes] if name != "none" else [])]
-        out.append((end, short, torch.autograd.grad((weight * end).sum(), wanted)))
-    (end, short, grads), (expected, shorts, expected_grads) = out
-    assert relative_error(end, expected) <= tolerance("formula")
-    assert torch.equal(short, shorts) and 0 < short.sum() < short.numel()
-    for own, other in zip(grads, expected_grads, strict=True):
-        assert relative_error(own, other) <= tolerance("adjoint") and own.abs().max() > 0
-
-
 def share_within(way: Tensor, stretch: Tensor, room: Tensor) -> Tensor:
     return (2 * room / (way + (way * way + 4 * stretch * room).sqrt()).clamp(min=torch.finfo(way.dtype).tiny)).clamp(
         max=1
@@ -271,10 +203,3 @@ def test_how_far_bodies_go_and_who_asks(device: str, own_pairs: bool) -> None:
     assert torch.equal(shared, went)
     assert relative_error(torch.where(free_of_floor, at, 0.0), torch.where(free_of_floor, ends[0], 0.0)) == 0
     assert relative_error(at + last, ends[1]) <= tolerance("formula")
-
-
-def test_no_vertices_or_scenes(device: str) -> None:
-    given = case("flat", device)
-    empty = given._replace(**{k: getattr(given, k)[:0] for k in ("x", "u", "way", "origin")})
-    left, stopped = empty.by_operator()
-    assert left.shape == (0, *given.x.shape[1:]) and stopped.shape == (0, 5)

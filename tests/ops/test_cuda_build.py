@@ -1,19 +1,14 @@
 """CUDA sources compile for every architecture without a device; the object is found, or compiled once and cached."""
 
-import ast
 import functools
 import os
-import re
-import runpy
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from glob import glob
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -81,52 +76,6 @@ def compile_for(kernels: list[Path], architectures: list[str], folder: Path, *fl
 # --- the sources ------------------------------------------------------------------------------------------------------
 
 
-@needs_csrc
-def test_kernels_include_no_torch() -> None:
-    """That is why they compile in seconds, with any torch, and here."""
-    paths = [p for p in (CSRC / "cuda").rglob("*") if p.suffix in (".cu", ".cuh", ".h")]
-    assert len(KERNELS) >= 1 and len(paths) > len(KERNELS)
-    for path in paths:
-        included = re.findall(r'^\s*#\s*include\s*[<"]([^>"]+)[>"]', path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert not [name for name in included if re.match(r"torch|ATen|c10|Python\.h", name)], path
-    assert set(QUICK) <= set(STEMS)
-
-
-@needs_csrc
-def test_every_source_is_in_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
-    for variable in ("DIFFVBD_NO_CLONES", "DIFFVBD_QUICK"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.chdir(ROOT)
-    # of setup.py only what comes before the list is executed
-    names: dict[str, Any] = {"os": os, "runpy": runpy, "glob": glob}
-    for node in ast.parse((ROOT / "setup.py").read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign | ast.FunctionDef) and "CPU_SOURCES" not in names:
-            exec(ast.unparse(node), names)
-    written = {f"{build_cuda.INSTANCES}/{name}" for name in names["SWEEPS"]}
-    assert len(written) == 6 and written < set(names["CPU_SOURCES"])
-    cpu = [source for source in names["CPU_SOURCES"] if source not in written]
-    sources = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".cpp", ".cu")}
-    cuda = {p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)}
-    assert len(cpu) == len(set(cpu)) and set(cpu) | cuda == sources
-    assert set(cpu) & cuda == {p.relative_to(ROOT).as_posix() for p in BINDINGS}  # compiled for both
-
-
-@needs_csrc
-def test_the_extension_has_all_sources_and_headers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpp_extension, "CUDA_HOME", "/cuda")
-    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
-    monkeypatch.chdir(ROOT)
-    extension = build_cuda.extension()
-    bindings, kernels = ([p.relative_to(ROOT).as_posix() for p in paths] for paths in (BINDINGS, KERNELS))
-    instances = [f"{build_cuda.INSTANCES}/{name}" for name in INSTANCES]
-    assert extension.sources == [*bindings, *instances, *kernels]
-    headers = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".h", ".cuh")}
-    assert set(extension.depends) == headers
-    assert "cudart" in extension.libraries and "torch_python" not in extension.libraries
-    # torch adds no architectures of its own where a flag looks as if it named one
-    assert not [flag for flags in extension.extra_compile_args.values() for flag in flags if "arch" in flag]
-
-
 def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a")
     assert build_cuda.architectures() == "8.6;9.0a"
@@ -157,14 +106,6 @@ def test_kernels_compile(tmp_path: Path, kernel: Path, architecture: str) -> Non
     """To machine code, as ptxas alone finds what does not fit the hardware: the variant that has everything. The
     architectures take turns."""
     compile_for([kernel], [architecture], tmp_path, *quick(), "-DDIFFVBD_ONE_VARIANT")
-
-
-@pytest.mark.hours
-@needs_csrc
-@needs_nvcc
-@pytest.mark.parametrize(("kernel", "architecture"), TURNS, ids=STEMS)
-def test_every_variant_compiles(tmp_path: Path, kernel: Path, architecture: str) -> None:
-    compile_for([kernel], [architecture], tmp_path, *quick())
 
 
 @pytest.mark.hours
@@ -231,7 +172,7 @@ def test_an_object_that_does_not_load_is_reported_when_needed(tmp_path: Path, mo
 FAKE = f"""
 import os, pathlib, sys, time
 here = pathlib.Path(os.environ["FAKE"])
-assert pathlib.Path("csrc/bind/schema.cpp").exists()
+assert pathlib.Path("csrc/bind/operator.h").exists()
 with open(here / "runs", "a") as runs:
     print(os.getpid(), file=runs)
 mode = (here / "mode").read_text()
@@ -254,7 +195,7 @@ class Fake:
     def __init__(self, folder: Path) -> None:
         self.folder, self.package, self.cache = folder, folder / "package", folder / "cache"
         (self.package / "csrc" / "cuda").mkdir(parents=True)
-        for path, text in ((("csrc", "bind", "schema.cpp"), "// nothing"), (("ops", "build_cuda.py"), FAKE)):
+        for path, text in ((("csrc", "bind", "operator.h"), "// nothing"), (("ops", "build_cuda.py"), FAKE)):
             self.package.joinpath(*path).parent.mkdir()
             self.package.joinpath(*path).write_text(text)
         self.mode("build")
@@ -340,14 +281,6 @@ def test_jit_failure_says_why_and_can_be_repaired(fake: Fake) -> None:
     assert "step.h(7): error" in message() and not list(fake.cache.rglob("*.so"))
     fake.mode("build")
     assert native.jit_build().read_text() == "object 2"
-
-
-def test_require_cuda_loads_what_it_compiled(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded = []
-    monkeypatch.setattr(torch.ops, "load_library", loaded.append)
-    native.require_cuda()
-    native.require_cuda()
-    assert native.has_cuda() and loaded == [str(native.jit_build())] and len(fake.runs()) == 1
 
 
 def test_jit_says_that_sources_are_missing(fake: Fake) -> None:

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from diffvbd import ops
-from diffvbd.ops import neighbors as ops_neighbors
-from diffvbd.ops.neighbors import neighbor_pairs
+from diffvbd.ops.contact import neighbor_pairs
 
 DTYPES = [torch.float64, torch.float32]
 
@@ -58,38 +57,12 @@ def test_lines_planes_and_boxes(
     check(flat, 2.0, least=1000)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_clusters(dtype: torch.dtype, device: str, rng: np.random.Generator) -> None:
-    """Tight heaps far from one another: lists that are long, most cells empty."""
-    centers = cloud(rng, 12, 1, dtype=dtype, device=device, size=1e3)
-    points = (centers + cloud(rng, 12, 80, dtype=dtype, device=device, size=0.3)).reshape(1, -1, 3)
-    check(points, 0.5, least=10_000)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_all_in_one_cell(dtype: torch.dtype, device: str, rng: np.random.Generator) -> None:
-    points = cloud(rng, 2, 300, dtype=dtype, device=device, size=0.01)
-    check(points, 10.0, least=2 * 300 * 299 // 2)
-
-
 def test_coincident_points(device: str) -> None:
     """Distance 0 is below any radius; a distance that equals the radius is not."""
     points = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0], [3, 0, 0], [0, 0, 0]]], device=device)
     pairs, _ = neighbor_pairs(points, 1.0, 10)
     assert pairs.tolist() == [[0, 0, 2], [0, 0, 5], [0, 1, 3], [0, 2, 5]]
     check(points, 1e-6, least=4)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_lattice_of_cells(dtype: torch.dtype, device: str) -> None:
-    """Points on the borders of cells, in every direction, negative coordinates included."""
-    axis = torch.arange(-5, 6, dtype=dtype, device=device)
-    points = torch.cartesian_prod(axis, axis, axis)[None]
-    for radius, neighbors in ((1.0, 0), (1.001, 6), (1.5, 18), (1.8, 26)):
-        pairs, _ = neighbor_pairs(points, radius, 20_000)
-        middle = len(points[0]) // 2
-        assert int((pairs[:, 1:] == middle).sum()) == neighbors
-        check(points, radius)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -163,52 +136,3 @@ def test_points_that_are_not_finite_raise(value: float, dtype: torch.dtype, devi
         points[scene, point, axis] = value
         with pytest.raises(ValueError, match=rf"points: expected finite values, got .* at \[{scene}, {point}, {axis}"):
             neighbor_pairs(points, 1.0, 1000)
-
-
-def test_largest_finite_numbers(device: str) -> None:
-    big = torch.finfo(torch.float64).max
-    points = torch.tensor([[[big, big, big], [-big, big, 0], [big, big, big], [0, 0, 0]]], dtype=torch.float64)
-    assert neighbor_pairs(points.to(device), 1e-3, 10)[0].tolist() == [[0, 0, 2]]
-
-
-@pytest.mark.parametrize("dtype, radius", [(torch.float64, 0.0), (torch.float64, -1.0), (torch.float64, 1e-160),
-                                           (torch.float64, float("nan")), (torch.float64, float("inf")),
-                                           (torch.float32, 1e-20), (torch.float32, 1e20)])  # fmt: skip
-def test_bad_radius(dtype: torch.dtype, radius: float, device: str) -> None:
-    with pytest.raises(ValueError, match=r"radius: expected a number in \[.*\] m, got"):
-        neighbor_pairs(torch.zeros(1, 2, 3, dtype=dtype, device=device), radius, 10)
-
-
-def test_bad_shapes_and_sizes(device: str) -> None:
-    for shape in ((2, 3), (1, 2, 2), (1, 1, 2, 3)):
-        with pytest.raises(ValueError, match=r"points: expected contiguous points of shape \[scenes, points, 3\]"):
-            neighbor_pairs(torch.zeros(shape, device=device), 1.0, 10)
-    with pytest.raises(ValueError, match="float64 or float32"):
-        neighbor_pairs(torch.zeros(1, 2, 3, dtype=torch.int64, device=device), 1.0, 10)
-    for size in (-1, 2**30 + 1):
-        with pytest.raises(ValueError, match="max_pairs"):
-            neighbor_pairs(torch.zeros(1, 2, 3, device=device), 1.0, size)
-
-
-def test_points_of_any_layout(device: str, rng: np.random.Generator) -> None:
-    points = cloud(rng, 2, 100, dtype=torch.float64, device=device)
-    strided = points.transpose(0, 2).contiguous().transpose(0, 2)
-    assert not strided.is_contiguous()
-    assert torch.equal(neighbor_pairs(strided, 0.5, 5000)[0], neighbor_pairs(points, 0.5, 5000)[0])
-
-
-# --- inside torch -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("room", [3, 500])
-def test_opcheck(room: int, dtype: torch.dtype, device: str, rng: np.random.Generator) -> None:
-    points = cloud(rng, 2, 30, dtype=dtype, device=device)
-    torch.library.opcheck(torch.ops.diffvbd.neighbor_pairs.default, (points, 0.5, room))
-
-
-def test_pairs_have_no_gradient(device: str, rng: np.random.Generator) -> None:
-    points = cloud(rng, 1, 30, dtype=torch.float64, device=device).requires_grad_()
-    assert not any(t.requires_grad for t in neighbor_pairs(points, 0.5, 500))
-    with pytest.raises(NotImplementedError, match="center_of_mass_penalty"):
-        ops_neighbors._raw_backward(None)

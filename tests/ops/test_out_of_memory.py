@@ -20,9 +20,9 @@ def test_a_tape_that_does_not_fit(kind: str, tape: str) -> None:
     energies += (dv.PairBarrier(),) if kind == "contact" else ()
     model = dv.Model(dv.mesh.cube(3, size=0.2), pinned=[0, 1], energies=energies)
     x = model.rest_points.expand(SCENES, -1, -1).clone().requires_grad_()
-    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "adjoint": dv.ReverseSweep(tape)}
+    options = {"mu": 1e4, "lam": 1e4}
     with pytest.raises(torch.OutOfMemoryError) as error:
-        dv.step(model, x, torch.zeros_like(x), sweeps=SWEEPS, **options)
+        dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, SWEEPS, tape=tape), **options)
     kept = {"plain": 0, "floor": 4, "contact": 3}[kind]
     scalars = {"full": 9 + kept, "compact": kept or 3}[tape]
     wanted = 8 * scalars * SCENES * SWEEPS * model.num_active
@@ -31,7 +31,7 @@ def test_a_tape_that_does_not_fit(kind: str, tape: str) -> None:
     assert found and wanted <= int(found[1]) <= wanted + 4 * x.numel() * 8
     assert "fewer sweeps or scenes" in str(error.value)
     assert ('"compact"' in str(error.value)) == (tape == "full" or 'tape="compact"' in str(error.value))
-    end, _ = dv.step(model, x, torch.zeros_like(x), sweeps=1, **options)
+    end, _ = dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 1, tape=tape), **options)
     assert torch.isfinite(torch.autograd.grad(end.sum(), x)[0]).all()
 
 

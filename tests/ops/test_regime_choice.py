@@ -4,8 +4,7 @@ import itertools
 
 import pytest
 
-import diffvbd as dv
-from diffvbd.ops.regimes import BLOCK, COLOR, GRID, MANY_LANES, SOME_LANES, SOME_REVERSE_LANES, THREAD, choose
+from diffvbd.ops.regimes import BLOCK, COLOR, GRID, MANY_LANES, SOME_LANES, SOME_REVERSE_LANES, THREAD, choose, regime
 
 COLORS = 8
 
@@ -42,5 +41,5 @@ def test_contact_has_one_regime() -> None:
 
 
 def test_a_forced_regime_is_of_both_directions() -> None:
-    with dv.regime("color"):
+    with regime("color"):
         assert choose(343, COLORS, 64)[:2] == (COLOR, COLOR)

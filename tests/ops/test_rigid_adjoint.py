@@ -12,8 +12,8 @@ import diffvbd as dv
 from diffvbd import mesh, ops
 from diffvbd.adjoint.contact_lag import of_scene
 from diffvbd.ops import broadcast
-from diffvbd.ops import contact_rigid as ops_rigid
-from diffvbd.ops.segments import Order, of_segments, sum_segments
+from diffvbd.ops import contact as ops_rigid
+from diffvbd.ops.sums import Order, of_segments, sum_segments
 from diffvbd.reference.rigid_contact import LEAST_INERTIA
 from diffvbd.step.rigid_terms import Scenes, vertex_blocks, vertex_gradient
 from diffvbd.testing import relative_error, tolerance
@@ -205,16 +205,16 @@ def test_compiled_adjoint_is_that_of_autograd(name: str, device: str, monkeypatc
 
     monkeypatch.setattr(rigid_contact, "_adjoints", both)
     leaves = {"x": x, "v": v, "density": x.new_full((), 1e3)}
-    parameters = {"floor_barrier.kappa": 1e3} if dv.FloorBarrier in map(type, energies) else {}
-    parameters |= {"pair_barrier.kappa": 1e3} if dv.PairBarrier in map(type, energies) else {}
+    parameters = {"floor_kappa": 1e3} if dv.FloorBarrier in map(type, energies) else {}
+    parameters |= {"pair_kappa": 1e3} if dv.PairBarrier in map(type, energies) else {}
     values = {key: x.new_full((), value).requires_grad_() for key, value in parameters.items()}
     for leaf in leaves.values():
         leaf.requires_grad_()
-    end = dv.step(model, leaves["x"], leaves["v"], mu=1e5, lam=1e5, time_step=0.01, sweeps=2, density=leaves["density"],
-                  parameters=values)  # fmt: skip
+    end = dv.step(model, leaves["x"], leaves["v"], dv.VBD(0.01, 2), mu=1e5, lam=1e5, density=leaves["density"],
+                  **values)  # fmt: skip
     sum(((t * noise(name, shape=t.shape, size=1.0).to(t)).sum() for t in end), x.new_zeros(())).backward()
     assert (max(longest) > 1) == (name in ("many", "held"))
-    wanted = {"x", "x_prev", "y", "mass"} | ({"lag"} if "pair_barrier.kappa" in values else {"floor_lag"})
+    wanted = {"x", "x_prev", "y", "mass"} | ({"lag"} if "pair_kappa" in values else {"floor_lag"})
     assert all(seen[field] > 0 for field in wanted), seen
     assert all(
         float(leaf.grad.abs().max()) > 0 for leaf in (*leaves.values(), *values.values()) if leaf.grad is not None

@@ -83,13 +83,3 @@ def test_rubbing_and_its_adjoint(coefficients: int, absent: tuple[str, ...], par
             continue
         assert expected.any() or (key in LEAVES[3:] and parts == (1,)), key
         assert relative_error(own, expected) <= tolerance("contact_adjoint"), key
-
-
-def test_no_pairs(device: str) -> None:
-    values, listed, origin = case(device, 1)
-    none = Pairs(listed.pairs[:0], listed.constants[:0], torch.zeros_like(listed.ptr), listed.entry[:0])
-    leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
-    lag, push = rubbing(*leaves.values(), origin, none)
-    assert lag.shape == (0, 9) and not push.any()
-    grads = torch.autograd.grad(lag.sum() + push.sum(), list(leaves.values()))
-    assert all(g.shape == leaf.shape and not g.any() for g, leaf in zip(grads, leaves.values(), strict=True))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.ops import sweep_rooms
+from diffvbd.ops import contact as sweep_rooms
 from diffvbd.testing import generator, tolerance
 
 MORE, LEAST = 1.5, 0.02
@@ -106,39 +106,3 @@ def test_all_that_bounds_a_room_does(device: str) -> None:
     assert int((got[0] == most).sum()) > 1  # those that have room for all that bodies want
     check(c._replace(held=torch.ones_like(c.held)))
     check(c._replace(held=torch.zeros_like(c.held)))
-
-
-@pytest.mark.parametrize("field", ["x", "start", "begin", "move", "fall", "apart", "stretched", "center", "room"])
-def test_what_is_not_a_number_shows(device: str, field: str) -> None:
-    """In the room of its vertex or, of what bodies want, of the whole scene, and of no other scene."""
-    c = case([4, 300, 3], device)
-    c = c._replace(held=torch.zeros_like(c.held))
-    values = getattr(c, field).clone()
-    values[(0, 1) if values.ndim == 2 else (0, 1, 2)] = torch.nan
-    lost = check(c._replace(**{field: values})).isnan()
-    assert not bool(lost[1].any()) and bool(lost[0, 1])
-    assert bool(lost[0].all()) == (field not in ("center", "room"))
-
-
-def test_threads_that_share_bodies_change_nothing() -> None:
-    c, threads, found = case([20] * 600, "cpu", scenes=4), torch.get_num_threads(), []
-    try:
-        for n in (1, 2, 4):
-            torch.set_num_threads(n)
-            found.append(c.rooms())
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(other, found[0]) for other in found)
-
-
-def test_opcheck_and_bad_input(device: str) -> None:
-    operator = torch.ops.diffvbd.contact_sweep_rooms.default
-    for own in (False, True):
-        c = case([3, 0, 5], device, own=own)
-        torch.library.opcheck(operator, (*c, MORE, LEAST))
-    for name, value in case([3, 0, 5], device)._asdict().items():
-        other = value.float() if value.is_floating_point() else value.to(torch.uint8)
-        few = value.reshape(-1)[:-1] if name != "held" else value[:7]
-        for bad in (few, other, value.mT if value.ndim > 1 and name != "apart" else few):
-            with pytest.raises(ValueError, match="expected"):
-                operator(*c._replace(**{name: bad}), MORE, LEAST)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from diffvbd import mesh
 from diffvbd.reference import intersections
 
 TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
@@ -72,37 +71,3 @@ def test_random_soup(rng: np.random.Generator, scale: float) -> None:
     assert intersections(x, triangles, edges).tolist() == [list(pair) for pair in expected]
     given = (torch.from_numpy(a) for a in (x, triangles, edges))
     assert intersections(*given).tolist() == [list(pair) for pair in expected]
-
-
-def surface(body: mesh.TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles and edges of the boundary."""
-    triangles = body.surface
-    sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-    return triangles, np.unique(np.sort(sides, 1), axis=0)
-
-
-def test_bodies() -> None:
-    """A mesh does not cross itself, nor a body beside it, but one that it reaches into."""
-    cube = mesh.cube(6)
-    for offset, crossed in (((1.0001, 0.03, 0.07), False), ((0.9999, 0.03, 0.07), True), ((0.5, 0.53, 0.47), True)):
-        both = mesh.join([cube, mesh.TetMesh(cube.points + np.array(offset), cube.tets)])
-        triangles, edges = surface(both)
-        found = intersections(both.points, triangles, edges)
-        assert (len(found) > 0) == crossed
-        assert torch.equal(found, intersections(both.points, triangles, edges, both.body))
-
-
-def test_labels_hide_a_body_from_itself() -> None:
-    x = np.array([*TRIANGLE, [0.2, 0.3, -1], [0.2, 0.3, 1]])
-    triangles, edges = np.array([[0, 1, 2]]), np.array([[3, 4]])
-    assert len(intersections(x, triangles, edges, np.array([0, 0, 0, 1, 1]))) == 1
-    assert len(intersections(x, triangles, edges, np.zeros(5, int))) == 0
-
-
-def test_bad_input() -> None:
-    x, triangles, edges = np.zeros((4, 3)), np.zeros((1, 3), int), np.zeros((1, 2), int)
-    with pytest.raises(ValueError, match=r"edges: expected shape \[n, 2\], got \[1, 3\]"):
-        intersections(x, triangles, triangles)
-    with pytest.raises(ValueError, match="x: expected finite positions, got 1 that are not"):
-        intersections(np.array([[0.0, np.nan, 0], [1, 1, 1]]), triangles, edges)
-    assert intersections(x, triangles[:0], edges).shape == (0, 2)

@@ -16,8 +16,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import reference
 from diffvbd.model.coarse import CoarseSpace, build_coarse
-from diffvbd.reference import coarse, rigid, sweep
-from diffvbd.reference import energies as laws
+from diffvbd.reference import coarse, sweep
 from diffvbd.reference.scene import build_layout, build_scene
 from diffvbd.testing import generator, relative_error, structured, tolerance
 
@@ -64,23 +63,16 @@ def inputs_of(model: Any, jitter: float = 0.02) -> dict[str, Any]:
         "gravity": torch.tensor([0.3, -9.81, 0.1]).double(),
         "prescribed": x + 0.01 * normal(SCENES, POINTS, 3),
         "rest_points": rest + 5e-3 * normal(SCENES, POINTS, 3),
-        "parameters": {"anchor.stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2))},
+        "parameters": {"anchor_stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2))},
         "time_step": 0.02,
     }
 
 
 def coarse_of(model: Any, x: Tensor, energies: Any = None, **changes: Any) -> tuple[coarse.Coarse, Any]:
     """The correction of a run from x, and its scene."""
-    options = {"mu": 8e3, "lam": 2e4, "time_step": 0.02, "rest_points": None, "density": None, "parameters": None}
+    options = {"mu": 8e3, "lam": 2e4, "rest_points": None, "density": None, "parameters": None}
     scene = build_scene(model, build_layout(model), x, **(options | changes))
     return coarse.Coarse(scene, sweep.build_energies(scene) if energies is None else energies), scene
-
-
-def test_bodies_are_as_expected() -> None:
-    """What the other tests rely on: filling functions, several groups, both bodies."""
-    geometry = stand_in().coarse_geometry
-    assert geometry.bodies == BODIES and 0 < geometry.filling.sum() < geometry.functions
-    assert np.bincount(geometry.group_body).tolist() == [3, 3]
 
 
 def test_stiffness_is_the_projected_hessian_at_rest() -> None:
@@ -101,38 +93,6 @@ def test_stiffness_is_the_projected_hessian_at_rest() -> None:
     for own, stiffness in zip(correction.own, correction.stiffness, strict=True):
         assert relative_error(stiffness.sum(0), projected[own, :, own, :]) <= tolerance("hessian")
     assert not projected[correction.own[0], :, correction.own[1], :].any()
-
-
-def test_a_negative_lam_is_bounded() -> None:
-    model = stand_in()
-    mu = torch.tensor(8e3).double().requires_grad_()
-    below, least = (coarse_of(model, model.rest_points, mu=mu, lam=lam)[0].stiffness[1] for lam in (-7e3, -2 / 3 * mu))
-    assert relative_error(below, least) <= tolerance("ulps")
-    slopes = [torch.autograd.grad(k.sum((0, 1, 3)).square().sum(), mu, retain_graph=True)[0] for k in (below, least)]
-    assert relative_error(*slopes) <= tolerance("formula") and slopes[0] != 0
-    n = below.shape[1]
-    values = torch.linalg.eigvalsh(below.detach().sum(0).reshape(3 * n, 3 * n))
-    assert values[0] >= -tolerance("formula") * values[-1]
-
-
-def test_rotations_are_the_nearest_ones() -> None:
-    model = stand_in()
-    rest = model.rest_points
-    correction, _ = coarse_of(model, rest)
-    # of a turned body, whose gradient has equal singular values
-    turned = correction.rotations((rest @ TURN.T + 1.0).T)
-    assert relative_error(turned, TURN.expand_as(turned)) <= tolerance("formula")
-    rng = generator("rotations")
-    gradient = torch.as_tensor(rng.standard_normal((200, 3, 3)))
-    found = coarse.nearest_rotation(gradient, torch.tensor(1e-3).double())
-    _, s, _ = torch.linalg.svd(gradient)
-    last = s[:, 2] * torch.linalg.det(gradient).sign()
-    good = s[:, 1] + last > 0.01
-    one = torch.eye(3).double()
-    assert relative_error(found @ found.mT, one.expand_as(found)) <= tolerance("cancelling")
-    assert (torch.linalg.det(found) > 0).all() and (last[good] < 0).any() and (last[good] > 0).any()
-    most = (s[:, 0] + s[:, 1] + last)[good]
-    assert relative_error((found * gradient).sum((-2, -1))[good], most) <= tolerance("cancelling")
 
 
 def test_rotations_against_central_differences() -> None:
@@ -181,40 +141,8 @@ def test_functions_that_span_everything_make_a_newton_step() -> None:
     assert relative_error(moved.T[1:] - rest[1:], step) <= tolerance("cancelling")
 
 
-def test_its_gradient_is_that_of_the_potential() -> None:
-    model = stand_in()
-    inputs = inputs_of(model)
-    x = inputs["x"]
-    y = torch.where(model.pinned[:, None], x, x + 0.01)
-    correction, scene = coarse_of(model, x)
-    above = x + torch.where(model.pinned[:, None], 0.0, torch.tensor([0.0, -1e-3, 2e-3]).double())
-    expected = reference.residual(model, above, y, 8e3, 2e4, scene.time_step, x)
-    found = correction._gradient(above.mT, y.mT, x.mT).mT
-    assert relative_error(found[:, ~model.pinned], expected[:, ~model.pinned]) <= tolerance("hessian")
-
-
-def test_terms_add_up_to_the_energies() -> None:
-    """Of each energy, friction included, but for what does not change; and body by body."""
-    model = stand_in()
-    model.friction = dv.Friction(0.5)
-    x = inputs_of(model)["x"]
-    correction, scene = coarse_of(model, x)
-    energies = [*correction.energies, *laws.floor_friction(scene, correction.energies)]
-    assert len(energies) == 4
-    moved = x + 0.01 * torch.as_tensor(generator("terms").standard_normal(tuple(x.shape)))
-    for energy in energies:
-        (before, vertex), (after, _) = (energy.terms(z.mT, x.mT) for z in (x, moved))
-        whole = energy.energy(moved.mT, x.mT) - energy.energy(x.mT, x.mT)
-        assert relative_error((after - before).sum(-1), whole) <= tolerance("cancelling")
-        for body in range(BODIES):
-            of_body = correction.body == body
-            mixed = torch.where(of_body[:, None], moved, x)
-            part = energy.energy(mixed.mT, x.mT) - energy.energy(x.mT, x.mT)
-            assert relative_error((after - before)[:, of_body[vertex]].sum(-1), part) <= tolerance("cancelling")
-
-
 @pytest.mark.parametrize(
-    ("sweeps", "rigid"), [(0, False), (1, False), (4, True), *(slow(*a) for a in ((0, True), (1, True), (4, False)))]
+    ("sweeps", "rigid"), [(0, False), (1, False), *(slow(*a) for a in ((0, True), (1, True), (4, False), (4, True)))]
 )
 def test_step_against_central_differences(sweeps: int, rigid: bool) -> None:
     """With as many sweeps, and the lengths of the corrections as they were found."""
@@ -249,36 +177,6 @@ def test_step_against_central_differences(sweeps: int, rigid: bool) -> None:
         assert any(error(s) <= tolerance("finite_difference") * abs(value) for s in (1e-6, 1e-5, 1e-7, 1e-3)), name
 
 
-@pytest.mark.parametrize("jitter", (0.0, 0.03, 0.3))
-def test_no_body_ends_above_its_start(jitter: float) -> None:
-    """Whatever the state, also among inverted tets; and no vertex loses more of its gap than it may."""
-    model = stand_in()
-    rest = model.rest_points
-    rng = generator("never above", jitter)
-    shape = (6, POINTS, 3)
-    x = rest + jitter * torch.as_tensor(rng.uniform(-1, 1, shape))
-    x[..., 1] = x[..., 1].clamp(min=-0.04)
-    state = x + jitter * torch.as_tensor(rng.uniform(-1, 1, shape))
-    state[..., 1] = state[..., 1].clamp(min=-0.04)
-    state = torch.where(model.pinned[:, None], x, state)
-    y = state + 0.1 * jitter * torch.as_tensor(rng.standard_normal(shape)) - torch.tensor([0.0, 0.2, 0.0]).double()
-    y = torch.where(model.pinned[:, None], x, y)
-    correction, scene = coarse_of(model, x)
-    moved, s = correction.correct(state.mT, y.mT, x.mT, correction.begin(x.mT))
-    assert s.shape == (6, BODIES) and (s > 0).any()
-    assert set(s.flatten().tolist()) <= {0.0, *(0.5**n for n in range(coarse.HALVINGS))}
-    for body in range(BODIES):
-        of_body = (correction.body == body)[:, None]
-        ends = [reference.incremental_potential(model, z, y, 8e3, 2e4, scene.time_step, x)
-                for z in (state, torch.where(of_body, moved.mT, state))]  # fmt: skip
-        assert (ends[1] <= ends[0] * (1 + tolerance("ulps"))).all()
-        assert (ends[1] < ends[0])[s[:, body] > 0].all()
-    floor = correction.energies[-1]
-    kept = floor.gap(moved) - rigid.LEAST_SHARE * floor.gap(state.mT)
-    assert (kept[..., ~model.pinned] >= 0).all()
-    assert torch.equal(moved.mT[:, model.pinned], state[:, model.pinned])
-
-
 @pytest.mark.parametrize(
     ("sweeps", "every", "expected"),
     [(0, 3, "c"), (1, 3, "sc"), (2, 3, "scs"), (4, 3, "scsss"), (5, 3, "scssscs"), (4, 1, "scscscs")],
@@ -300,69 +198,3 @@ def test_order_of_a_step(sweeps: int, every: int, expected: str, monkeypatch: py
     monkeypatch.setattr(sweep, "run_sweeps", run_sweeps)
     reference.step(model, sweeps=sweeps, **inputs_of(model))
     assert "".join(seen) == expected and relaxations == [None] * (sweeps - 1) + [1.0] * min(sweeps, 1)
-
-
-def test_a_body_that_is_refused_twice_is_left_to_the_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And then the step is that of a model without a coarse space, to the bit."""
-    model, plain = stand_in(every=1), stand_in(coarse=False)
-    inputs = inputs_of(model)
-    monkeypatch.setattr(coarse, "DECREASE", 1e12)
-    given, corrected = [], coarse.Coarse.correct
-
-    def correct(*args: Any) -> Any:
-        given.append(bool(args[-1].all()))
-        return corrected(*args)
-
-    monkeypatch.setattr(coarse.Coarse, "correct", correct)
-    record: list[Tensor] = []
-    x, v = reference.step(model, sweeps=5, record=record, **inputs)
-    assert not record[0].any() and given == [False, False, True, True]
-    expected = reference.step(plain, sweeps=5, **inputs)
-    assert torch.equal(x, expected[0]) and torch.equal(v, expected[1])
-
-
-def test_scenes_and_order_of_tets_change_rounding_alone() -> None:
-    model = stand_in()
-    inputs = inputs_of(model)
-    record: list[Tensor] = []
-    run: dict[str, Any] = {"steps": 2, "sweeps": 4}
-    ends = reference.rollout(model, record=record, **run, **inputs)
-    assert len(record) == 2 and record[0].shape == (2, SCENES, BODIES)
-    order = torch.as_tensor(generator("order").permutation(len(model.tets)))
-    permuted = reference.rollout(model, tet_order=order, coarse_steps=record, **run, **inputs)
-    assert relative_error(permuted.x, ends.x) <= tolerance("forward")
-    for n in range(SCENES):
-        alone: dict[str, Any] = {name: value[n] if isinstance(value, Tensor) and value.shape[:1] == (SCENES,) else value
-                 for name, value in inputs.items()}  # fmt: skip
-        alone["parameters"] = {name: value[n] for name, value in inputs["parameters"].items()}
-        single: list[Tensor] = []
-        end = reference.rollout(model, record=single, **run, **alone)
-        assert all(torch.equal(a, b[:, n]) for a, b in zip(single, record, strict=True))
-        assert relative_error(end.x, ends.x[:, n]) <= tolerance("forward")
-
-
-def test_few_sweeps_come_closer_with_it() -> None:
-    """What it is for: of what the potential of a step may still fall, four sweeps leave less."""
-    model, plain = stand_in(), stand_in(coarse=False)
-    inputs = inputs_of(model)
-    inputs |= {"mu": inputs["mu"] * 100, "lam": inputs["lam"] * 100}
-    x, v, options = inputs["x"], inputs["v"], {n: inputs[n] for n in ("rest_points", "density", "parameters")}
-    scene = coarse_of(model, x, **options)[1]
-    y = sweep.predictor(scene, x, v, inputs["force"], inputs["gravity"], inputs["prescribed"])
-
-    def left(model: Any, sweeps: int) -> Tensor:
-        end, _ = reference.step(model, sweeps=sweeps, **inputs)
-        return reference.incremental_potential(model, end, y, inputs["mu"], inputs["lam"], 0.02, x, **options)
-
-    least = left(model, 100)
-    assert (left(model, 4) - least < left(plain, 4) - least).all()
-
-
-def test_a_model_without_a_body_to_correct() -> None:
-    """All vertices pinned: no function, and the step is the plain one."""
-    model, plain = (stand_in(pinned=np.arange(POINTS), coarse=given) for given in (True, False))
-    inputs = inputs_of(plain)
-    record: list[Tensor] = []
-    x, _ = reference.step(model, sweeps=3, record=record, **inputs)
-    assert record[0].shape == (1, SCENES, 0)
-    assert torch.equal(x, reference.step(plain, sweeps=3, **inputs)[0])

@@ -2,24 +2,27 @@
 is at fault; so does one whose sweeps leave its motion wrong, and one that bends tets too thin for it."""
 
 import warnings
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from helpers.two_boxes import two_boxes
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.rollout import end_check
-from diffvbd.step.arguments import prepare
-from diffvbd.step.integrators import Solve
-from diffvbd.step.lost import FAR
-from diffvbd.step.unsolved import unsolved
+from diffvbd import reference
+from diffvbd.mesh import box
+from diffvbd.model.system import system_of
+from diffvbd.rollout import checks
+from diffvbd.step.arguments import material_of, prepare
+from diffvbd.step.contact_cycles import CUT
+from diffvbd.step.residual import cut_share
+from diffvbd.step.stability import FAR
 from diffvbd.testing import tolerance
 
 MEASURES_GROWTH = True  # see conftest.py
 
-SOFT: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 10}
+SOFT: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, 10)}
 
 
 def bent(**options: Any) -> tuple[dv.Model, Tensor, Tensor]:
@@ -59,21 +62,6 @@ def test_an_end_that_is_no_number_is_warned_of() -> None:
     assert messages(lambda: dv.rollout(model, 1e-20 * x, v, steps=1, **SOFT)) == []
 
 
-def test_the_next_rollout_says_it_where_the_device_was_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on CUDA: a copy that is not there yet is asked for again later, whatever ends meanwhile."""
-    model, x, v = bent()
-    monkeypatch.setattr(end_check, "may_copy", lambda x: True)
-    ready = SimpleNamespace(query=lambda: there)
-    model._derived[end_check.ENDED] = [(torch.tensor([good, True]), ready) for good in (True, False, True)]
-    there = False
-    assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
-    there = True
-    with pytest.warns(UserWarning, match="a rollout of this Model before this one ended") as found:
-        dv.rollout(model, x, v, steps=1, **SOFT)
-    assert found[0].filename == __file__
-    assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
-
-
 @pytest.mark.cuda
 def test_the_next_rollout_says_it_on_cuda() -> None:
     model, x, v = lost()
@@ -106,31 +94,17 @@ def test_a_force_that_explodes_is_blamed() -> None:
 
 
 def test_sweeps_and_time_steps_are_blamed() -> None:
-    model = dv.Model(dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1)), relaxation=1.7)
+    model = dv.Model(dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1)))
     x, v = model.rest_points, 0 * model.rest_points
     v[:, 1] = torch.sin(9 * x[:, 0])
-    said = messages(lambda: dv.rollout(model, x, v, steps=16, mu=1e8, lam=4e8, time_step=0.01, sweeps=2,
-                                       integrator=dv.SDIRK2(), gravity=(0.0, 0.0, 0.0)))  # fmt: skip
+    said = messages(lambda: dv.rollout(model, x, v, dv.VBD(0.01, 2, integrator=dv.SDIRK2(), relaxation=1.7), steps=16,
+                                       mu=1e8, lam=4e8, gravity=(0.0, 0.0, 0.0)))  # fmt: skip
     assert any("more than 1000 body sizes" in text and "sweeps: so few let vibrations grow" in text for text in said)
-
-
-def test_a_loop_of_steps_says_it_too() -> None:
-    model, x, v = bent()
-    said: list[int] = []
-    state = x, 0 * v
-    for k in range(20):
-        after: list[tuple[Tensor, Tensor]] = []
-        texts = messages(lambda s=state: after.append(dv.step(model, *s, force=-50.0 * s[1], **SOFT)))  # noqa: B023
-        assert all("x: this step ended with positions that are spread over" in t and "force:" in t for t in texts)
-        said += [k] * bool(texts)
-        state = after[0]
-    assert len(said) > 2 and said == list(range(said[0], 20))
-    assert messages(lambda: dv.step(model, x + 1e6, v, **SOFT)) == []  # far from the origin
 
 
 def test_a_flight_is_not_lost() -> None:
     model, x, v = bent()
-    flight: dict[str, Any] = {"mu": 10.0, "lam": 10.0, "time_step": 0.9, "sweeps": 1}
+    flight: dict[str, Any] = {"mu": 10.0, "lam": 10.0, "solver": dv.VBD(0.9, 1)}
     assert messages(lambda: dv.rollout(model, x, 0 * v + 500.0, steps=9, **flight)) == []
 
 
@@ -139,22 +113,22 @@ def test_a_flight_is_not_lost() -> None:
 
 def swinging(sweeps: int, **options: Any) -> tuple[Tensor, list[str]]:
     mesh = dv.mesh.beam(6, 3, 3, size=(0.4, 0.05, 0.05))
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, **options)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
     x, frames = model.rest_points, []
-    said = messages(lambda: frames.append(dv.rollout(model, x, 0 * x, steps=60, young=1e6, poisson=0.3,
-                                                     time_step=0.005, sweeps=sweeps).x))  # fmt: skip
+    solver = dv.VBD(0.005, sweeps, **options)
+    said = messages(lambda: frames.append(dv.rollout(model, x, 0 * x, solver, steps=60, young=1e6, poisson=0.3).x))
     return frames[0], said
 
 
 def test_motion_that_sweeps_leave_wrong_is_warned_of_and_what_is_right_is_not() -> None:
-    coarse: dict[str, Any] = {"coarse": "auto", "relaxation": 1.5}
+    coarse: dict[str, Any] = {"subspace": "coarse", "relaxation": 1.5}
     right, said = swinging(100, **coarse)
     assert said == []
     for sweeps, options, wrong in ((10, {}, True), (300, {"relaxation": 1.5}, False), (20, coarse, False)):
         motion, said = swinging(sweeps, **options)
         error = float((motion - right).norm() / (right - right[0]).norm())
         assert (error > 0.05) == wrong == any("the motion may be off by" in text for text in said)
-        assert all('coarse="auto"' in text for text in said)
+        assert all('subspace="coarse"' in text for text in said)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -163,35 +137,245 @@ def test_what_rests_or_has_no_sweeps_to_judge_is_not_doubted(dtype: torch.dtype)
         dv.mesh.box(3, 0.2), dtype=dtype, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.004, kappa=1e4))
     )
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    many: dict[str, Any] = SOFT | {"sweeps": 100}
-    end = dv.rollout(model, x, v, steps=60, save="last", check_energy=False, **many)
+    many: dict[str, Any] = SOFT | {"solver": dv.VBD(0.01, 100)}
+    end = dv.rollout(model, x, v, steps=60, save="last", **many, checks=dv.Checks(energy=False))
     for frames in (10, 40):
         assert messages(lambda n=frames: dv.rollout(model, end.x[-1], end.v[-1], steps=n, **SOFT)) == []
 
 
-def test_the_error_is_that_of_newtons_method_among_polynomials() -> None:
-    """Of a body that is moved as a whole from where the step converges, all of it is found."""
-    mesh = dv.mesh.box(3, 0.2)
-    model = dv.Model(mesh)
-    x = model.rest_points
-    converged = dv.solve(model, x, 0 * x, mu=1e4, lam=1e4, time_step=0.01, tolerance=1e-10).x
-    given = {"force": None, "gravity": (0.0, -9.81, 0.0), "prescribed": None, "colliders": None,
-             "colliders_before": None}  # fmt: skip
-    prepared = prepare(model, (), mu=1e4, lam=1e4, time_step=0.01, sweeps=1, rest_points=None, density=None,
-                       parameters=None)  # fmt: skip
-    away = torch.tensor([3e-4, 0.0, -4e-4], dtype=x.dtype)
-    found = unsolved(model, Solve(x, 0 * x, prepared, given), converged + away, {})
-    assert found is not None and abs(found.error / 5e-4 - 1) <= tolerance("closed_form")
+# --- energy from nowhere ----------------------------------------------------------------------------------------------
 
 
-def test_bending_of_thin_tets_is_said_where_it_shows() -> None:
-    mesh = dv.mesh.sheet(10, 10, (0.3, 0.3), 2e-3)
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse="auto", relaxation=1.5)
+STIFF: dict[str, Any] = {"mu": 1e9, "lam": 1e9, "solver": dv.VBD(0.01, 2)}
+
+
+def bent_bar(**options: Any) -> tuple[dv.Model, Tensor, Tensor]:
+    """A bar whose velocities bend it."""
+    mesh = dv.mesh.box((5, 2, 2), (0.4, 0.1, 0.1))
+    model = dv.Model(mesh, **options)
     x = model.rest_points
-    pull = torch.zeros(2, 3, dtype=x.dtype)
-    thin = int((x.amax(0) - x.amin(0)).argmin())
-    pull[0, thin], pull[1, 0] = -9.81, 9.81  # across the sheet, along it
-    for gravity, bends in zip(pull, (True, False), strict=True):
-        said = messages(lambda g=gravity: dv.rollout(model, x, 0 * x, steps=10, young=1e8, poisson=0.3, gravity=g,
-                                                     time_step=0.01, sweeps=10))  # fmt: skip
-        assert any("tets 24 times as wide as thick bend here" in text for text in said) == bends
+    v = torch.zeros_like(x)
+    v[:, 1] = 20 * x[:, 0].square()
+    return model, x, v
+
+
+def said_of_energy(run: Any, of: str = "gained") -> list[str]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        run()
+    return [str(w.message) for w in found if of in str(w.message)]
+
+
+# --- energy -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [3, checks.LEAST_CHUNK])  # tets that are looked at together
+def test_energy_is_that_of_the_reference(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    monkeypatch.setattr(checks, "LEAST_CHUNK", chunk)
+    model, x, v = bent_bar()
+    x = x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    mu, lam = (torch.linspace(1e4, k, model.num_tets, dtype=x.dtype) for k in (2e4, 5e4))
+    system = system_of(model, dv.VBD(1.0, 1))
+    prepared = prepare(system, (), material_of(mu=mu, lam=lam), time_step=1.0, sweeps=1)
+    expected = reference.incremental_potential(model, x, x, mu, lam, 1.0)
+    expected = expected + 0.5 * (model.mass[:, None] * v.square()).sum()
+    found = checks.mechanical_energy(system, prepared, x, v)
+    assert found.shape == (1,) and expected > 0
+    assert abs(found - expected) <= tolerance("energy_gain") * expected
+    many = checks.mechanical_energy(system, prepared, x.expand(3, -1, -1), v.expand(3, -1, -1))
+    assert torch.allclose(many, found, rtol=tolerance("energy_gain"))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
+    model, x, v = bent_bar(dtype=dtype)
+    with pytest.warns(UserWarning, match=r'has gained .* subspace="coarse"') as found:
+        dv.rollout(model, x, v, steps=10, **STIFF)
+    assert {w.filename for w in found} == {__file__}
+    for asked in (None, True):
+        assert (
+            len(
+                said_of_energy(
+                    lambda asked=asked: dv.rollout(model, x, v, steps=10, **STIFF, checks=dv.Checks(energy=asked))
+                )
+            )
+            == 1
+        )
+
+
+def test_what_helps_helps() -> None:
+    model, x, v = bent_bar()
+    solver = dv.VBD(0.01, 100, subspace="coarse", relaxation=1.5)
+    assert (
+        said_of_energy(
+            lambda: dv.rollout(
+                model,
+                x,
+                v,
+                steps=10,
+                **STIFF | {"solver": solver},
+                checks=dv.Checks(energy=True),
+            )
+        )
+        == []
+    )
+
+
+def test_nothing_is_said_of_a_scene_that_gains_none_or_is_driven() -> None:
+    model, x, v = bent_bar()
+    assert said_of_energy(lambda: dv.rollout(model, x, v, steps=20, **SOFT, checks=dv.Checks(energy=True))) == []
+    kinds: list[dict[str, Any]] = [
+        {"force": 0 * x},
+        {"gravity": lambda k, x, v: 0 * x},
+        {"checks": dv.Checks(energy=False)},
+    ]
+    for driven in kinds:
+        assert said_of_energy(lambda d=driven: dv.rollout(model, x, v, steps=20, **STIFF, **d)) == []
+    assert said_of_energy(lambda: dv.rollout(model, x, v, steps=9, **STIFF)) == []  # too short to be looked at unasked
+
+
+def test_rest_and_fall_are_no_gain_in_single_precision_or_far_away() -> None:
+    for dtype, distance in ((torch.float32, 1.0), (torch.float32, 1e3), (torch.float64, 1e5)):
+        model, x, v = bent_bar(dtype=dtype)
+        given = {**SOFT, "mu": 1e7, "lam": 1e7}
+
+        def run(model: dv.Model = model, x: Tensor = x + distance, v: Tensor = 0 * v, given: Any = given) -> Any:
+            return dv.rollout(model, x, v, steps=10, **given, checks=dv.Checks(energy=True))
+
+        assert said_of_energy(run) == []
+
+
+@pytest.mark.parametrize("schedule", [None, 3, dv.BinomialCheckpoints(2)])
+def test_gradients_are_those_without_a_look(schedule: Any) -> None:
+    model, x, v = bent_bar()
+    gradients = []
+    for asked in (True, False):
+        leaf = v.clone().requires_grad_()
+        end = dv.rollout(
+            model, x, leaf, steps=10, checkpoint_every=schedule, save="last", **SOFT, checks=dv.Checks(energy=asked)
+        )
+        gradients.append(torch.autograd.grad(end.x.square().sum(), leaf)[0])
+    assert torch.equal(*gradients) and gradients[0].abs().max() > 0
+
+
+def test_a_wrong_argument_is_named() -> None:
+    model, x, v = bent_bar()
+    with pytest.raises(TypeError, match="energy: expected a bool or None, got int"):
+        dv.rollout(model, x, v, steps=1, **SOFT, checks=dv.Checks(energy=1))  # pyright: ignore[reportArgumentType]
+
+
+# --- pairs that hold up, friction that has not converged --------------------------------------------------------------
+
+
+FAST: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "solver": dv.VBD(0.002, 3)}
+
+
+def thrown() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    """Two boxes that meet at speed."""
+    model = two_boxes(detections=1)
+    v = torch.zeros_like(model.rest_points)
+    v[8:, 1] = -60.0
+    return model, model.rest_points, v
+
+
+def sliding(**friction: float) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    floor = dv.FloorBarrier(height=-0.01, kappa=2e3)
+    model = dv.Model(box(3, 0.2, split="kuhn"), energies=(dv.StableNeoHookean(), floor, dv.Friction(**friction)))
+    v = torch.zeros_like(model.rest_points)
+    v[:, 0] = 1e-3
+    return model, model.rest_points, v
+
+
+def test_motion_that_pairs_held_up_is_warned_of() -> None:
+    model, x, v = thrown()
+    with pytest.warns(UserWarning, match=r"contact: pairs held up .* larger reach") as found:
+        dv.rollout(model, x, v, steps=1, **FAST, checks=dv.Checks(contact=True))
+    assert found[0].filename == __file__
+    assert sum("pairs held up" in str(w.message) for w in found) == 1
+    assert cut_share(system_of(model, FAST["solver"])) > CUT
+
+
+def test_friction_that_has_not_converged_is_warned_of() -> None:
+    model, x, v = sliding(coefficient=0.5, velocity=1e-4)
+    stiff: dict[str, Any] = {"mu": 1e5, "lam": 2e5}
+    with pytest.warns(UserWarning, match=r"friction: .* not balanced .*more sweeps .*a smaller time_step") as found:
+        dv.rollout(model, x, v, dv.VBD(0.01, 1), steps=10, **stiff)
+    said = [str(w.message) for w in found]  # of the friction, and of the motion
+    assert len(said) == 2 and said[1].startswith("sweeps:") and found[0].filename == __file__
+    assert messages(lambda: dv.rollout(model, x, v, dv.VBD(0.01, 1), steps=10, **stiff)) == said  # each time
+    soft, x, v = sliding(coefficient=0.5, velocity=0.1)
+    assert not messages(lambda: dv.rollout(soft, x, v, dv.VBD(0.01, 400), steps=10, **stiff))
+
+
+def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
+    model, x, v = thrown()
+    ends = []
+    for every in (None, 3, dv.BinomialCheckpoints(2)):
+        for check in (True, False):
+            start = v.clone().requires_grad_()
+
+            def run(start: torch.Tensor = start, every: Any = every, check: bool = check) -> None:
+                end = dv.rollout(
+                    model, x, start, steps=3, checkpoint_every=every, **FAST, checks=dv.Checks(contact=check)
+                )
+                ends.append((end.x[-1].detach(), torch.autograd.grad(end.x[-1].square().sum(), start)[0]))
+
+            assert sum("pairs held up" in text for text in messages(run)) == int(check)
+    for end, slope in ends[1:]:
+        assert torch.equal(end, ends[0][0]) and torch.equal(slope, ends[0][1]) and slope.any()
+
+
+def test_bad_input() -> None:
+    model, x, v = thrown()
+    with pytest.raises(TypeError, match="contact: expected a bool or None, got str"):
+        dv.rollout(model, x, v, steps=1, **FAST, checks=dv.Checks(contact="yes"))  # pyright: ignore[reportArgumentType]
+
+
+# --- bodies that start inside out -------------------------------------------------------------------------------------
+
+
+CUBE = dv.mesh.cube(3)
+GIVEN: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "gravity": (0.0, 0.0, 0.0), "solver": dv.VBD(0.01, 2)}
+
+
+def said(model: dv.Model, x: Tensor, **more: Any) -> list[str]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        dv.rollout(model, x, torch.zeros_like(x), steps=1, **GIVEN, **more)
+    return [str(w.message) for w in found if "inverted" in str(w.message)]
+
+
+def two_cubes(**options: Any) -> tuple[dv.Model, Tensor]:
+    model = dv.Model(dv.mesh.join([CUBE, CUBE.translate((3.0, 0.0, 0.0))]), **options)
+    return model, model.rest_points.clone()
+
+
+def mirrored(model: dv.Model, x: Tensor, body: int) -> Tensor:
+    out, own = x.clone(), model.body == body
+    out[..., own, 1] = -out[..., own, 1]
+    return out
+
+
+@pytest.mark.parametrize("body", (0, 1))
+def test_a_mirrored_body_is_named(body: int) -> None:
+    model, x = two_cubes()
+    (message,) = said(model, mirrored(model, x, body))
+    assert f"body {body} in scene 0 are inverted" in message and "mirrored" in message
+
+
+def test_some_inverted_tets_are_no_mistake() -> None:
+    model, x = two_cubes()
+    pushed = x.clone()
+    pushed[0] = x[model.body == 0].mean(0) + (x[model.body == 0].mean(0) - x[0])  # one corner through its body
+    assert dv.diagnose(model, pushed, mu=1e4, lam=1e4).inverted.any()
+    assert said(model, pushed) == [] and said(model, x) == []
+
+
+def test_nothing_is_said_where_nobody_asks() -> None:
+    model, x = two_cubes()
+    other = mirrored(model, x, 0)
+    assert said(model, other, checks=dv.Checks(start=False)) == []
+    with pytest.warns(UserWarning, match="no StableNeoHookean"):
+        loose, x = two_cubes(energies=())
+    x = mirrored(loose, x, 0)
+    assert messages(lambda: dv.rollout(loose, x, 0 * x, GIVEN["solver"], steps=1)) == []

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd import solvers
+import diffvbd as dv
 from diffvbd.solvers import BlockUpdate, Update, compose
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -116,18 +116,6 @@ def test_a_wrong_vjp_is_seen() -> None:
     assert relative_error(found["a"], expected["a"]) > 1e-2
 
 
-def test_scenes_share_parameters_or_have_their_own() -> None:
-    shared = system(batch=(2, 3))
-    found, expected = (gradients(run, shared) for run in (gauss_seidel(3), unrolled(3)))
-    assert_equal(found, expected)
-    assert found["a"].shape == (7, 7) and found["b"].shape == (7,)
-    own = shared | {"b": rand(2, 3, 7, key="own")}
-    assert gradients(gauss_seidel(3), own)["b"].shape == (2, 3, 7)
-    kept = shared | {"b": rand(2, 1, 7, key="kept")}
-    each = gradients(gauss_seidel(3), kept | {"b": kept["b"].expand(2, 3, 7)})
-    assert_equal(gradients(gauss_seidel(3), kept), each | {"b": each["b"].sum(1, keepdim=True)})
-
-
 # --- sequences of the user's own --------------------------------------------------------------------------------------
 
 
@@ -183,63 +171,6 @@ def test_finite_differences() -> None:
     )  # fmt: skip
 
 
-def test_function_with_its_own_vjp_and_one_tensor() -> None:
-    def scaled(state: tuple, parameters: tuple) -> Tensor:
-        return parameters[0] * state[0][..., :2, :]
-
-    def scaled_vjp(state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
-        bar = torch.zeros_like(state[0])
-        bar[..., :2, :] = parameters[0] * rows_bar[0]
-        return (bar,), ((state[0][..., :2, :] * rows_bar[0]).sum(),)
-
-    x, p = rand(4, 3), torch.tensor(0.7, dtype=torch.float64)
-    results = []
-    for vjp in (None, scaled_vjp):
-        solver = compose([Update(scaled, slice(0, 2), vjp=vjp)])
-        results.append(gradients(lambda x, p, s=solver: s(x, p, sweeps=3), {"x": x, "p": p}))
-    assert_equal(results[1], results[0])
-
-
-@pytest.mark.parametrize("vjp", [None, "by hand"])
-def test_rows_that_are_views_of_the_state(vjp: Any) -> None:
-    """What an update returns is what the state was before it, however the rows are written."""
-
-    def exchange(state: tuple, parameters: tuple) -> tuple:
-        return state[1][..., :2, :], state[0][..., :2, :]
-
-    def exchange_vjp(state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
-        bars = [torch.zeros_like(t) for t in state]
-        bars[0][..., :2, :], bars[1][..., :2, :] = rows_bar[1], rows_bar[0]
-        return tuple(bars), ()
-
-    def exchanged(x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.cat((z[:2], x[2:])), torch.cat((x[:2], z[2:]))
-
-    update = Update(exchange, (slice(2), slice(2)), vjp=exchange_vjp if vjp else None)
-    inputs = {"x": rand(3, 3), "z": rand(3, 3, key="z")}
-    found = gradients(lambda x, z: compose([update])((x, z), sweeps=1), inputs)
-    assert_equal(found, gradients(exchanged, inputs), bar=0.0)
-    twice = gradients(lambda x, z: compose([update])((x, z), sweeps=2), inputs)
-    assert_equal(twice, gradients(lambda x, z: (x + 0, z + 0), inputs), bar=0.0)
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x: x[..., 1:4, :],  # overlaps the rows that it is written to
-        lambda x: x[..., :3, :].flip(-2),
-        lambda x: x[..., :1, :].expand(3, 3),  # overlaps itself
-        lambda x: x[..., :3, :].mT,
-    ],
-    ids=["shifted", "flipped", "expanded", "transposed"],
-)
-def test_rows_that_overlap_what_they_replace(function: Any) -> None:
-    inputs = {"x": rand(4, 3)}
-    solver = compose([Update(lambda state, parameters: function(state[0]), slice(3))])
-    found = gradients(lambda x: solver(x, sweeps=1), inputs)
-    assert_equal(found, gradients(lambda x: torch.cat((function(x), x[3:])), inputs), bar=tolerance("composed"))
-
-
 # --- tape, copies, refusals -------------------------------------------------------------------------------------------
 
 
@@ -261,28 +192,6 @@ def test_the_tape_holds_rows_only() -> None:
     assert len(saved) == 1 + 2 * sweeps
     out.sum().backward()
     assert x.grad is not None and torch.equal(x.grad, torch.ones_like(x))
-
-
-def test_inputs_stay_and_backwards_repeat() -> None:
-    updates, _ = chain()
-    inputs = chain_inputs()
-    before = {name: t.clone() for name, t in inputs.items()}
-    leaves = {name: t.requires_grad_() for name, t in inputs.items()}
-    x, z = compose(updates)((leaves["x"], leaves["z"]), (leaves["p"], leaves["q"]), sweeps=3)
-    end = x.detach().clone()
-    loss = (x**2).sum() + z.sum()
-    once, twice = (torch.autograd.grad(loss, list(leaves.values()), retain_graph=True) for _ in range(2))
-    assert all(torch.equal(a, b) and a.any() for a, b in zip(once, twice, strict=True))
-    assert all(torch.equal(leaves[name], before[name]) for name in leaves) and torch.equal(x, end)
-
-
-def test_only_what_is_asked_for_gets_a_gradient() -> None:
-    given = system()
-    wanted = given["b"].requires_grad_()
-    out = gauss_seidel(2)(given["x"], given["a"], wanted)
-    out.sum().backward()
-    assert wanted.grad is not None and wanted.grad.any() and given["a"].grad is None and given["x"].grad is None
-    assert not gauss_seidel(2)(given["x"], given["a"], given["b"].detach()).requires_grad
 
 
 def test_float32() -> None:
@@ -356,5 +265,118 @@ def test_a_vjp_of_the_wrong_shape_is_named(bars: Any, message: str) -> None:
         out.sum().backward()
 
 
-def test_names_are_exported() -> None:
-    assert all(getattr(solvers, name).__doc__ for name in solvers.__all__)
+# --- what compose() refuses -------------------------------------------------------------------------------------------
+
+
+ROWS = torch.from_numpy(generator("contract").standard_normal((4, 3)))
+
+
+def leaf(value: float = 0.7) -> Tensor:
+    return torch.tensor(value, dtype=ROWS.dtype, requires_grad=True)
+
+
+def doubled_vjp(state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
+    bar = torch.zeros_like(state[0])
+    bar[:2] = 2 * rows_bar[0]
+    return (bar,), (None,) * len(parameters)
+
+
+# --- tensors that an update closes over -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("vjp", [None, doubled_vjp])
+@pytest.mark.parametrize("recorded", [True, False])
+def test_closed_over_tensors_that_require_grad_are_refused(vjp: Any, recorded: bool) -> None:
+    """Also where nothing else requires grad, so that the result would not."""
+    scale, x = leaf(), ROWS.clone().requires_grad_(recorded)
+    solver = compose([Update(lambda s, p: scale * s[0][:2], slice(2), vjp=vjp)])
+    with pytest.raises(RuntimeError, match="update of Update: expected rows of state and parameters alone.*parameters"):
+        solver(x, sweeps=1)
+    with torch.no_grad():  # where no gradient is lost
+        assert torch.equal(solver(x, sweeps=1)[:2], scale * ROWS[:2])
+    scale.requires_grad_(False)
+    assert solver(x, sweeps=1).requires_grad == recorded
+    scale.requires_grad_()  # the look is not at the first call only
+    with pytest.raises(RuntimeError, match="update of Update"):
+        solver(x, sweeps=1)
+
+
+def test_a_module_inside_an_update_is_refused() -> None:
+    class Learned(BlockUpdate):
+        def __init__(self) -> None:
+            self.rows, self.net = (slice(2),), torch.nn.Linear(3, 3, dtype=ROWS.dtype)
+
+        def update(self, state: tuple, parameters: tuple) -> tuple:
+            return (self.net(state[0][:2]),)
+
+    with pytest.raises(RuntimeError, match="update of Learned: expected rows of state and parameters alone"):
+        compose([Learned()])(ROWS.clone().requires_grad_(), sweeps=1)
+
+
+# --- purity -----------------------------------------------------------------------------------------------------------
+
+
+class Counting(BlockUpdate):
+    """Depends on how often it was called, until it is told not to."""
+
+    def __init__(self, impure: bool = True) -> None:
+        self.rows, self.calls, self.impure = (slice(2),), 0, impure
+
+    def update(self, state: tuple, parameters: tuple) -> tuple:
+        self.calls += self.impure
+        return ((1 + 0.1 * self.calls) * state[0][:2],)
+
+
+class CountingByHand(Counting):
+    def vjp(self, state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
+        return doubled_vjp(state, rows_bar, parameters)
+
+
+@pytest.mark.parametrize("kind", [Counting, CountingByHand])
+def test_debug_checks_see_an_impure_update(kind: type[Counting]) -> None:
+    for impure in (True, False):
+        x = ROWS.clone().requires_grad_()
+        out = compose([kind(impure)])(x, sweeps=2)
+        with dv.debug_checks():
+            if impure:
+                with pytest.raises(RuntimeError, match=f"update of {kind.__name__}: .*pure and deterministic"):
+                    out.sum().backward()
+            else:
+                out.sum().backward()
+                assert x.grad is not None and x.grad.all()
+
+
+def test_debug_checks_change_no_gradient() -> None:
+    """Rows that are NaN are the same rows."""
+    at = torch.tensor([0, 2])
+    update = Update(lambda s, p: (torch.sqrt(p[0] * s[0][at]), None), (at, None))
+    results = []
+    for debug in (False, True):
+        x, p = ROWS.clone().requires_grad_(), leaf()
+        with dv.debug_checks(debug):
+            end, _ = compose([update])((x, ROWS), p, sweeps=2)
+            end[1:2].sum().backward()
+        assert end.isnan().any() and x.grad is not None and x.grad.any()
+        results.append(x.grad)
+    assert torch.allclose(*results, rtol=0, atol=0, equal_nan=True)
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def made(rows: Any, dim: int = -2) -> Update:
+    return Update(lambda s, p: s[0][rows], rows, dim)
+
+
+def test_rows_that_no_state_has_are_named() -> None:
+    with pytest.raises(ValueError, match=r"state\[0\]: expected at least 2 dimensions .* dim=-2., got .*\[4\]"):
+        compose([made(slice(1, 2))])(ROWS[:, 0], sweeps=1)  # dim=-1 forgotten
+    with pytest.raises(ValueError, match=r"updates\[1\].rows: expected some of the 4 rows of state\[0\] .*slice\(4, 6"):
+        compose([made(slice(2)), made(slice(4, 6))])(ROWS, sweeps=1)
+    for step in (-1, 0, 1.5):
+        with pytest.raises(ValueError, match=r"updates\[0\].rows: expected a slice with a step > 0, got slice"):
+            compose([made(slice(None, None, step))])
+    empty = compose([made(slice(None))])(ROWS[:0], sweeps=1)  # a state without rows has nothing to select
+    assert empty.shape == (0, 3)
+    every = compose([Update(lambda s, p: -s[0][..., ::2], slice(None, None, 2), dim=-1)])(ROWS[:, 0], sweeps=1)
+    assert torch.equal(every, ROWS[:, 0] * ROWS.new_tensor([-1, 1, -1, 1]))

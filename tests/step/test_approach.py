@@ -27,13 +27,12 @@ def model_above(shape: str, gap: float, device: str) -> dv.Model:
     return dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[SHAPES[shape]], device=device)
 
 
-def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list[Tensor], dv.Trajectory]:
+def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list[Tensor], dv.results.Trajectory]:
     """A rollout whose colliders go by `ways` [steps, ..., 3]: who took implicit Euler, and the motion."""
     at = model.collider_points
-    with dv.integrators.record() as euler:
-        motion = dv.rollout(model, model.rest_points, v, steps=len(ways), mu=1e5, lam=1e5, time_step=TIME_STEP,
-                            sweeps=200, gravity=GRAVITY, integrator=integrator, colliders=dv.per_step(at + ways),
-                            colliders_before=at)  # fmt: skip
+    with dv.record("integrator") as euler:
+        motion = dv.rollout(model, model.rest_points, v, dv.VBD(TIME_STEP, 200, integrator=integrator), steps=len(ways),
+                            mu=1e5, lam=1e5, gravity=GRAVITY, colliders=dv.per_step(at + ways), colliders_before=at)  # fmt: skip
     return list(euler), motion
 
 
@@ -85,8 +84,8 @@ def test_colliders_go_on_from_where_the_first_solve_has_left_them(
 def test_colliders_end_at_those_of_the_model_unless_they_are_given(integrator: Any, device: str) -> None:
     model = model_above("plane", 0.011, device)
     x, at = model.rest_points, model.collider_points
-    given = {"mu": 1e5, "lam": 1e5, "time_step": TIME_STEP, "sweeps": 5, "integrator": integrator,
-             "colliders_before": at - 1e-3}  # fmt: skip
+    given = {"mu": 1e5, "lam": 1e5, "colliders_before": at - 1e-3, "solver": dv.VBD(TIME_STEP, 5,
+                                                                                    integrator=integrator)}  # fmt: skip
     own, same = (dv.step(model, x, torch.zeros_like(x), **given, **more)[0] for more in ({}, {"colliders": at}))
     assert torch.equal(own, same) and (own - x).abs().max() > 0
 
@@ -112,12 +111,12 @@ def test_a_body_above_a_floor_moves_as_it_does_alone(integrator: Any, device: st
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.005, kappa=400.0, dhat=0.01))
 
     def end(mesh: dv.TetMesh) -> Tensor:
-        model = dv.Model(mesh, density=500.0, energies=energies, relaxation=0.7, device=device)
+        model = dv.Model(mesh, density=500.0, energies=energies, device=device)
         x, v = model.rest_points, torch.zeros_like(model.rest_points)
         v[:8, 0], v[:8, 1], v[8:, 1] = 3.0 * x[:8, 1], -0.5, 0.1
-        with dv.integrators.record() as euler:
-            motion = dv.rollout(model, x, v, steps=10, mu=2e4, lam=2e4, time_step=0.01, sweeps=1, integrator=integrator,
-                                save="last", check_energy=False)  # fmt: skip
+        with dv.record("integrator") as euler:
+            motion = dv.rollout(model, x, v, dv.VBD(0.01, 1, integrator=integrator, relaxation=0.7), steps=10, mu=2e4,
+                                lam=2e4, save="last", checks=dv.Checks(energy=False))  # fmt: skip
         if len(x) > 8:
             assert any(bool(of[..., :8].any() != of[..., 8:].any()) for of in euler)
         return motion.x[-1, :8] - x[:8]

@@ -11,7 +11,6 @@ import pytest
 import torch
 from helpers.exactness import BATCHED, MEASURED, check, check_shapes, measure
 from helpers.marks import slow
-from helpers.spreads import beyond
 from torch import Tensor
 
 import diffvbd as dv
@@ -50,7 +49,7 @@ def table(request: pytest.FixtureRequest):
 
 def pairwise() -> tuple[list[tuple], list[tuple]]:
     """Quick rows and slow ones: each case with every sweep count; mesh kinds and steps rotate, so that all their pairs
-    occur. One sweep is always quick; longer runs and larger meshes are so for every third case."""
+    occur. One sweep is always quick; longer runs and larger meshes are so for every sixth case."""
     rows, quick = [], []
     for i, case in enumerate(CASES):
         for j, sweeps in enumerate(SWEEPS):
@@ -60,7 +59,7 @@ def pairwise() -> tuple[list[tuple], list[tuple]]:
         rows.append((case, KINDS[(i + 1) % 3], "medium", 5, 1))
     for case, kind, size, sweeps, steps in rows:
         short = size == "small" and (sweeps == 1 or (sweeps < 20 and steps == 1))
-        if short or list(CASES).index(case) % 3 == 0:
+        if short or list(CASES).index(case) % 6 == 0:
             quick.append((case, kind, size, sweeps, steps))
     rows += [("plain", "delaunay", "large", 2, 1), ("paper", "random", "large", 1, 4)]
     rows += [("floor_filtered", "structured", "large", 5, 1), ("inverted", "delaunay", "large", 1, 1)]
@@ -93,34 +92,20 @@ def test_full_product_large(device: str, case: str, kind: str, sweeps: int) -> N
     check(device, case, kind, "large", sweeps, 1)
 
 
-@pytest.mark.parametrize(("rows", "least"), [(QUICK[1::4], 20), slow([*QUICK, *SLOW], 100)], ids=("quick", "all"))
-def test_headline(device: str, rows: list[tuple], least: int) -> None:
+@pytest.mark.slow
+def test_headline(device: str) -> None:
     """Scenes that rounding leaves alone (spread <= 1e-13): the worst gradient of each, and the typical one."""
     errors = {}
-    for row in rows:
+    for row in [*QUICK, *SLOW]:
         m = measure(device, *row)
         if row[3] > 0 and m.spread <= tolerance("headline_spread"):
             errors[row] = max(m.errors[name] for name in m.gradients)
     ordered = sorted(errors.values())
     worst = max(errors, key=lambda row: errors[row])
     print(f"{len(errors)} scenes, median {ordered[len(errors) // 2]:.1e}, worst {ordered[-1]:.1e} in {worst}")
-    assert len(errors) >= least
+    assert len(errors) >= 100
     assert ordered[len(errors) // 2] <= tolerance("headline_median")
     assert ordered[-1] <= tolerance("headline_worst")
-
-
-def test_bars_are_raised_where_an_error_asks_for_it_and_no_further() -> None:
-    asked = []
-
-    def sample() -> dict[str, float]:
-        asked.append(None)
-        return {"x": 0.5 / tolerance("spread_factor"), "v": 0.0}
-
-    floors = {"x": 0.25, "v": 0.25}
-    assert not beyond({"x": 0.25, "v": 0.125}, floors, [sample]) and not asked
-    assert not beyond({"x": 0.5, "v": 0.125}, floors, [sample, sample]) and len(asked) == 1
-    assert set(beyond({"x": 0.75, "v": 0.5}, floors, [sample, sample])) == {"x", "v"} and len(asked) == 3
-    assert set(beyond({"x": float("nan"), "v": 0.0}, floors, [sample])) == {"x"}
 
 
 @pytest.mark.parametrize("sweeps", (1, 3))
@@ -144,8 +129,9 @@ def test_values_per_step(device: str) -> None:
         return end.x[-1], end.v[-1]
 
     def of_package(force: Tensor, held: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
-        end = dv.rollout(there, steps=steps, sweeps=2, force=dv.per_step(force), prescribed=dv.per_step(held),
-                         checkpoint_every=2, **options)  # fmt: skip
+        # TODO62: the solver of this call
+        end = dv.rollout(there, steps=steps, force=dv.per_step(force), prescribed=dv.per_step(held), checkpoint_every=2,
+                         **options, sweeps=2)  # fmt: skip
         return end.x[-1], end.v[-1]
 
     there = model.to(device)
@@ -162,6 +148,7 @@ def test_constants_equal_parameters(device: str) -> None:
     """The numbers of a Model's energies and the same numbers given as parameters are the same to the bit."""
     scene = build_scene("anchored", "random", "small")
     model, inputs = scene.model(device), scene.inputs(device=device)
-    given = dv.step(model, sweeps=2, **inputs)
-    constant = dv.step(model, sweeps=2, **{name: value for name, value in inputs.items() if name != "parameters"})
+    given = dv.step(model, solver=scene.solver(2), **inputs)
+    # TODO62: the solver of this call
+    constant = dv.step(model, **{name: value for name, value in inputs.items() if name != "parameters"}, sweeps=2)
     assert torch.equal(given[0], constant[0]) and torch.equal(given[1], constant[1])

@@ -47,7 +47,7 @@ def held(model: dv.Model, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     steps = 0
     while steps < 5:
         with torch.no_grad(), Decisions() as seen:
-            x, v = dv.step(model, x, v, mu=1e5, lam=2e5, time_step=SHORT, sweeps=5)
+            x, v = dv.step(model, x, v, dv.VBD(SHORT, 5), mu=1e5, lam=2e5)
         steps += bool(seen.alone[0].any())
     return x, v
 
@@ -59,7 +59,7 @@ def test_a_drop_in_short_steps(device: str, name: str) -> None:
     def end(sweeps: int) -> tuple[Tensor, Tensor, list[Tensor]]:
         model, x, v = falling(MESHES[name], device)
         with torch.no_grad(), Decisions() as seen:
-            last = dv.rollout(model, x, v, mu=1e5, lam=2e5, time_step=SHORT, sweeps=sweeps, steps=400, save="last")
+            last = dv.rollout(model, x, v, dv.VBD(SHORT, sweeps), mu=1e5, lam=2e5, steps=400, save="last")
         return last.x[-1] - x, last.v[-1], seen.alone
 
     goal, velocity, _ = end(15)
@@ -80,7 +80,7 @@ def test_what_is_soft_within_a_step_decides(device: str) -> None:
 
     def step(rows: Any, h: float) -> tuple[Tensor, Tensor]:
         with Decisions() as seen:
-            end = dv.step(model, xs[rows], vs[rows], mu=mu[rows], lam=mu[rows], time_step=h, sweeps=2)[0]
+            end = dv.step(model, xs[rows], vs[rows], dv.VBD(h, 2), mu=mu[rows], lam=mu[rows])[0]
         return end, seen.alone[-1][:, 0]
 
     ends, alone = step(slice(None), SHORT)
@@ -91,7 +91,7 @@ def test_what_is_soft_within_a_step_decides(device: str) -> None:
     # nothing is decided without a floor, nor where sweeps are too few
     for other, sweeps in ((dv.Model(MESHES["ball"], device=device), 2), (model, 1), (model, 0)):
         with Decisions() as seen:
-            dv.step(other, x, v, mu=1e5, lam=1e5, time_step=SHORT, sweeps=sweeps)
+            dv.step(other, x, v, dv.VBD(SHORT, sweeps), mu=1e5, lam=1e5)
         assert seen.alone[-1].numel() == 0
 
 
@@ -152,5 +152,5 @@ def test_no_impact_gains_energy(device: str, mu: float, sweeps: int, h: float) -
     first = energy()
     with torch.no_grad():
         for _ in range(20):
-            x, v = dv.step(model, x, v, mu=mu, lam=2 * mu, time_step=h, sweeps=sweeps)
+            x, v = dv.step(model, x, v, dv.VBD(h, sweeps), mu=mu, lam=2 * mu)
             assert energy() <= first * (1 + tolerance("energy_gain"))

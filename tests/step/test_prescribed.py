@@ -8,7 +8,7 @@ from torch import Tensor
 
 import diffvbd as dv
 
-GIVEN: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2}
+GIVEN: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, 2)}
 MESSAGE = r"prescribed: expected positions for pinned vertices .*, got another position for vertex 5.*not pinned"
 
 
@@ -39,6 +39,7 @@ def test_a_row_that_would_be_ignored_raises(model: dv.Model) -> None:
             dv.rollout(model, x, v, steps=2, prescribed=how, **GIVEN)
     options = {name: GIVEN[name] for name in ("mu", "lam", "time_step")}
     with pytest.raises(ValueError, match=MESSAGE):
+        # TODO62: the solver of this call
         dv.solve(model, x, v, prescribed=everywhere, **options)
     with pytest.raises(ValueError, match=MESSAGE):
         dv.diagnose(model, x, previous=(x, v), prescribed=everywhere, **options)
@@ -54,7 +55,7 @@ def test_nothing_is_done_before_a_rollout_raises(model: dv.Model) -> None:
     values = torch.stack([x] * 9 + [moved(x, 5)])
     with pytest.raises(ValueError, match=MESSAGE):
         dv.rollout(
-            model, x, v, steps=10, prescribed=dv.per_step(values), observe=lambda x, v, k: seen.append(k), **GIVEN
+            model, x, v, steps=10, prescribed=dv.per_step(values), observe=lambda k, x, v: seen.append(k), **GIVEN
         )
     assert seen == []
 
@@ -92,36 +93,3 @@ def test_gradients_pass_where_pinned_and_nowhere_else(model: dv.Model) -> None:
     target = torch.where(model.pinned[:, None], moved(x, 1), torch.nan).requires_grad_()
     (slope,) = torch.autograd.grad(dv.rollout(model, x, v, steps=2, prescribed=target, **GIVEN).x[-1].sum(), target)
     assert (slope[:3] != 0).all() and not slope[3:].any()
-
-
-def test_check_gradients_takes_rows_that_are_not_read() -> None:
-    model = dv.Model(dv.mesh.cube(3, size=0.2), pinned=[0, 1, 2])
-    x, v = start(model)
-    target = torch.where(model.pinned[:, None], moved(x, 1), torch.nan)
-
-    def loss(prescribed: Tensor) -> Tensor:
-        return dv.step(model, x, v, prescribed=prescribed, **GIVEN)[0].square().sum()
-
-    found = dv.check_gradients(loss, {"prescribed": target}, verbose=False)
-    assert found.ok and found.rows[0][1] > 0.1
-
-
-def test_on_cuda_values_are_looked_at_only_on_request(model: dv.Model, device: str) -> None:
-    x, v = start(model)
-    if device == "cuda":
-        dv.step(model, x, v, prescribed=moved(x, 5), **GIVEN)
-    with dv.debug_checks(), pytest.raises(ValueError, match=MESSAGE):
-        dv.step(model, x, v, prescribed=moved(x, 5), **GIVEN)
-
-
-def test_traced_steps_do_not_look(model: dv.Model) -> None:
-    x, v = start(model)
-
-    def end(target: Tensor) -> Tensor:
-        return dv.step(model, x, v, prescribed=target, **GIVEN)[0]
-
-    free = dv.step(model, x, v, **GIVEN)[0]
-    both = torch.func.vmap(end)(torch.stack([x, moved(x, 5)]))
-    assert torch.equal(both[0], free) and torch.equal(both[1], free)
-    slope = torch.func.grad(lambda target: end(target).sum())(moved(x, 5))
-    assert not slope[5].any() and slope[1].any()

@@ -1,5 +1,6 @@
 """Claim: few sweeps turn a free body as converged ones do, and do not stretch it, with and without contact."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,8 @@ def turned(device: str, contact: bool, young: float, sweeps: int, integrator: An
     spin = torch.linalg.cross(x - x.mean(0), mass * v).sum(0)
     kinetic = float((0.5 * mass * v * v).sum())
     with torch.no_grad():
-        end = dv.rollout(model, x, v, steps=30, time_step=STEP, sweeps=sweeps, mu=mu, lam=lam, save="last",
-                         gravity=(0.0, 0.0, 0.0), integrator=integrator)  # fmt: skip
+        end = dv.rollout(model, x, v, dv.VBD(STEP, sweeps, integrator=integrator), steps=30, mu=mu, lam=lam,
+                         save="last", gravity=(0.0, 0.0, 0.0))  # fmt: skip
     x, v = end.x[-1], end.v[-1]
     center = (mass * x).sum(0) / mass.sum()
     left = torch.linalg.cross(x - center, mass * v).sum(0)
@@ -65,17 +66,6 @@ def test_implicit_euler(device: str, contact: bool, young: float) -> None:
         assert abs(left - converged) <= tolerance("turning")
 
 
-@pytest.mark.parametrize("contact", (False, True), ids=("free", "contact"))
-def test_first_steps(device: str, contact: bool) -> None:
-    """Velocities w x r are tangents of a turn, where those after a step are chords."""
-    model, x, v = scene(device, contact)
-    mu, lam = dv.lame(4.4e6, 0.3)
-    kinetic = float((0.5 * model.mass[:, None] * v * v).sum())
-    for _ in range(5):
-        x, v = dv.step(model, x, v, time_step=STEP, sweeps=1, mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
-        assert 0 < elastic_energy(model, x, mu, lam) <= ELASTIC[4.4e6, 1] * kinetic
-
-
 def test_implicit_euler_within_a_step_of_bdf2(device: str) -> None:
     """A body that contact has just made take implicit Euler moves by chords, whatever the scheme of the step."""
     one, _, _ = scene(device, True)
@@ -86,11 +76,22 @@ def test_implicit_euler_within_a_step_of_bdf2(device: str) -> None:
     v = torch.linalg.cross((SPIN * r.new_tensor([0.36, -0.48, 0.8])).expand_as(r), r)
     mu, lam = dv.lame(4.4e6, 0.3)
     kinetic = float((0.5 * model.mass[:half, None] * v[:half].square()).sum())
-    given: dict[str, Any] = {"time_step": STEP, "sweeps": 2, "mu": mu, "lam": lam, "gravity": (0.0, 0.0, 0.0)}
-    x, v, history = dv.step(model, x, v, integrator=dv.BDF2(), **given)
+    given: dict[str, Any] = {"mu": mu, "lam": lam, "gravity": (0.0, 0.0, 0.0), "solver": dv.VBD(STEP, 2)}
+    # TODO62: BDF2 steps in rollouts
+    x, v, history = dv.step(
+        model, x, v, **(given | {"solver": dataclasses.replace(given["solver"], integrator=dv.BDF2())})
+    )
     euler = torch.arange(model.num_vertices, device=device) < half
     for _ in range(10):
-        x, v, history = dv.step(model, x, v, integrator=dv.BDF2(), history=history._replace(smooth=~euler), **given)
+        # TODO62: a history lives in rollouts
+        # TODO62: BDF2 steps in rollouts
+        x, v, history = dv.step(
+            model,
+            x,
+            v,
+            history=history._replace(smooth=~euler),
+            **(given | {"solver": dataclasses.replace(given["solver"], integrator=dv.BDF2())}),
+        )
         assert 0 < elastic_energy(one, x[:half], mu, lam) <= CHANGED * kinetic
     assert elastic_energy(one, x[:half], mu, lam) <= ELASTIC[4.4e6, 1] * kinetic
 
@@ -106,27 +107,9 @@ def test_second_order(device: str, contact: bool) -> None:
 
 def test_without_the_correction_few_sweeps_stretch(device: str) -> None:
     model, x, v = scene(device, False)
-    model = dv.Model(model.mesh, density=1000.0, rigid=False, device=device)
+    model = dv.Model(model.mesh, density=1000.0, device=device)
     mu, lam = dv.lame(4.4e6, 0.3)
     kinetic = float((0.5 * model.mass[:, None] * v * v).sum())
     for _ in range(30):
-        x, v = dv.step(model, x, v, time_step=STEP, sweeps=1, mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
+        x, v = dv.step(model, x, v, dv.VBD(STEP, 1, subspace=None), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
     assert elastic_energy(model, x, mu, lam) > 0.5 * kinetic
-
-
-@pytest.mark.parametrize("aspect", (10, 20, 40))
-def test_slender_bodies(device: str, aspect: int) -> None:
-    """Half a radian in a step across its length, of which a beam's moments say little: one is much the largest."""
-    model = dv.Model(dv.mesh.beam(aspect + 1, 2, 2, size=(1.0, 1 / aspect, 1 / aspect)), density=1000.0, device=device)
-    x, mu = model.rest_points.clone(), 1e6
-    v = torch.linalg.cross(x.new_tensor([0.0, 0.0, 0.5 / STEP]).expand_as(x), x - x.mean(0))
-    kinetic = float((0.5 * model.mass[:, None] * v * v).sum())
-    lengths = []
-    for _ in range(4):
-        x, v = dv.step(model, x, v, time_step=STEP, sweeps=1, mu=mu, lam=mu, gravity=(0.0, 0.0, 0.0))
-        assert 0 < elastic_energy(model, x, mu, mu) <= 0.01 * kinetic
-        lengths.append(float((x[0] - x[-1]).norm()))
-    spin = torch.linalg.cross(x - x.mean(0), model.mass[:, None] * v).sum(0)
-    begun = float(kinetic * 2 / (0.5 / STEP))  # I w
-    assert 0.5 < float(spin[2]) / begun < 0.7  # implicit Euler's own loss, 1 / (1 + 0.5^2) in each but the first
-    assert max(lengths) < 1.05 * (1 + 2 / aspect**2) ** 0.5

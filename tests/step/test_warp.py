@@ -15,7 +15,7 @@ wp.init()
 
 MESH = dv.mesh.beam(4, 2, 2)
 MODEL = dv.Model(MESH, pinned=MESH.points[:, 0] == MESH.points[:, 0].min())
-STEP = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 4}
+STEP = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, 4)}
 
 
 @wp.kernel

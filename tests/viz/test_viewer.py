@@ -22,10 +22,10 @@ MODEL = dv.Model(MESH, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.3)))
 STEP = 0.02
 
 
-def fall(speed: float = 0.0, steps: int = 8) -> dv.Trajectory:
+def fall(speed: float = 0.0, steps: int = 8) -> dv.results.Trajectory:
     x = MODEL.rest_points
     v = torch.tensor([0.0, speed, 0.0], dtype=x.dtype).expand_as(x)
-    return dv.rollout(MODEL, x, v, steps=steps, mu=1e4, lam=1e4, time_step=STEP, sweeps=3)
+    return dv.rollout(MODEL, x, v, dv.VBD(STEP, 3), steps=steps, mu=1e4, lam=1e4)
 
 
 def until(true: Callable[[], Any], seconds: float = 60.0) -> bool:
@@ -146,43 +146,12 @@ def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         live(MESH)
 
 
-def minimised(viewer: dv.viz.Viewer | None) -> list[float]:
-    """Losses of a small optimisation, watched or not."""
-    log_mu = torch.tensor(1e4, dtype=torch.float64).log().requires_grad_()
-    optimizer = torch.optim.Adam([log_mu], 0.1)
-    losses = []
-    for _ in range(4):
-        optimizer.zero_grad()
-        x = dv.rollout(MODEL, MODEL.rest_points, torch.zeros_like(MODEL.rest_points), steps=3, mu=log_mu.exp(),
-                       lam=1e4, time_step=STEP, sweeps=3).x  # fmt: skip
-        loss = x[-1, :, 1].square().sum()
-        loss.backward()
-        if viewer is not None:
-            viewer.update(x, loss=loss, mu=log_mu.exp())
-        optimizer.step()
-        losses.append(loss.item())
-    return losses
-
-
-def test_an_optimisation_is_followed_and_not_changed() -> None:
-    with live(MODEL, time_step=STEP) as viewer:
-        losses = minimised(viewer)
-        assert losses == minimised(None)
-        assert viewer._losses == losses and [*viewer._parameters] == ["mu"]
-        with viewer.listening():
-            run = fall()
-            viewer.update(loss=0.5)
-        assert viewer._losses[-1] == 0.5 and torch.equal(viewer._pending.x, run.x)
-        with pytest.raises(TypeError, match="mu: expected a number or a tensor of one, got Tensor"):
-            viewer.update(mu=torch.zeros(2))
-
-
 @pytest.mark.slow
 def test_a_browser_draws_plays_and_reruns() -> None:
     images = pytest.importorskip("PIL.Image")
     speeds: list[float] = []
 
-    def throw(speed: float) -> dv.Trajectory:
+    def throw(speed: float) -> dv.results.Trajectory:
         speeds.append(speed)
         if speed > 4.0:
             raise ValueError("too fast")
