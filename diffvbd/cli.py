@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import inspect
 import re
 import sys
 import time
@@ -25,8 +26,6 @@ from diffvbd.tasks.report import versions
 from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
 from diffvbd.viz.server import require_viser
 from diffvbd.viz.values import QUANTITIES
-
-from .rollout.tune import ERROR, TIME_BUDGET
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
@@ -129,13 +128,12 @@ def _parser() -> argparse.ArgumentParser:
     advice = commands.add_parser("advise", help="find a solver that stays within a wanted error")
     advice.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     advice.add_argument("--duration", type=float, required=True, help="of the motion [s]")
+    error, budget = (inspect.signature(dv.advise).parameters[name].default for name in ("error", "time_budget"))
     advice.add_argument(
-        "--error", type=float, default=ERROR, help=f"fraction of the motion, below 1 (default {ERROR:g})"
+        "--error", type=float, default=error, help=f"fraction of the motion, below 1 (default {error:g})"
     )
-    advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
-    advice.add_argument(
-        "--time-budget", type=float, default=TIME_BUDGET, help=f"of trial runs [s] (default {TIME_BUDGET:g})"
-    )
+    advice.add_argument("--gradient", action="store_true", help="of gradients, too")
+    advice.add_argument("--time-budget", type=float, default=budget, help=f"of trial runs [s] (default {budget:g})")
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
     _add_material(advice)
     _add_scene(advice, ADVISED)
@@ -372,9 +370,7 @@ def _add_scene(parser: argparse.ArgumentParser, chosen: tuple[str, ...] = ()) ->
     scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
     text = "1.5 to 1.7 needs fewer sweeps (default 1; not with friction)"
     scene.add_argument("--relaxation", type=float, help=shown("relaxation", text))
-    text = (
-        f"corrections between the sweeps (default {Scene.subspace}); coarse: for what is stiff, long or finely meshed"
-    )
+    text = f"corrections between the sweeps (default {Scene.subspace}); coarse suits what is stiff, long or fine"
     scene.add_argument("--subspace", choices=[*SUBSPACES], help=shown("subspace", text))
     scene.add_argument("--integrator", choices=[*INTEGRATORS],
                        help=shown("integrator", f"of time (default {Scene.integrator})"))  # fmt: skip

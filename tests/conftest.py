@@ -6,8 +6,6 @@ import os
 from collections.abc import Generator, Iterator
 from typing import Any
 
-from diffvbd.ops.regimes import regime
-
 # Idle OpenMP threads must sleep, not spin, on a shared machine; read when torch is loaded, so it comes first.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -96,6 +94,7 @@ def device(request: pytest.FixtureRequest) -> str:
 def one_regime(device: str) -> Iterator[None]:
     """For comparisons to the bit between calls of different size, whose regimes may differ: all in the one that runs
     any scene. They must also be so small that a warp works on each vertex (regimes.MANY_LANES_VERTICES)."""
+    from diffvbd.testing import regime
 
     with regime("color") if device == "cuda" else contextlib.nullcontext():
         yield

@@ -136,7 +136,7 @@ def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str])
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start-young", "1e5", "--start-poisson", "0.6"], "poisson"),
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "1", "1", "--start-young", "1"], "--start"),
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "nan", "1"], "start"),
-        (["identify", "MESH", "other.npz"], "unknown keys ['positions']: expected x and any of coarse, density, dhat"),
+        (["identify", "MESH", "other.npz"], "unknown keys ['positions']: expected x and any of density, dhat, floor"),
         (["identify", "MESH", "mm.npz"], "x: expected shapes about as large as the mesh, 0.4 m, got 400 m"),
         (
             ["identify", "MESH", "timed.npz", "--time-step", "0.04"],
@@ -223,21 +223,23 @@ def test_simulate_makes_folders_and_asks_before_it_overwrites(
 def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
     """With two sweeps they change where a stiff body ends, and its file says that they were there."""
     ends = {}
-    for name, more in {"plain": [], "coarse": ["--coarse"]}.items():
+    for name, more in {"plain": [], "coarse": ["--subspace", "coarse"]}.items():
         target = tmp_path / f"{name}.npz"
         out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target, "--pin", "x-"]
         assert (
             run("simulate", mesh_file, *out, "--young", 1e6, "--poisson", 0.3, "--sweeps", 2, "--steps", 6, *more) == 0
         )
         found = Observation.load(target, dv.mesh.load(mesh_file))
-        assert found.scene.coarse == (name == "coarse")
+        assert found.scene.subspace == ("coarse" if name == "coarse" else "rigid")
         ends[name] = found.x[-1]
     apart = np.abs(ends["coarse"] - ends["plain"]).max()
     assert apart > 0.05 * np.abs(ends["plain"] - found.x[0]).max()
     out = ["--iterations", 1, "--out", tmp_path / "run"]
-    assert run("identify", mesh_file, tmp_path / "plain.npz", "--coarse", *out) in (0, 1)
-    for given in (True, np.bool_(True), 1, 1.0):
-        assert Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), coarse=given).scene.coarse
+    assert run("identify", mesh_file, tmp_path / "plain.npz", "--subspace", "coarse", *out) in (0, 1)
+    asked = Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), subspace="coarse")
+    assert asked.scene.solver.subspace == dv.CoarseSpace()
+    with pytest.raises(ValueError, match="subspace: expected one of .*, got 'fine'"):
+        Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), subspace="fine")
 
 
 @pytest.mark.parametrize(
@@ -310,10 +312,10 @@ def test_advise(beam_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     common = ["advise", str(beam_file), "--pin", "x-", "--duration", "0.1", "--error", "0.1"]
     assert main(common) == 0
     told = capsys.readouterr().out
-    made = re.search(r"in Python: settings=(dv\.Settings\(.*\))", told)
-    assert made is not None and "pilot runs took" in told
-    settings = eval(made[1])
-    assert isinstance(settings, dv.Settings) and 0 < settings.time_step <= 0.1
+    made = re.search(r"in Python: (dv\.VBD\(.*\))", told)
+    assert made is not None and "trial runs took" in told
+    solver = eval(made[1])
+    assert isinstance(solver, dv.VBD) and 0 < solver.time_step <= 0.1
     assert main([*common, "--sweeps", "3"]) == 2
     assert "--sweeps: expected none" in capsys.readouterr().err
     with pytest.raises(SystemExit):
@@ -404,7 +406,7 @@ def test_simulate_writes_gltf_and_says_early_what_usd_needs(
     assert run(*common, "--out", tmp_path / "part.glb") == 0
     assert (tmp_path / "part.glb").read_bytes()[:4] == b"glTF"
     monkeypatch.setitem(sys.modules, "pxr", None)
-    monkeypatch.setattr("diffvbd.cli_scene.scene", lambda *_: pytest.fail("simulated first"))
+    monkeypatch.setattr("diffvbd.cli._scene", lambda *_: pytest.fail("simulated first"))
     assert run(*common, "--out", tmp_path / "part.usdc") == 2
     assert "pip install 'diffvbd[exchange]'" in capsys.readouterr().err
     assert run(*common, "--out", tmp_path / "part.avi") == 2
@@ -473,5 +475,5 @@ def test_a_run_that_is_viewed_finds_the_same(
     plain, viewed = (json.loads((tmp_path / name / "log.json").read_text())["history"] for name in ("plain", "viewed"))
     assert [row | {"seconds": 0} for row in plain] == [row | {"seconds": 0} for row in viewed]
     assert len(shown) == len(viewed) and shown[0] == ((16, 54, 3), viewed[0]["loss"], "gradient_norm", "mu")
-    names = [*dv.viz.opened.opened(tmp_path / "viewed").motions]  # pyright: ignore[reportAttributeAccessIssue]
+    names = [*dv.viz.motion.opened(tmp_path / "viewed").motions]  # pyright: ignore[reportAttributeAccessIssue]
     assert names == ["initial", "target", "recovered"]

@@ -214,8 +214,9 @@ class VertexBlock(BlockUpdate):
 def vertex_block_descent(model: Model, solver: VBD, update: type[VertexBlock] = VertexBlock) -> Solver:
     """The sweep of :func:`diffvbd.step` as a composition of its colors.
 
-    ``descent((x,), (y, mu, lam, mass), sweeps=K)`` is the sweep that a step executes between predictor and velocity;
-    shapes and units in :class:`VertexBlock`. For study and for comparison: it is many times slower than ``step``.
+    ``descent((x,), (y, mu, lam, mass), sweeps=K)`` equals the sweep that a step executes between predictor and
+    velocity; shapes and units in :class:`VertexBlock`. For study and for comparison: it is many times slower than
+    ``step``.
 
     Args:
         model: A Model whose only energy is StableNeoHookean, on any device.

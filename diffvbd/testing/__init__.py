@@ -1,5 +1,6 @@
 """What tests and benchmarks share: scenes, evaluation against the reference, and one table of tolerances."""
 
+from ..ops.regimes import regime
 from .scenes import (
     CASES,
     KINDS,
@@ -38,6 +39,7 @@ __all__ = [
     "generator",
     "on_device",
     "reference_result",
+    "regime",
     "relative_error",
     "scenes",
     "sensitivity",

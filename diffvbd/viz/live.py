@@ -41,8 +41,8 @@ def live(
     Args:
         source: What to show:
 
-            * a Trajectory, or positions [m], shape [N, V, 3] or [N, B, V, 3], array or tensor; a dict of such things by
-              name;
+            * a Trajectory, or positions [m], shape [N, V, 3] or [N, B, V, 3], array or tensor; a dict of such things
+              by name;
             * a dv.Model or dv.TetMesh, for :meth:`Viewer.update`;
             * a file: a .pvd that `write_series` wrote, a mesh with tets, or the folder of a `diffvbd run`;
             * a function of the parameters in ``sliders`` that returns a trajectory or positions.

@@ -100,9 +100,7 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
     if isinstance(source, Trajectory):
         x, v, steps = source.x, as_array(source.v), np.asarray(source.steps)
     if isinstance(x, (str, bytes)) or not (hasattr(x, "__array__") or isinstance(x, Sequence)):
-        raise TypeError(
-            f"source: expected a dv.results.Trajectory, positions, a mesh or a file, got {type(source).__name__}"
-        )
+        raise TypeError(f"source: expected a Trajectory, positions, a mesh or a file, got {type(source).__name__}")
     points = positions("source", x, body.num_vertices)
     numbers = np.arange(len(points)) if steps is None else steps
     times = None if step is None else as_array(numbers * step)

@@ -78,9 +78,9 @@ def reference_step(solver: Any) -> Any:
 
 def check(solver: Any, inputs: dict[str, Any], sweeps: int, steps: int = 1) -> dict[str, Tensor]:
     """Compares a solver, on its device, with its reference on the CPU."""
-    expected = evaluate(repeated(reference_step(solver), steps, sweeps=sweeps), inputs)
+    expected = evaluate(repeated(reference_step(solver), steps, sweeps=sweeps), inputs, H)
     given = on_device(inputs, solver.mass.device)
-    found = on_device(evaluate(repeated(solver.step, steps, sweeps=sweeps), given), "cpu")
+    found = on_device(evaluate(repeated(solver.step, steps, sweeps=sweeps), given, H), "cpu")
     assert relative_error(found["x"], expected["x"]) <= tolerance("forward")
     # a velocity is a difference of positions over h, and so is its error
     error = (found["v"] - expected["v"]).abs().max() * H / expected["x"].abs().max()
@@ -133,7 +133,7 @@ def test_colors_are_the_sequential_sweep_in_their_order() -> None:
         assert colored.edges[group].unique().numel() == 2 * group.numel()
     inputs = inputs_of(mesh, colored)
     same = inputs | {name: inputs[name][order] for name in ("stiffness", "rest_length")}
-    found, expected = (evaluate(repeated(s.step, 1, sweeps=3), i) for s, i in ((colored, inputs), (listed, same)))
+    found, expected = (evaluate(repeated(s.step, 1, sweeps=3), i, H) for s, i in ((colored, inputs), (listed, same)))
     for name in expected:
         value = found[name][order] if name in ("grad_stiffness", "grad_rest_length") else found[name]
         assert (
@@ -161,9 +161,9 @@ def test_float32(kind: str) -> None:
     mesh = mesh_of("small")
     solver, single = (MADE[kind](mesh, dtype=t, **KINDS[kind]) for t in (torch.float64, torch.float32))
     inputs = inputs_of(mesh, solver)
-    expected = evaluate(repeated(solver.step, 1, sweeps=3), inputs)
+    expected = evaluate(repeated(solver.step, 1, sweeps=3), inputs, H)
     inputs = {name: t.float() if isinstance(t, Tensor) else t for name, t in inputs.items()}
-    found = evaluate(repeated(single.step, 1, sweeps=3), inputs)
+    found = evaluate(repeated(single.step, 1, sweeps=3), inputs, H)
     assert found["grad_x"].dtype == torch.float32 and found["grad_x"].any()
     assert relative_error(found["x"], expected["x"]) <= tolerance("float32_forward")
     assert relative_error(found["grad_x"], expected["grad_x"]) <= tolerance("float32_gradient")
@@ -288,7 +288,6 @@ def test_a_factor_serves_many_steps(device: str) -> None:
     given = constants(solver)
 
     def run(x: Tensor, v: Tensor, time_step: float, *, once: bool, **own: Tensor) -> tuple[Tensor, Tensor]:
-        # TODO62: solver options in own | ...
         options: dict[str, Any] = own | {"time_step": time_step}
         if once:
             options = {"factor": solver.factor(**options)}
@@ -298,7 +297,7 @@ def test_a_factor_serves_many_steps(device: str) -> None:
         return x, v
 
     inputs = state(device) | given | {"time_step": H}
-    found, expected = (evaluate(lambda once=once, **i: run(once=once, **i), inputs) for once in (True, False))
+    found, expected = (evaluate(lambda once=once, **i: run(once=once, **i), inputs, H) for once in (True, False))
     assert all(torch.equal(found[n], expected[n]) for n in ("x", "v"))
     assert all(relative_error(found[n], expected[n]) <= tolerance("other_solvers") and found[n].any() for n in found)
 
@@ -356,7 +355,7 @@ X = torch.from_numpy(TETS.points.copy())
 NAN = torch.where(torch.arange(8)[:, None] == 2, torch.nan, X)
 INF = float("inf")
 LEAF = torch.tensor(0.01, dtype=torch.float64, requires_grad=True)
-GIVEN = {"x": X, "v": torch.zeros_like(X), "stiffness": 1e3, "solver": dv.VBD(0.01, 1)}
+GIVEN = {"x": X, "v": torch.zeros_like(X), "stiffness": 1e3, "time_step": 0.01, "sweeps": 1}
 
 
 def xpbd(**changes: Any) -> Any:

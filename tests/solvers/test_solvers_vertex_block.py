@@ -16,27 +16,27 @@ from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
 CASES = ("plain", "paper", "saturated", "relaxed", "stiff", "inverted", "inverted_paper", "no_shear")
 
 
-def composed(model: Any, sweeps: int, update: type[VertexBlock] = VertexBlock) -> Any:
+def composed(model: Any, solver: dv.VBD, update: type[VertexBlock] = VertexBlock) -> Any:
     """A whole step around the composed sweep, masses from density."""
 
     def run(x: Tensor, v: Tensor, **given: Any) -> tuple[Tensor, Tensor]:
-        h, pinned = given["time_step"], model.pinned[:, None]
+        h, pinned = solver.time_step, model.pinned[:, None]
         corners = model.rest_points[model.tets]
         volume = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
         quarter = (given["density"] * volume / 4).repeat_interleave(4)
         mass = torch.zeros_like(model.mass).index_add(0, model.tets.reshape(-1), quarter)
         y = x + h * v + h**2 * (given["gravity"] + torch.where(pinned, 0.0, given["force"]) / mass[:, None])
         y = torch.where(pinned, given["prescribed"], y)
-        solver = vertex_block_descent(model, h, update)
-        (end,) = solver((y,), (y, given["mu"], given["lam"], mass), sweeps=sweeps)
+        descent = vertex_block_descent(model, solver, update)
+        (end,) = descent((y,), (y, given["mu"], given["lam"], mass), sweeps=solver.sweeps)
         return end, (end - x) / h
 
     return run
 
 
-def model_of(scene: Any, device: str = "cpu") -> Any:
+def solver_of(scene: Any, sweeps: int) -> dv.VBD:
     """Its sweeps start where composed() starts them."""
-    return scene.model(device, start="predictor")
+    return scene.solver(sweeps, start="predictor")
 
 
 def inputs_of(scene: Any, device: str = "cpu") -> dict[str, Any]:
@@ -57,31 +57,31 @@ def assert_agree(found: dict[str, Tensor], expected: dict[str, Tensor], spread: 
 @pytest.mark.parametrize("case", CASES)
 def test_equals_the_reference(case: str, sweeps: int, device: str) -> None:
     scene = build_scene(case, "delaunay")
-    model, inputs = model_of(scene), inputs_of(scene)
-    expected = testing.reference_result(model, inputs, sweeps)
-    found = evaluate(composed(model_of(scene, device), sweeps), inputs_of(scene, device))
-    assert_agree(found, expected, lambda: testing.spread(model, inputs, sweeps, expected=expected))
+    model, solver, inputs = scene.model(), solver_of(scene, sweeps), inputs_of(scene)
+    expected = testing.reference_result(model, inputs, solver)
+    found = evaluate(composed(scene.model(device), solver), inputs_of(scene, device), solver.time_step)
+    assert_agree(found, expected, lambda: testing.spread(model, inputs, solver, expected=expected))
 
 
 @pytest.mark.parametrize("case", ["plain", "paper"])
 def test_equals_the_step_of_the_package(case: str, device: str) -> None:
     scene = build_scene(case, "delaunay", "medium")
-    model, inputs = model_of(scene, device), inputs_of(scene, device)
-    expected = evaluate(lambda **given: dv.step(model, **given, solver=scene.solver(3)), inputs)
-    found = evaluate(composed(model, 3), inputs)
-    assert_agree(found, expected, lambda: testing.spread(model_of(scene), inputs_of(scene), 3))
+    model, solver, inputs = scene.model(device), solver_of(scene, 3), inputs_of(scene, device)
+    expected = evaluate(lambda x, v, **given: dv.step(model, x, v, solver, **given), inputs, solver.time_step)
+    found = evaluate(composed(model, solver), inputs, solver.time_step)
+    assert_agree(found, expected, lambda: testing.spread(scene.model(), inputs_of(scene), solver))
 
 
 def test_scenes_of_a_batch_do_not_mix() -> None:
     scene = build_scene("paper", "delaunay")
     inputs = inputs_of(scene)
-    model, x = model_of(scene), inputs["x"]
-    solver = vertex_block_descent(model, 0.01)
+    model, x = scene.model(), inputs["x"]
+    descent = vertex_block_descent(model, solver_of(scene, 2))
     scale = torch.tensor([1.0, 1.1, 0.9], dtype=x.dtype)[:, None, None]
     results = []
     for batch in (scale, *scale.split(1)):
         leaves = [(batch * x).requires_grad_(), inputs["mu"].clone().requires_grad_()]
-        (end,) = solver((leaves[0],), (leaves[0], leaves[1], inputs["lam"], model.mass), sweeps=2)
+        (end,) = descent((leaves[0],), (leaves[0], leaves[1], inputs["lam"], model.mass), sweeps=2)
         results.append((end.detach(), *torch.autograd.grad((end**2).sum(), leaves)))
     together, *each = results
     for k in (0, 1):
@@ -106,18 +106,20 @@ def test_each_part_of_the_adjoint_is_seen(part: str) -> None:
             return super().gradient_tangent(b, 0 * p if part == "gradient_tangent" else p)
 
     scene = build_scene("inverted_paper", "delaunay")
-    model, inputs = model_of(scene), inputs_of(scene)
-    full, without = (evaluate(composed(model, 1, kind), inputs) for kind in (VertexBlock, Without))
+    model, solver, inputs = scene.model(), solver_of(scene, 1), inputs_of(scene)
+    full, without = (
+        evaluate(composed(model, solver, kind), inputs, solver.time_step) for kind in (VertexBlock, Without)
+    )
     assert torch.equal(full["x"], without["x"])
     assert relative_error(without["grad_x"], full["grad_x"]) > 1e-3
 
 
 def test_float32() -> None:
     scene = build_scene("plain", "delaunay")
-    model = model_of(scene).to(dtype=torch.float32)
+    model, solver = scene.model().to(dtype=torch.float32), solver_of(scene, 2)
     single = {name: t.float() if isinstance(t, Tensor) else t for name, t in inputs_of(scene).items()}
-    found = evaluate(composed(model, 2), single)
-    expected = evaluate(composed(model_of(scene), 2), inputs_of(scene))
+    found = evaluate(composed(model, solver), single, solver.time_step)
+    expected = evaluate(composed(scene.model(), solver), inputs_of(scene), solver.time_step)
     assert found["grad_x"].dtype == torch.float32 and found["grad_x"].any()
     assert relative_error(found["x"], expected["x"]) <= tolerance("float32_forward")
     assert relative_error(found["grad_x"], expected["grad_x"]) <= tolerance("float32_gradient")
@@ -150,7 +152,7 @@ def test_bad_arguments_of_the_composed_sweep_are_named(changes: dict[str, Tensor
     given |= {"mass": model.mass}
 
     def run(x: Tensor, *parameters: Tensor) -> Tensor:
-        return vertex_block_descent(model, 0.01)(x, parameters, sweeps=1)
+        return vertex_block_descent(model, dv.VBD(0.01, 1))(x, parameters, sweeps=1)
 
     assert not torch.equal(run(*given.values()), x)
     with pytest.raises((ValueError, TypeError), match=message):

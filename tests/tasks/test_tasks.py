@@ -14,8 +14,7 @@ from helpers.task_checks import check_fall, check_gradient, quick, timeless
 
 import diffvbd as dv
 from diffvbd import losses
-from diffvbd.tasks import TASKS, Settings, fit_real_mesh, million_cubes, solve, table
-from diffvbd.tasks.beam import beam_mu
+from diffvbd.tasks import TASKS, Settings, beam, fit_real_mesh, million_cubes, solve, table
 from diffvbd.tasks.cape_wind import TRUE_WIND
 from diffvbd.tasks.cover_the_spot import faces_up, outline, smooth_uncovered, sunflower, uncovered
 from diffvbd.tasks.dress import SOFTNESS, profile
@@ -63,7 +62,7 @@ def test_gradient_is_that_of_central_differences(name: str, stage: int, step: fl
 @pytest.mark.slow
 def test_log_and_picture_are_written(tmp_path: Path) -> None:
     settings = Settings(tmp_path, quick=True)
-    result = solve(beam_mu.problem(settings), settings)
+    result = solve(beam.beam_mu(settings), settings)
     log = json.loads((tmp_path / "log.json").read_text())
     assert {"diffvbd", "torch", "numpy", "python"} <= set(log["versions"])
     assert log["settings"]["seed"] == 0

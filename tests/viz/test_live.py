@@ -12,8 +12,9 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd.viz import clock, motion, values
-from diffvbd.viz.motion import opened, scenery_of
+from diffvbd.viz import motion, values
+from diffvbd.viz import viewer as clock
+from diffvbd.viz.motion import scenery_of
 
 MESH = dv.mesh.join([dv.mesh.cube(2, 0.2, split="kuhn"), dv.mesh.cube(2, 0.2, split="kuhn").translate((0.0, 0.5, 0.0))])
 MODEL = dv.Model(MESH, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)))
@@ -55,7 +56,7 @@ def test_scenes_and_names_are_motions_of_their_own() -> None:
         (X * float("nan"), MODEL, ValueError, "source: expected finite positions, got some .* frame 0"),
         (X, None, TypeError, "mesh: expected a dv.Model or a dv.TetMesh beside Tensor, got None"),
         (X, MESH.points, TypeError, "mesh: expected a dv.Model or a dv.TetMesh, got ndarray"),
-        (3.0, MODEL, TypeError, "source: expected a dv.Trajectory, positions, a mesh or a file, got float"),
+        (3.0, MODEL, TypeError, "source: expected a Trajectory, positions, a mesh or a file, got float"),
         ({}, MODEL, ValueError, "source: expected at least one motion"),
     ],
 )
@@ -216,11 +217,11 @@ def test_what_is_asked_for_during_a_run_runs_after_it(reruns: Callable[..., cloc
 def test_a_series_is_opened_as_it_was_written(tmp_path: Path) -> None:
     run, times = falling(), STEP * np.arange(7)
     dv.mesh.write_series(tmp_path / "part.pvd", MESH, run.x, times)
-    found = opened.opened(tmp_path / "part.pvd")
+    found = motion.opened(tmp_path / "part.pvd")
     (moving,) = found.motions.values()
     assert moving.points == pytest.approx(run.x.numpy()) and moving.times == pytest.approx(times)
     assert found.mesh is not None and np.array_equal(found.mesh.body, MESH.body)
-    single = opened.opened(tmp_path / "part_0003.vtu")
+    single = motion.opened(tmp_path / "part_0003.vtu")
     assert next(iter(single.motions.values())).points[0] == pytest.approx(run.x[3].numpy())
 
 
@@ -230,10 +231,10 @@ def test_a_series_is_opened_as_it_was_written(tmp_path: Path) -> None:
     ids=["nested too deep", "no rows", "no row", "no loss"],
 )
 def test_the_log_of_a_run_that_is_none_is_refused(log: str, tmp_path: Path) -> None:
-    motion.save_motions(tmp_path / opened.MOTION, MESH.surface, {"target": X[None]}, STEP)
+    motion.save_motions(tmp_path / motion.MOTION, MESH.surface, {"target": X[None]}, STEP)
     (tmp_path / "log.json").write_text(log)
     with pytest.raises(ValueError, match="log.json: expected the log of a run, got"):
-        opened.opened(tmp_path)
+        motion.opened(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -258,4 +259,4 @@ def test_files_of_another_kind_are_refused(
     elif content is not None:
         path.write_text(content)
     with pytest.raises(kind, match=expected):
-        opened.opened(path)
+        motion.opened(path)
