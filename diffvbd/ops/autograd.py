@@ -25,7 +25,7 @@ Reverse = Callable[[Bars, Sequence[Any], tuple, Sequence[bool]], Bars]
 Vmap = Callable[..., tuple[Any, Any]]  # as torch.autograd.Function.vmap
 
 
-def no_second_derivative(*_: Any) -> NoReturn:
+def no_second_derivative() -> NoReturn:
     raise NotImplementedError(
         "diffvbd: second derivatives of a step are not supported (create_graph, hessian), nor is "
         "torch.autograd.functional.jvp, which differentiates a backward: take torch.autograd.grad or backward() once"
@@ -122,7 +122,10 @@ class Differentiable:
 
         class _Reverse(Function):
             forward = staticmethod(reversed_)
-            backward = staticmethod(no_second_derivative)
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Any) -> NoReturn:
+                no_second_derivative()
 
             @staticmethod
             def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
@@ -194,11 +197,12 @@ class Linear:
         run: Of a tensor and constants.
         transpose: Of its adjoint, the shape of the tensor, and the constants: the tensor's adjoint.
         arguments: How many there are, with the tensor.
-        vmap: As of torch.autograd.Function, but of ``run``; None: there is none.
+        vmap: Of the info of torch.autograd.Function.vmap, the tensor with the batch first, and the constants; None:
+            there is none.
     """
 
     def __init__(self, run: Callable[..., Tensor], transpose: Callable[..., Tensor], arguments: int,
-                 vmap: Vmap | None = None) -> None:  # fmt: skip
+                 vmap: Callable[..., Tensor] | None = None) -> None:  # fmt: skip
         class _Function(Function):
             forward = _of_arity(arguments, run)
 
@@ -214,7 +218,7 @@ class Linear:
             def vmap(info: Any, in_dims: tuple, values: Tensor, *constants: Any) -> tuple[Tensor, int]:
                 if vmap is None:
                     no_transforms()
-                return vmap(info, values.movedim(in_dims[0], 0), *constants), 0  # type: ignore[return-value]
+                return vmap(info, values.movedim(in_dims[0], 0), *constants), 0
 
         self.function = _Function
 

@@ -70,8 +70,8 @@ def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequ
 
 # The matrices, or their Cholesky factors. What comes back for these is the adjoint of the matrices themselves: no other
 # operator reads a factor, and the matrices need not be kept. Fields; sizes, time_step, factored.
-_matrix = ops.Differentiable(ops.direct.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS, tensors=_FIELDS,
-                             vmap=NO_VMAP, batched=True)  # fmt: skip
+_matrix = ops.Differentiable(ops.direct.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS,
+                             tensors=_FIELDS, vmap=NO_VMAP, batched=True)  # fmt: skip
 
 
 def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
