@@ -82,7 +82,7 @@ DIFFVBD_OPERATOR(Out<3>, coarse_matrix_backward, DIFFVBD_PARAMETERS(COARSE) In b
   });
 }
 
-#ifndef USE_CUDA  // there products of torch do the rest, see diffvbd/ops/coarse_cuda.py
+#ifndef USE_CUDA  // there products of torch do the rest, see diffvbd/ops/coarse.py
 
 // gradients [1 | B, tets, 4, 3] of the tets' shape functions
 template <class T>
