@@ -65,13 +65,13 @@ def _shapes_of(model: System) -> tuple[Tensor, Tensor]:
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Sequence[Tensor]:
     sizes, time_step, _ = rest
-    return ops.raw.coarse_matrix_backward(*saved, bars[0], sizes, time_step)
+    return ops.direct.coarse_matrix_backward(*saved, bars[0], sizes, time_step)
 
 
 # The matrices, or their Cholesky factors. What comes back for these is the adjoint of the matrices themselves: no other
 # operator reads a factor, and the matrices need not be kept. Fields; sizes, time_step, factored.
-_matrix = ops.Differentiable(ops.raw.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS, tensors=_FIELDS,
-                             vmap=NO_VMAP, batched=True)  # fmt: skip
+_matrix = ops.Differentiable(ops.direct.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS,
+                             tensors=_FIELDS, vmap=NO_VMAP, batched=True)  # fmt: skip
 
 
 def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:

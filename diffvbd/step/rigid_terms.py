@@ -12,8 +12,7 @@ from .. import ops
 from ..adjoint.contact_lag import Pairs, at_corners, of_scene, pair_lag, some_of
 from ..adjoint.potential import of_vertices
 from ..ops import broadcast
-
-RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
+from ..ops.fields import RESTING_MOTION
 
 
 class Scenes(NamedTuple):
@@ -53,7 +52,7 @@ def outer(n: Tensor) -> Tensor:
 def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
     """f1(|u|) / |u| of friction, and that quotient's derivative over |u|, of slips u [..., 3]."""
     square = (u * u).sum(-1)
-    moves = square > (RESTING * eps) ** 2
+    moves = square > (RESTING_MOTION * eps) ** 2
     length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
     sticks = length < eps
     rate = torch.where(sticks, (2 - length / eps) / eps, 1 / torch.where(sticks, torch.ones_like(length), length))

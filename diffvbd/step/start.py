@@ -30,14 +30,14 @@ _FIELDS = len(ops.BeginFields._fields)
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
     groups, other_groups, options = args[_FIELDS:]
-    return ops.raw.begin(*ops.as_list(ops.BeginFields(*args[:_FIELDS]), args[0]), groups, other_groups, *options)
+    return ops.direct.begin(*ops.as_list(ops.BeginFields(*args[:_FIELDS]), args[0]), groups, other_groups, *options)
 
 
 def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     fields, (falls, alone), (groups, options) = ops.BeginFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
     x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
     wants = (needs[2], needs[3], needs[5])
-    *out, shared, own, planes = ops.raw.begin_backward(
+    *out, shared, own, planes = ops.direct.begin_backward(
         *ops.as_list(fields, fields.x), x_start_bar, y_bar, falls, alone, groups, *options[:-1], wants
     )
     data_out = None
@@ -89,7 +89,7 @@ def begin(
         parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
     """
     # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
-    looked_at = (t if t is None else t.detach() for t in (mu, lam, rest))
+    looked_at = mu.detach(), lam.detach(), rest if rest is None else rest.detach()
     tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
     *listed, groups = bodies
     *listed_others, other_groups = others

@@ -15,14 +15,13 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs
-from ..adjoint.rise import ROUNDINGS, RiseParts, rise_of_bodies
+from ..adjoint.rise import RiseParts, rise_of_bodies
 from ..ops import contact as ops_start
+from ..ops.fields import DECREASE, FRACTIONS, ROUNDINGS
 from ..ops.sums import sum_by
 from .pair_values import barrier_values, floor_friction_values, lagged_values
 from .rigid_terms import Scenes, corners_of
 
-LENGTHS = 8  # 1, 1/2, ..., 1/128; twin of kFractions in csrc/core/safeguards.h
-DECREASE = 1e-4  # share of what the slope promises; twin of kDecrease in csrc/coarse/length.h
 EDGES = 1  # the kind of a pair of two edges
 
 
@@ -107,7 +106,7 @@ class Trials:
         """Fraction of a displacement [B, V, 3] that each set takes: the first of 1, 1/2, ..., 1/128 that lowers its
         potential by enough of what the slope [sets] promises, else 0; [1, sets]."""
         found = torch.zeros_like(slope, dtype=x.dtype)
-        for trial in range(LENGTHS):
+        for trial in range(FRACTIONS):
             share = 0.5**trial
             enough = torch.cat([DECREASE * share * slope, slope.new_zeros(1)])
             good = self._admits(x, x + share * way, enough)[:-1] & (slope <= 0)

@@ -1,27 +1,27 @@
-// Loads and stores of a thread, and which of the threads of a vertex it is.
+// Loads and stores of threads, and the layout of the threads of a vertex in a warp.
 #pragma once
 
 #include "../core/vec.h"
-#include "exchange.cuh"
 #include "step.h"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 
-// 16 bytes: the widest load of a thread
+// 16 bytes, the widest load.
 template <class T>
 struct alignas(16) Pack {
   static constexpr int size = 16 / sizeof(T);
   T v[size];
 };
 
-// The vector type of a Pack, by whose name the loads go: a Pack that is one in disguise would live on the stack.
+// Vector type of a Pack for loads; a Pack that contains it would live on the stack.
 template <class T>
 using Wide = std::conditional_t<sizeof(T) == sizeof(double), double2, float4>;
 __device__ __forceinline__ Pack<double> pack(const double2& a) { return {a.x, a.y}; }
 __device__ __forceinline__ Pack<float> pack(const float4& a) { return {a.x, a.y, a.z, a.w}; }
 
-// Values that other multiprocessors may write during the launch come from the L2 cache; a block that has its scene to
-// itself (`own`) can use the nearer one.
+// Values that other multiprocessors may write during the launch come from the L2 cache. A block that has its scene to
+// itself (`own`) uses the L1 cache.
 template <class T>
 __device__ __forceinline__ Pack<T> load_state(const T* p, bool own) {
   const auto* from = reinterpret_cast<const Wide<T>*>(p);
@@ -38,7 +38,7 @@ __device__ __forceinline__ void store(float* p, const Pack<float>& a) {
   *reinterpret_cast<float4*>(p) = {a.v[0], a.v[1], a.v[2], a.v[3]};
 }
 
-// rows of x, y, z and one unused
+// Rows of x, y, z and one unused scalar.
 template <class T>
 __device__ __forceinline__ Vec3<T> load_row(const T* rows, int64_t row, bool own = false) {
   const T* p = rows + kRow * row;
@@ -59,7 +59,7 @@ __device__ __forceinline__ void store_row(T* rows, int64_t row, const Vec3<T>& a
     store(p + 2, Pack<T>{a.z, T(0)});
   }
 }
-// packed vectors [blocks, 3, kSlice]
+// Packed vectors [blocks, 3, kSlice].
 template <class T>
 __device__ __forceinline__ Vec3<T> load3(const T* p, int block, int v) {
   const T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
@@ -72,7 +72,7 @@ __device__ __forceinline__ void store3(T* p, int block, int v, const Vec3<T>& b)
   a[kSlice] = b.y;
   a[2 * kSlice] = b.z;
 }
-// one that this thread alone writes, so that it may change during the launch
+// One that only this thread writes, so that it may change during the launch.
 template <class T>
 __device__ __forceinline__ Vec3<T> load_own3(const T* p, int block, int v) {
   const T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
@@ -97,7 +97,7 @@ __device__ __forceinline__ void each_number(T (&a)[n], const F& f) {
 #pragma unroll
   for (int k = 0; k < n; ++k) f(a[k]);
 }
-// Calls f(array) with the numbers of type T of some values, which then have what f has made of them.
+// Calls f(array) with the numbers of type T of some values, and stores the array back.
 template <class T, class F, class... R>
 __device__ __forceinline__ void change_numbers(const F& f, R&... values) {
   T all[(sizeof(R) + ...) / sizeof(T)];
@@ -108,14 +108,14 @@ __device__ __forceinline__ void change_numbers(const F& f, R&... values) {
   (each_number(values, [&](T& a) { a = all[k++]; }), ...);
 }
 
-// Which warp of its block a thread is in. The first thread tells the others, so that the compiler knows that all have
-// the same and keeps it, and what follows from it, once for the warp.
+// Number of a thread's warp. The first lane broadcasts it, so that the compiler keeps it and its consequences in
+// uniform registers.
 __device__ __forceinline__ int warp_of_block() {
   return __shfl_sync(kWholeWarp, static_cast<int>(threadIdx.x) / kSlice, 0);
 }
 
-// Where something of a block begins and ends. Asked for at once, whatever it is needed for later: volatile, or the
-// compiler would put each load off, and every one takes its time.
+// Begin and end of a block's part of an array. The load is volatile: the compiler would delay each load, and their
+// latencies would add up.
 struct Span {
   int begin, end;
 };
@@ -125,7 +125,7 @@ __device__ __forceinline__ Span span_of(const int32_t* starts, int block) {
   asm volatile("ld.global.nc.s32 %0, [%1];" : "=r"(out.end) : "l"(starts + block + 1));
   return out;
 }
-// Of a block's vertices: slots of their pairs, edges to their neighbours.
+// Spans of a block's vertices: slots of their pairs, edges to their neighbours.
 struct StarSpans {
   Span slots, edges;
 };
@@ -133,18 +133,18 @@ __device__ __forceinline__ StarSpans spans_of(const GroupPlan& plan, int block) 
   return {span_of(plan.block_slot, block), span_of(plan.block_edge, block)};
 }
 
-// Where a thread stands: vertex `v` of a block, and which of the `lanes` threads of that vertex it is. Neighbouring
-// threads have neighbouring vertices, so that their loads lie side by side.
+// Layout of a thread: vertex `v` of a block and lane among its `lanes` threads. Neighbouring threads have neighbouring
+// vertices, so that their loads coalesce.
 template <int lanes_>
-struct Place {
+struct LaneLayout {
   static constexpr int lanes = threads_of(lanes_), groups = kSlice / lanes;  // vertices of a warp
   int64_t scene;
   int block, v, group, lane;
-  __device__ __forceinline__ Place(int64_t scene, int block, int part)
+  __device__ __forceinline__ LaneLayout(int64_t scene, int block, int part)
       : scene(scene), block(block), group(threadIdx.x % groups), lane(threadIdx.x % kSlice / groups) {
     v = part * groups + group;
   }
-  // Sums of numbers of type T, vectors, matrices and arrays of such over the threads of a vertex.
+  // Sums over the threads of a vertex of numbers of type T, vectors, matrices and arrays of these.
   template <class T, class... R>
   __device__ __forceinline__ static void sum(R&... values) {
     change_numbers<T>(

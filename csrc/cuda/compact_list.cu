@@ -1,7 +1,10 @@
+// Compact list of pairs (contact/keep.h): a part of a list in the memory of the whole; the host does not learn its
+// size.
 #include <cub/device/device_scan.cuh>
 
-#include "exchange.cuh"
-#include "keep.h"
+#include "common.cuh"
+#include "contact.h"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -10,16 +13,13 @@ using namespace contact;
 
 constexpr int kThreads = 128, kWarp = 32;
 
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
-
 template <class T>
 __global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ KeepInputs<T> in, int32_t* kept) {
-  const int64_t i = own_item();
+  const int64_t i = own_item(kThreads);
   if (i <= in.count) kept[i] = i < in.count && stays(in, i) ? 1 : 0;
 }
-// Calls f(number(entry), its place in the shorter list) for the entries of a corner point whose pairs stay; a warp for
-// each. Returns how many there are.
+// Calls f(number(entry), index in the compact list) for the entries of a corner point whose pairs stay, a warp for each
+// corner. Returns how many there are.
 template <class T, class Number, class F>
 __device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Number& number, const F& f) {
   constexpr int kAhead = 8;  // entries of a thread that are read at once: a corner of a collider may have thousands
@@ -27,7 +27,7 @@ __device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Numb
   const int32_t end = in.ptr[corner + 1];
   int32_t count = 0;
   for (int32_t first = in.ptr[corner]; first < end; first += kAhead * kWarp) {
-    int32_t entries[kAhead], numbers[kAhead];  // -1: there is none that stays
+    int32_t entries[kAhead], numbers[kAhead];  // -1: dropped
 #pragma unroll
     for (int u = 0; u < kAhead; ++u) {
       const int32_t own = first + u * kWarp + static_cast<int32_t>(lane);
@@ -64,12 +64,12 @@ __device__ void copy_entries_of(const KeepInputs<T>& in, const int32_t* kept, in
 
 template <class T>
 __global__ void __launch_bounds__(kThreads) count_entries(const __grid_constant__ KeepInputs<T> in, int32_t* counts) {
-  count_entries_of(in, own_item() / kWarp, counts);
+  count_entries_of(in, own_item(kThreads) / kWarp, counts);
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     copy_pairs(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item();
+  const int64_t i = own_item(kThreads);
   if (i >= in.count) return;
   if (stays(in, i)) copy_pair(in, i, kept[i], out);
   if (kept[in.count] <= i) leave_empty(i, out);
@@ -77,11 +77,11 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     copy_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item() / kWarp;
+  const int64_t i = own_item(kThreads) / kWarp;
   if (i < in.corners) copy_entries_of(in, kept, i, out.ptr[i], out);
 }
 
-// Where lists are short, each block adds up by itself what comes before its own: two launches in place of eight.
+// Short lists: each block sums what precedes its part itself, two launches in place of eight.
 constexpr int64_t kFewPairs = 1 << 15, kFewCorners = 1 << 12;
 
 template <class T>
@@ -92,7 +92,7 @@ bool are_few(const KeepInputs<T>& in) {
 struct Sums {
   int before, all;
 };
-// The sums over the threads of a block; all must call it.
+// Sums over the threads of a block; all must call it.
 __device__ Sums sums_of_block(Sums own) {
   __shared__ int before[kThreads / kWarp], all[kThreads / kWarp];
   const unsigned warp = threadIdx.x / kWarp;
@@ -103,7 +103,7 @@ __device__ Sums sums_of_block(Sums own) {
   for (int i = 0; i < kThreads / kWarp; ++i) sum.before += before[i], sum.all += all[i];
   return sum;
 }
-// The sum of value(i) over i in [0, end), and over those below `first`.
+// Sum of value(i) over i in [0, end), and over those below `first`.
 template <class Value>
 __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
   Sums own{0, 0};
@@ -116,17 +116,17 @@ __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
   return sums_of_block(own);
 }
 
-// The pairs, by the first blocks; how many entries corner points keep, by the others.
+// The first blocks copy pairs; the others count the entries that corner points keep.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    keep_few_pairs(const __grid_constant__ KeepInputs<T> in, unsigned blocks, int32_t* kept, int32_t* counts,
-                   const __grid_constant__ Kept<T> out) {
+    compact_few_pairs(const __grid_constant__ KeepInputs<T> in, unsigned blocks, int32_t* kept, int32_t* counts,
+                      const __grid_constant__ Kept<T> out) {
   if (blockIdx.x >= blocks) {
     count_entries_of(in, (static_cast<int64_t>(blockIdx.x - blocks) * kThreads + threadIdx.x) / kWarp, counts);
     return;
   }
   __shared__ int of_warps[kThreads / kWarp];
-  const int64_t i = own_item(), listed = in.ptr[in.corners] / 4;
+  const int64_t i = own_item(kThreads), listed = in.ptr[in.corners] / 4;
   const unsigned lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   const bool own = i < in.count && stays(in, i);
   const unsigned found = __ballot_sync(kWholeWarp, own);
@@ -142,9 +142,9 @@ __global__ void __launch_bounds__(kThreads)
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    keep_few_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const int32_t* counts,
-                     const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item() / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
+    compact_few_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const int32_t* counts,
+                        const __grid_constant__ Kept<T> out) {
+  const int64_t i = own_item(kThreads) / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
   int before = sums_before(first, first, [&](int64_t corner) { return counts[corner]; }).all;
   if (i > in.corners) return;
   for (int64_t k = first; k < i; ++k) before += counts[k];
@@ -166,38 +166,34 @@ size_t scan_bytes(const KeepInputs<T>& in) {
 }  // namespace
 
 template <class T>
-int64_t keep_bytes(const KeepInputs<T>& in) {
+int64_t compact_list_bytes(const KeepInputs<T>& in) {
   if (are_few(in)) return aligned(in.count * sizeof(int32_t)) + aligned((in.corners + 1) * sizeof(int32_t));
   return aligned((in.count + 1) * sizeof(int32_t)) + aligned(static_cast<int64_t>(scan_bytes(in)));
 }
 
 template <class T>
-cudaError_t keep(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, cudaStream_t stream) {
+cudaError_t compact_list(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, cudaStream_t stream) {
   auto* kept = static_cast<int32_t*>(workspace);
-  const unsigned of_corners = blocks_for((in.corners + 1) * kWarp);
+  const unsigned of_corners = blocks_for((in.corners + 1) * kWarp, kThreads);
   if (are_few(in)) {
     auto* counts = reinterpret_cast<int32_t*>(static_cast<uint8_t*>(workspace) + aligned(in.count * sizeof(int32_t)));
-    const unsigned of_pairs = blocks_for(in.count);
-    keep_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, of_pairs, kept, counts, out);
-    keep_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, kept, counts, out);
+    const unsigned of_pairs = blocks_for(in.count, kThreads);
+    compact_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, of_pairs, kept, counts, out);
+    compact_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, kept, counts, out);
     return cudaGetLastError();
   }
   void* scan = static_cast<uint8_t*>(workspace) + aligned((in.count + 1) * sizeof(int32_t));
   size_t bytes = scan_bytes(in);
-  flag_pairs<T><<<blocks_for(in.count + 1), kThreads, 0, stream>>>(in, kept);
+  flag_pairs<T><<<blocks_for(in.count + 1, kThreads), kThreads, 0, stream>>>(in, kept);
   if (auto error = cub::DeviceScan::ExclusiveSum(scan, bytes, kept, kept, in.count + 1, stream)) return error;
   count_entries<T><<<of_corners, kThreads, 0, stream>>>(in, out.ptr);
   if (auto error = cub::DeviceScan::ExclusiveSum(scan, bytes, out.ptr, out.ptr, in.corners + 1, stream)) return error;
-  if (in.count > 0) copy_pairs<T><<<blocks_for(in.count), kThreads, 0, stream>>>(in, kept, out);
-  if (in.corners > 0) copy_entries<T><<<blocks_for(in.corners * kWarp), kThreads, 0, stream>>>(in, kept, out);
+  if (in.count > 0) copy_pairs<T><<<blocks_for(in.count, kThreads), kThreads, 0, stream>>>(in, kept, out);
+  if (in.corners > 0) copy_entries<T><<<blocks_for(in.corners * kWarp, kThreads), kThreads, 0, stream>>>(in, kept, out);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                          \
-  template int64_t keep_bytes<T>(const KeepInputs<T>&); \
-  template cudaError_t keep<T>(const KeepInputs<T>&, const Kept<T>&, void*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(compact_list_bytes)
+DIFFVBD_INSTANTIATE(compact_list)
 
 }  // namespace diffvbd::cuda
