@@ -53,7 +53,7 @@ def closest_features(kind: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inside_face(p: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Whether p projects into the interior of a triangle: positive areas against each of its edges."""
+    """True if p projects into the interior of a triangle: positive areas against each of its edges."""
     ab, ac = b - a, c - a
     normal = _cross(ab, ac)
     areas = [_dot(_cross(s - p, t - p), normal) > 0 for s, t in ((a, b), (b, c), (c, a))]
@@ -61,7 +61,7 @@ def _inside_face(p: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _inside_edges(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Whether the lines through two edges are closest inside both."""
+    """True if the lines through two edges are closest inside both."""
     u, v, r = b - a, d - c, c - a
     normal = _cross(u, v)
     size = _dot(normal, normal)
@@ -228,7 +228,7 @@ class _Predicates:
         self.integers: np.ndarray | None = None
 
     def cross(self, ends: np.ndarray, corners: np.ndarray) -> np.ndarray:
-        """Whether edges [n, 2] cross triangles [n, 3], as `intersections` defines it."""
+        """Mask of edges [n, 2] that cross triangles [n, 3], as `intersections` defines it."""
         p, q = ends.T
         sides = [self.side(np.column_stack((corners, end))) for end in (p, q)]
         crossing = sides[0] * sides[1] < 0

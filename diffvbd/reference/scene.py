@@ -107,7 +107,7 @@ def solve6(matrix: Tensor, rhs: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Scene:
-    """What stays the same over the steps of one run. Component-major; leading dimensions are scenes."""
+    """Constants of the steps of one run. Component-major; leading dimensions are scenes."""
 
     model: Any
     layout: Layout

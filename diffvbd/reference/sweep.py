@@ -286,7 +286,7 @@ def _rise(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor
 
 
 def started(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
-    """What the start of a step may take of a step [..., 3, n] from x [..., 3, n]."""
+    """Admissible part of a step [..., 3, n] from x [..., 3, n] at the start."""
     for energy in energies:
         if hasattr(energy, "start"):
             step = energy.start(x, step)

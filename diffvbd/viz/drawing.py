@@ -1,4 +1,4 @@
-"""What every picture is made of."""
+"""Bodies, scenery, axes and colors: the parts of every picture."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -42,7 +42,7 @@ def animation(
     view: tuple[float, float] = VIEW,
     color: Any = None,
 ) -> None:
-    """Save motions beside each other as a .gif that runs in real time, or slower where it would last less than 2 s; or
+    """Save motions side by side as a .gif that runs in real time, or slower where it would last less than 2 s; or
     as an .npz, which :func:`live` shows.
 
     Args:
@@ -93,7 +93,7 @@ def comparison(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save a grid of shapes, one row per motion and one column per time, beside the course of an optimisation.
+    """Save a grid of shapes, one row per motion and one column per time, with the course of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -144,7 +144,7 @@ def learning(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save shapes, one row per motion and one column per time, beside losses over the seconds that they took.
+    """Save shapes, one row per motion and one column per time, with losses over the seconds that they took.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -330,7 +330,7 @@ def field(
     truth: Mapping[str, float] | None = None,
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save maps of fields beside each other, on the surface and on a cut, with one colorbar of logarithmic scale.
+    """Save maps of fields side by side, on the surface and on a cut, with one colorbar of logarithmic scale.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -407,7 +407,7 @@ SHOWN = 20_000  # points; of more, so many of them
 def cloud(
     path: str | Path, frames: Any, time_step: float, history: Sequence[Mapping[str, float]], estimate: str
 ) -> None:
-    """Save points at several times beside the course of an optimisation.
+    """Save points at several times with the course of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
