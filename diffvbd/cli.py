@@ -94,9 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     run.formatter_class = raw
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
     run.add_argument(
-        "--quick",
-        action="store_true",
-        help="a small version that takes seconds and need not be as accurate",
+        "--quick", action="store_true", help="a small version that takes seconds and need not be as accurate"
     )
     _add_run_options(run, "runs/NAME, or runs/NAME-quick")
     for name, texts in sorted(_task_options().items()):

@@ -269,11 +269,7 @@ RATE = 24.0  # frames per second of a single frame
 
 
 def write_usd(
-    path: Path,
-    parts: Sequence[Part],
-    frames: FloatArray,
-    times: NDArray[Any],
-    point_data: Mapping[str, NDArray[Any]],
+    path: Path, parts: Sequence[Part], frames: FloatArray, times: NDArray[Any], point_data: Mapping[str, NDArray[Any]]
 ) -> None:
     """Write parts whose vertices move; frames [N, V, 3] m, times [N] s, increasing, point_data [N, V] or [N, V, C].
 

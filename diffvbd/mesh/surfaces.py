@@ -67,10 +67,7 @@ class Repair(NamedTuple):
 
 
 def repair(
-    surface: Source | tuple[Any, Any],
-    size: float | None = None,
-    scale: float | None = None,
-    up: str = "y",
+    surface: Source | tuple[Any, Any], size: float | None = None, scale: float | None = None, up: str = "y"
 ) -> Repair:
     """Bring a triangle surface to metres and to y up, and repair it. Needs the extra: `pip install diffvbd[mesh]`.
 

@@ -264,10 +264,7 @@ REACH = 2.5  # planes are shown so far around a scene, in its radii
 
 
 def scenery_of(
-    model: Model,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    colliders: Any = None,
+    model: Model, low: NDArray[np.float64], high: NDArray[np.float64], colliders: Any = None
 ) -> tuple[Scenery, ...]:
     """Floors and colliders around a scene between two corners [m].
 
