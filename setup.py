@@ -33,41 +33,8 @@ QUICK = bool(os.environ.get("DIFFVBD_QUICK"))
 INSTRUCTION_SETS = ["baseline"] if QUICK or os.environ.get("DIFFVBD_NO_CLONES") else ["v4", "v3", "baseline"]
 CPU_SOURCES = [
     *(f"csrc/cpu/sweep_{scalar}_{name}.cpp" for scalar in ("double", "float") for name in INSTRUCTION_SETS),
-    "csrc/bind/schema.cpp",
-    "csrc/cpu/advance.cpp",
-    "csrc/cpu/checks.cpp",
-    "csrc/cpu/cholesky.cpp",
-    "csrc/cpu/coarse.cpp",
-    "csrc/cpu/contact.cpp",
-    "csrc/cpu/contact_groups.cpp",
-    "csrc/cpu/contact_rigid.cpp",
-    "csrc/cpu/contact_rigid_backward.cpp",
-    "csrc/cpu/contact_rigid_move.cpp",
-    "csrc/cpu/contact_rigid_reverse.cpp",
-    "csrc/cpu/detect.cpp",
-    "csrc/cpu/intersect.cpp",
-    "csrc/cpu/islands.cpp",
-    "csrc/cpu/kernels.cpp",
-    "csrc/cpu/layout.cpp",
-    "csrc/cpu/motion.cpp",
-    "csrc/cpu/neighbors.cpp",
-    "csrc/cpu/plan.cpp",
-    "csrc/bind/cpu/sweep.cpp",
-    "csrc/bind/cpu/begin.cpp",
-    "csrc/bind/cpu/coarse.cpp",
-    "csrc/bind/cpu/contact.cpp",
-    "csrc/bind/cpu/contact_start.cpp",
-    "csrc/bind/cpu/contact_lag.cpp",
-    "csrc/bind/cpu/contact_part.cpp",
-    "csrc/bind/cpu/contact_rigid.cpp",
-    "csrc/bind/cpu/mesh.cpp",
-    "csrc/bind/cpu/motion.cpp",
-    "csrc/bind/cpu/neighbors.cpp",
-    "csrc/bind/cpu/rigid.cpp",
-    "csrc/bind/cpu/rise.cpp",
-    "csrc/bind/cpu/sweep_rooms.cpp",
-    "csrc/bind/cpu/unsupported.cpp",
-    "csrc/cpu/run.cpp",
+    *sorted(glob("csrc/bind/*.cpp")),
+    *(path for path in sorted(glob("csrc/cpu/*.cpp")) if not path.startswith("csrc/cpu/sweep_")),
 ]
 
 # -ffp-contract=off: the same bits from every instruction set. -fno-math-errno: sqrt is one instruction.
@@ -107,6 +74,15 @@ class BuildPy(build_py):
         return super().get_source_files() + PACKED
 
 
+class BuildExt(BuildExtension):
+    """Keeps the objects of each extension apart: both compile csrc/bind."""
+
+    def build_extension(self, ext):
+        temp, self.build_temp = self.build_temp, os.path.join(self.build_temp, ext.name)
+        super().build_extension(ext)
+        self.build_temp = temp
+
+
 extensions = [
     CppExtension(
         "diffvbd._C",
@@ -130,7 +106,7 @@ setup(
     long_description=long_description(),
     long_description_content_type="text/markdown",
     ext_modules=extensions,
-    cmdclass={"build_ext": BuildExtension, "build_py": BuildPy},
+    cmdclass={"build_ext": BuildExt, "build_py": BuildPy},
     options={
         "bdist_wheel": {"py_limited_api": "cp310"},
         "egg_info": {"tag_build": f"+{local_version}" if local_version else ""},

@@ -7,11 +7,16 @@ Each variant is a subclass of `diffvbd.solvers.VertexBlock` with one method chan
 * validity gate: the Hessian tangent only of tets with det F > 0.5, which the forward knows nothing of.
 
 Scene, the same on all meshes: the unit cube (Delaunay meshes of 26, 115 and 631 vertices), not held, paper preset
-(`dv.Model.paper`), density 1000 kg/m^3, mu = lam = 1e4 Pa, h = 1/60 s, one step under gravity. The cube starts at rest
+(`dv.VBD.paper`), density 1000 kg/m^3, mu = lam = 1e4 Pa, h = 1/60 s, one step under gravity. The cube starts at rest
 shape, turning about its vertical axis by 4 rad/s per metre of height (zero at mid-height), with uniform noise of 1 m/s
 on every velocity component. Noise of one size is a strain that grows as edges get shorter: that is what refinement does
 to any motion whose wavelength the mesh barely resolves. The loss is a fixed random linear function of the end state.
 Other draws of the noise are measured too, because one flat tet decides whether a gate fires on the coarse mesh.
+
+The paper gives neither motion nor material of its ablation, so only the pattern can be compared: the full adjoint at
+rounding level, each omission visible at K = 1 and larger on a finer mesh, the gate exact where no tet comes near
+inversion. What an omission costs follows the length of the updates (saturation: their ratio to 0.1 m) and the strain
+that they make (Hessian tangent).
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import paper
-from bench.common import markdown_table
+from bench.tables import Table
 from diffvbd import testing
 from diffvbd.solvers import VertexBlock, vertex_block_descent
 
@@ -68,7 +73,7 @@ def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
     for size in testing.SIZES[:2] if quick else testing.SIZES:
         model, inputs = scene(size)
         for sweeps in SWEEPS[:1] if quick else SWEEPS:
-            expected = testing.reference_result(model, inputs, sweeps)
+            expected = testing.reference_result(model, inputs, solver_of(sweeps))
             found = {name: composed(model.to(device), inputs, sweeps, kind) for name, kind in VARIANTS.items()}
             found[STEP] = package_step(model.to(device), inputs, sweeps)
             rows += [{"variant": name, "vertices": model.num_vertices, "sweeps": sweeps, **errors(name, one, expected)}
@@ -99,7 +104,7 @@ def draws(device: str) -> list[dict[str, Any]]:
         found: dict[str, list[float]] = {name: [] for name in VARIANTS}
         for draw in range(DRAWS):
             model, inputs = scene(size, draw)
-            expected = testing.reference_result(model, inputs, 1)
+            expected = testing.reference_result(model, inputs, solver_of(1))
             for name, kind in VARIANTS.items():
                 one = composed(model.to(device), inputs, 1, kind)
                 found[name].append(errors(name, one, expected)["error"])
@@ -110,14 +115,19 @@ def draws(device: str) -> list[dict[str, Any]]:
 
 def scene(size: str, draw: int = 0) -> tuple[dv.Model, dict[str, Any]]:
     """Model and inputs of a step, on the CPU."""
-    model = dv.Model.paper(mesh_of(size), rigid=False)  # the sweeps alone, as the composed variants have them
+    model = dv.Model(mesh_of(size))
     points = model.mesh.points
     x, height, z = (points - 0.5).T
     twist = TWIST * height * np.stack((z, 0 * z, -x))
     noise = NOISE * testing.generator("ablation", size, draw).uniform(-1, 1, points.shape)
     given = {"mu": MODULUS, "lam": MODULUS, "x": points.copy(), "v": twist.T + noise, "gravity": [0.0, -9.81, 0.0]}
     tensors = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
-    return model, tensors | {"time_step": TIME_STEP}
+    return model, tensors
+
+
+def solver_of(sweeps: int) -> dv.VBD:
+    """The paper's preset by the sweeps alone, as the composed variants have them."""
+    return dv.VBD.paper(TIME_STEP, sweeps, subspace=None)
 
 
 def mesh_of(size: str) -> dv.TetMesh:
@@ -134,7 +144,7 @@ def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
     y = inputs["x"] + h * inputs["v"] + h * h * inputs["gravity"]
     corners, at_rest = y[model.tets], model.rest_points[model.tets]
     det = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / torch.linalg.det(at_rest[:, 1:] - at_rest[:, :1])
-    end, _ = dv.step(model, sweeps=1, **inputs)
+    end, _ = dv.step(model, solver=solver_of(1), **inputs)
     return {
         "vertices": model.num_vertices,
         "tets": model.num_tets,
@@ -147,56 +157,29 @@ def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
 
 def composed(model: dv.Model, inputs: dict[str, Any], sweeps: int, kind: type[VertexBlock]) -> dict[str, Tensor]:
     """`testing.evaluate` of a step whose sweep is composed of one kind of update."""
-    solver = vertex_block_descent(model, TIME_STEP, kind)
+    solver = vertex_block_descent(model, solver_of(sweeps), kind)
 
-    def step(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor, time_step: float) -> Any:
-        y = x + time_step * v + time_step**2 * gravity
+    def step(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor) -> Any:
+        y = x + TIME_STEP * v + TIME_STEP**2 * gravity
         (end,) = solver((y,), (y, mu, lam, model.mass), sweeps=sweeps)
-        return end, (end - x) / time_step
+        return end, (end - x) / TIME_STEP
 
-    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device)), "cpu")
+    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device), TIME_STEP), "cpu")
 
 
 def package_step(model: dv.Model, inputs: dict[str, Any], sweeps: int) -> dict[str, Tensor]:
     """`testing.evaluate` of the package's own step."""
 
     def step(**given: Any) -> tuple[Tensor, Tensor]:
-        return dv.step(model, sweeps=sweeps, **given)
+        return dv.step(model, solver=solver_of(sweeps), **given)
 
-    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device)), "cpu")
+    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device), TIME_STEP), "cpu")
 
 
-def markdown(results: dict[str, Any]) -> str:
-    rows, meshes = results["rows"], results["meshes"]
-    sizes = [m["vertices"] for m in meshes]
-    error = {(r["variant"], r["vertices"], r["sweeps"]): r["error"] for r in rows}
-    names = list(dict.fromkeys(r["variant"] for r in rows))
-    depths = sorted({r["sweeps"] for r in rows})
-
-    def cells(name: str, sweeps: int) -> list[Any]:
-        theirs = paper.ABLATION[name] if sweeps == 1 else {}
-        return [f"{error[name, n, sweeps]:.1e}" + (f" (paper {theirs[n]:.1e})" if n in theirs else "") for n in sizes]
-
-    header = [f"{n} vertices" for n in sizes]
-    parts = ["## Gradient error at K = 1: the larger of x0 and v0, against autograd through the executed sweep\n",
-             markdown_table(["adjoint", *header], [[name, *cells(name, 1)] for name in names])]  # fmt: skip
-    if len(depths) > 1:
-        parts += ["## More sweeps hide what is missing\n",
-                  markdown_table(["adjoint", "K", *header],
-                                 [[name, k, *cells(name, k)] for name in names for k in depths])]  # fmt: skip
-    if results["draws"]:
-        by = {(r["variant"], r["vertices"]): r for r in results["draws"]}
-        spans = [[name, *("{median:.1e} ({least:.1e} to {largest:.1e})".format(**by[name, n]) for n in sizes)]
-                 for name in VARIANTS]  # fmt: skip
-        parts += [f"## Median, least and largest error at K = 1 over {DRAWS} draws of the noise\n",
-                  markdown_table(["adjoint", *header], spans)]  # fmt: skip
-    parts += ["## What the first sweep meets\n",
-              markdown_table([k.replace("_", " ") for k in meshes[0]], [m.values() for m in meshes])]  # fmt: skip
-    parts.append(
-        "The paper gives neither motion nor material of its ablation, so the scene is ours and only the pattern can be "
-        "compared: the full adjoint at rounding level, each omission visible at K = 1 and larger on a finer mesh, the "
-        "gate exact where no tet comes near inversion. What an omission costs follows the length of the updates "
-        "(saturation: their ratio to 0.1 m) and the strain that they make (Hessian tangent). In some draws the noise "
-        "flattens a tet of the coarse mesh, and then the gate is wrong there, too.\n"
-    )
-    return "\n".join(parts)
+TABLES = (
+    Table("Gradient error, the larger of x0 and v0, against autograd through the executed sweeps", "rows",
+          {"adjoint": "variant", "vertices": "vertices", "K": "sweeps", "error": "error",
+           "paper": lambda row: paper.ABLATION[row["variant"]].get(row["vertices"]) if row["sweeps"] == 1 else None}),
+    Table(f"Median, least and largest error at K = 1 over {DRAWS} draws of the noise", "draws"),
+    Table("What the first sweep meets", "meshes"),
+)  # fmt: skip

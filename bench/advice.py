@@ -1,28 +1,185 @@
 """Whether `dv.advise` keeps its promise, and how fast what it advises is.
 
-Scenes drawn by a seed; for each wanted error the true one of the advised settings, against runs of eight times the
-steps and five times the sweeps; the time of the advised settings over that of the best of a grid; and what the advice
-cost. Then the cantilever and the drop of docs/numerics.md beside the best settings of implicit
-Euler, and a fit of a material with steps that are too long and with short ones. One thread each.
+Scenes drawn by a seed: meshes, materials over five decades, with and without contact. For each wanted error the true
+one of what is advised, against runs of eight times the steps and five times the sweeps; its time over that of the best
+of a grid; and what the advice cost, in rollouts of what it advises. Barriers are drawn as well, one to ten times as
+stiff as it takes that kappa dhat^2 is the kinetic energy of a vertex: what meets a much weaker one stops at gaps that
+no time step resolves.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import time
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from torch import Tensor
 
 import diffvbd as dv
 from bench import common
-from bench.advice_fit import fit
-from bench.advice_scenes import Scene, drawn
-from bench.common import markdown_table
-from diffvbd.rollout.tune import FRAMES, Pilot, Pilots, pilots_of
+from bench.measure import Card
+from bench.tables import Table, count, most
+from diffvbd import mesh
+
+SEED = 20_261_125  # of no scene that the search was tuned on
+DHAT = 2e-3  # [m]
+
+
+@dataclass(frozen=True)
+class Scene:
+    name: str
+    model: dv.Model
+    v: Tensor  # [V, 3] [m/s]
+    duration: float  # [s]
+    given: dict[str, Any]
+
+    @property
+    def touches(self) -> bool:
+        return self.model.contact is not None or self.model.floor is not None
+
+
+# --- rollouts of one scene by one solver or another -------------------------------------------------------------------
+
+FRAMES = 4  # at which two runs are compared, equally spaced over the duration
+
+
+class Run(NamedTuple):
+    steps: int
+    x: Tensor | None  # [FRAMES + 1, V, 3], the first is the start; None: it failed
+    seconds: float
+    gradient: tuple[Tensor, ...] = ()
+
+
+class Runs:
+    """Rollouts of a scene from rest shape by any solver. With a gradient: that of the mean squared way, with respect
+    to the moduli and to one velocity of all vertices, since those of single ones excite what no time step resolves."""
+
+    def __init__(self, scene: Scene, gradient: bool = False, dtype: torch.dtype | None = None) -> None:
+        self.model = scene.model if dtype is None else scene.model.to(dtype=dtype)
+        self.scene, self.gradient, self.spent = scene, gradient, 0.0
+        self.x = self.model.rest_points
+        self.v = scene.v.to(self.x)
+        self.given = {k: v.to(self.x) if isinstance(v, Tensor) else v for k, v in scene.given.items()}
+        self.warm: set[str] = set()
+
+    def run(self, solver: dv.VBD, steps: int, checkpoint_every: Any = "auto") -> Run:
+        """So many steps over the whole duration; a first short one, which arranges what lasts, is not timed."""
+        kind = f"{replace(solver, time_step=1.0, prediction=None)} {solver.start}"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                if kind not in self.warm:
+                    self._rollout(solver, steps, 1 if not self.gradient else FRAMES, checkpoint_every)
+                    self.warm.add(kind)
+                began = time.perf_counter()
+                x, gradient = self._rollout(solver, steps, steps, checkpoint_every)
+                if x.is_cuda:
+                    torch.cuda.synchronize(x.device)
+            except (RuntimeError, ValueError):
+                return Run(steps, None, math.inf)
+        seconds = time.perf_counter() - began
+        self.spent += seconds
+        return Run(steps, x, seconds, gradient) if bool(torch.isfinite(x).all()) else Run(steps, None, seconds)
+
+    def _rollout(self, solver: dv.VBD, steps: int, count: int, checkpoint_every: Any
+                 ) -> tuple[Tensor, tuple[Tensor, ...]]:  # fmt: skip
+        """``count`` of steps of the scene's duration over ``steps``."""
+        h, given, v, leaves = self.scene.duration / steps, dict(self.given), self.v, []
+        for name, value in self.given.items():
+            if callable(value):  # of the time at a step's end
+                given[name] = lambda step, x, v, value=value: value((step + 1) * h).to(x)
+        if self.gradient:
+            leaves = [self.x.new_zeros(3, requires_grad=True)]
+            v = torch.where(self.model.pinned[:, None], v, v + leaves[0])
+            for name in set(given) & {"mu", "lam", "young", "poisson"}:
+                given[name] = torch.as_tensor(given[name]).to(self.x).detach().clone().requires_grad_()
+                leaves.append(given[name])
+        with torch.set_grad_enabled(self.gradient):
+            x = dv.rollout(self.model, self.x, v, replace(solver, time_step=h), steps=count,
+                           save=max(1, count // FRAMES), checkpoint_every=checkpoint_every,
+                           checks=dv.Checks(contact=False, energy=False), **given).x  # fmt: skip
+            way = (x[-1] - self.x).square().mean()
+        return x.detach(), torch.autograd.grad(way, leaves) if leaves else ()
+
+    def motion(self, x: Tensor) -> float:
+        """Root mean square way from the start, over vertices and frames [m]."""
+        return float((x[1:] - x[:1]).square().sum(-1).mean().sqrt())
+
+    def apart(self, a: Run, b: Run) -> tuple[float, float]:
+        """Root mean square distance over the motion of the second, and the relative one of the worst gradient."""
+        if a.x is None or b.x is None:
+            return math.inf, math.inf
+        off = float((a.x[1:].to(b.x) - b.x[1:]).square().sum(-1).mean().sqrt()) / max(self.motion(b.x), 1e-300)
+        gradients = [float((u.to(w) - w).norm() / w.norm().clamp(min=1e-300))
+                     for u, w in zip(a.gradient, b.gradient, strict=False)]  # fmt: skip
+        return off, max(gradients, default=0.0)
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def _body(rng: np.random.Generator) -> tuple[str, dv.TetMesh]:
+    kind = ("beam", "sheet", "blob", "box")[rng.integers(4)]
+    if kind == "beam":
+        n = int(rng.integers(2, 4))
+        return kind, mesh.beam(
+            int(rng.integers(5, 12)), n, n, size=(float(rng.uniform(0.2, 0.8)), 0.1, 0.1), split="kuhn"
+        )
+    if kind == "sheet":
+        return kind, mesh.sheet(8, 8, (0.3, 0.3), float(rng.uniform(0.01, 0.04)))
+    if kind == "blob":
+        return kind, mesh.blob(5, int(rng.integers(100)), 0.1)
+    return kind, mesh.box(int(rng.integers(2, 5)), 0.1, split="kuhn")
+
+
+def _kappa(rng: np.random.Generator, body: dv.TetMesh, speed: float) -> float:
+    """Stiffness of a barrier [N/m]."""
+    mass = float(dv.Model(body).mass.mean())
+    return 10 ** float(rng.uniform(0, 1)) * 0.5 * mass * speed**2 / DHAT**2
+
+
+def drawn(number: int) -> Scene:
+    """Scene `number` of the seed: every third falls on a floor, or meets another body."""
+    rng = np.random.default_rng((SEED, number))
+    kind, body = _body(rng)
+    young, poisson = float(10 ** rng.uniform(3.5, 8.5)), float(rng.uniform(0.1, 0.47))
+    material: dict[str, Any] = {"young": young, "poisson": poisson}
+    contact = ("none", "none", "floor", "none", "none", "pairs")[number % 6]
+    size = float(np.ptp(body.points, axis=0).max())
+    # some swings of the slowest kind, as far as it is known beforehand
+    wave = size / np.sqrt(young / 1000.0)
+    duration = float(np.clip(rng.uniform(4, 20) * wave, 0.02, 0.4))
+    if contact == "none":
+        pinned = body.points[:, 0] < body.points[:, 0].min() + 1e-6
+        turn = bool(rng.integers(2)) and kind in ("blob", "box")
+        model = dv.Model(body, pinned=None if turn else pinned)
+        v = torch.zeros_like(model.rest_points)
+        if turn:  # free: it spins and quivers
+            arm = model.rest_points - model.rest_points.mean(0)
+            v = torch.linalg.cross(torch.tensor(rng.standard_normal(3) * 10).expand_as(arm), arm) + 2.0 * arm
+    elif contact == "floor":
+        speed, low = float(rng.uniform(0.5, 2.0)), body.points[:, 1].min()
+        floor = dv.FloorBarrier(low - 0.01, kappa=_kappa(rng, body, speed), dhat=DHAT)
+        model = dv.Model(body, energies=(dv.StableNeoHookean(), floor))
+        v = torch.zeros_like(model.rest_points)
+        v[:, 1] = -speed
+        duration = 0.1
+    else:
+        other = body.translate((0.004 + float(np.ptp(body.points[:, 0])), 0.007, 0.003))
+        speed = float(rng.uniform(0.3, 1.5))
+        pairs = dv.PairBarrier(kappa=_kappa(rng, body, speed), dhat=DHAT)
+        model = dv.Model(mesh.join([body, other]), energies=(dv.StableNeoHookean(), pairs))
+        v = torch.zeros_like(model.rest_points)
+        v[: body.num_vertices, 0] = speed
+        material["gravity"] = (0.0, 0.0, 0.0)
+        duration = 0.06
+    vertices = model.num_vertices
+    return Scene(f"{number}: {kind}, {vertices} vertices, {young:.1g} Pa, {contact}", model, v, duration, material)
+
 
 ERRORS = (0.1, 0.01, 0.001)
 SCENES, GRADIENTS, EXHAUSTIVE = 30, 12, 12  # of the drawn scenes, from the first
@@ -32,210 +189,104 @@ Row = dict[str, Any]
 SWEEPS: list[tuple[dict[str, Any], tuple[int, ...]]] = [
     ({}, (5, 10, 20, 40)),
     ({"relaxation": 1.6}, (10, 20, 40)),
-    ({"relaxation": 1.5, "coarse": "auto"}, (2, 5, 8)),
+    ({"relaxation": 1.5, "subspace": "coarse"}, (2, 5, 8)),
 ]
 GRID = [
-    dv.Settings(1.0, k, scheme, **options)
+    dv.VBD(1.0, k, integrator=scheme, **options)
     for scheme in (dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2())
     for options, counts in SWEEPS
     for k in counts
 ]
 
 
-def pilots(scene: Scene, gradient: bool = False) -> Pilots:
-    state = scene.model.rest_points, scene.v
-    return pilots_of(dv.rollout, scene.model, *state, scene.duration, None, gradient, scene.given)
+# --- the promise ------------------------------------------------------------------------------------------------------
 
 
-def exact(runs: Pilots, settings: dv.Settings) -> tuple[Pilot, float]:
-    """A run of much smaller steps and many more sweeps than those settings, and how far one of half of them is off."""
-    steps = FRAMES * math.ceil(settings.steps(runs.duration) / FRAMES)
-    sweeps = 40 if settings.coarse is None else 5 * settings.sweeps
-    fine = replace(settings, sweeps=sweeps, integrator=dv.SDIRK2(), relaxation=1.5 if settings.coarse else 1.0)
-    factor = 8
-    a, b = runs.run(fine, factor // 2 * steps), runs.run(fine, factor * steps)
-    return b, distance(runs, a, b)
-
-
-def distance(runs: Pilots, a: Pilot, b: Pilot) -> float:
-    if a.x is None or b.x is None:
-        return math.inf
-    apart = [runs.apart(a.x, b.x)]
-    for u, w in zip(a.gradient, b.gradient, strict=True):
-        apart.append(float((u - w).norm() / w.norm()))
-    return max(apart)
-
-
-def asked(scene: Scene, error: float, gradient: bool) -> tuple[Row, dv.Settings, Pilot | None]:
-    s = dv.advise(scene.model, scene.model.rest_points, scene.v, duration=scene.duration, error=error,
-                  gradient=gradient, patience=PATIENCE, **scene.given)  # fmt: skip
-    told = s.predicted
-    assert told is not None
+def advised(scene: Scene, error: float, gradient: bool, patience: float) -> tuple[dv.VBD, Row]:
+    """What is advised, and what is said of it."""
+    found = dv.advise(scene.model, scene.model.rest_points, scene.v, duration=scene.duration, error=error,
+                      gradient=gradient, time_budget=patience, **scene.given)  # fmt: skip
+    told = found.prediction
     row: Row = {"scene": scene.name, "asked": error, "gradient": gradient, "reached": told.reached,
-                "settings": str(replace(s, predicted=None)), "predicted": told.error, "true": None, "unsure": None,
-                "ms": 1e3 * told.seconds, "cost": told.cost, "spent": told.spent,
-                "why": "" if told.reached else told.why}  # fmt: skip
-    if not told.reached:
-        return row, s, None
-    runs = pilots(scene, gradient)
-    truth, row["unsure"] = exact(runs, s)
-    row["true"] = distance(runs, runs.run(s, s.steps(scene.duration)), truth)
-    return row, s, truth
+                "settings": str(replace(found, prediction=None)), "predicted": told.error, "ms": 1e3 * told.seconds,
+                "cost": told.cost, "spent": told.spent, "why": "" if told.reached else told.why}  # fmt: skip
+    return found, row
 
 
-def best(scene: Scene, error: float, advised: dv.Settings, truth: Pilot) -> Row:
-    """The fastest settings of the grid that keep the error, each with the fewest steps that do, to a factor of 1.4."""
-    runs = pilots(scene)
-    own = min(runs.run(advised, advised.steps(scene.duration)).seconds for _ in range(3))
-    least, name = math.inf, ""
-    for settings in GRID:
-        if scene.model.touches and (settings.coarse is not None or settings.relaxation > 1):
+def exact(runs: Runs, solver: dv.VBD) -> tuple[Run, float]:
+    """A run of much smaller steps and many more sweeps than those solver, and how far one of half of them is off."""
+    steps = 4 * FRAMES * math.ceil(solver.steps(runs.scene.duration) / FRAMES)
+    sweeps = 40 if solver.coarse is None else 5 * solver.sweeps
+    fine = replace(solver, sweeps=sweeps, integrator=dv.SDIRK2(), relaxation=1.5 if solver.coarse else 1.0)
+    a, b = runs.run(fine, steps), runs.run(fine, 2 * steps)
+    return b, max(runs.apart(a, b))
+
+
+def asked(scene: Scene, error: float, gradient: bool) -> tuple[Row, dv.VBD, Run | None]:
+    solver, row = advised(scene, error, gradient, PATIENCE)
+    if not row["reached"]:
+        return row, solver, None
+    runs = Runs(scene, gradient)
+    truth, row["unsure"] = exact(runs, solver)
+    row["true"] = max(runs.apart(runs.run(solver, solver.steps(scene.duration)), truth))
+    return row, solver, truth
+
+
+def best(scene: Scene, error: float, own: dv.VBD, truth: Run) -> Row:
+    """The fastest solver of the grid that keep the error, each with the fewest steps that do, to a factor of 1.4."""
+    runs = Runs(scene)
+    seconds = min(runs.run(own, own.steps(scene.duration)).seconds for _ in range(3))
+    least, name = math.inf, "the advised"
+    for solver in GRID:
+        if scene.model.touches and (solver.coarse is not None or solver.relaxation > 1):
             continue
         steps = float(FRAMES)
         while steps < 2**14:
-            run = runs.run(settings, FRAMES * round(steps / FRAMES))
-            if run.seconds > min(own, least):
+            run = runs.run(solver, FRAMES * round(steps / FRAMES))
+            if run.seconds > min(seconds, least):
                 break
-            if distance(runs, run, truth) <= error:
-                seconds = min([run.seconds, *(runs.run(settings, run.steps).seconds for _ in range(2))])
-                if seconds < least:
-                    least, name = seconds, str(run.settings)
+            if runs.apart(run, truth)[0] <= error:
+                least, name = run.seconds, f"{replace(solver, time_step=scene.duration / run.steps)}"
                 break
             steps *= 1.4
-    return {"ms": 1e3 * own, "best_ms": 1e3 * min(own, least), "best": name or "the advised"}
+    return {"ms": 1e3 * seconds, "best_ms": 1e3 * min(seconds, least), "best": name}
 
 
 def kept_of(number: int, quick: bool) -> list[Row]:
     """The rows of one scene."""
     rows, scene = [], drawn(number)
-    for error in ERRORS[:1] if quick else ERRORS:
-        row, settings, truth = asked(scene, error, False)
+    for error in ERRORS[: 1 if quick else None]:
+        row, solver, truth = asked(scene, error, False)
         compare = truth is not None and number < EXHAUSTIVE and error == 0.01
-        rows.append(row | (best(scene, error, settings, truth) if compare and truth is not None else {}))
+        rows.append(row | (best(scene, error, solver, truth) if compare and truth is not None else {}))
     if number < GRADIENTS and not quick:
         rows.append(asked(scene, 0.01, True)[0])
-    print(f"scene {number}", file=sys.stderr, flush=True)
     return rows
 
 
-def kept(quick: bool) -> list[Row]:
-    found = dict(common.side_by_side(kept_of, range(2 if quick else SCENES), quick, at_once=not quick))
+def kept(card: Card) -> list[Row]:
+    numbers = range(2 if card.quick else SCENES)
+    found = dict(common.side_by_side(kept_of, numbers, card.quick, at_once=not card.quick))
     return [row for number in sorted(found) for row in found[number]]
 
 
-def beam(quick: bool) -> list[Row]:
-    """The cantilever of docs/numerics.md to 0.1 %, beside the fastest implicit Euler, coarse corrections included."""
-    body = (
-        dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15), split="kuhn")
-        if quick
-        else dv.mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
-    )
-    model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
-    scene = Scene("cantilever of 0.6 m, 1e5 Pa", model, torch.zeros_like(model.rest_points), 0.4,
-                  {"mu": 1e5, "lam": 2e5})  # fmt: skip
-    return [against_euler(scene, 0.02 if quick else 0.001)]
+def is_kept(row: Row) -> bool:
+    return row["reached"] and row["true"] <= row["asked"]
 
 
-def drop(quick: bool) -> list[Row]:
-    """A bunny dropped for 0.3 s on a floor, to 10 % and 1 %."""
-    body = dv.mesh.blob(4, 1, 0.1) if quick else dv.mesh.bunny(9, 0.2)
-    body = body.translate((0, 0.05 - body.points[:, 1].min(), 0))
-    model = dv.Model(body, energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3, dhat=DHAT_OF_DROP)))
-    scene = Scene("bunny dropped 5 cm, 0.3 s", model, torch.zeros_like(model.rest_points), 0.02 if quick else 0.3,
-                  {"young": 5e4, "poisson": 0.3})  # fmt: skip
-    return [against_euler(scene, error) for error in ((0.1,) if quick else (0.1, 0.01))]
-
-
-DHAT_OF_DROP = 2e-3  # [m]
-
-
-def against_euler(scene: Scene, error: float) -> Row:
-    row, settings, truth = asked(scene, error, False)
-    row |= {"euler_ms": None, "euler": None}
-    if truth is None:
-        return row
-    runs = pilots(scene)
-    row["ms"] = 1e3 * min(runs.run(settings, settings.steps(scene.duration)).seconds for _ in range(3))
-    least, name, began = math.inf, "", time.perf_counter()
-    for option in (o for o in GRID if isinstance(o.integrator, dv.ImplicitEuler)):
-        steps = 4.0 * FRAMES
-        while time.perf_counter() - began < 300:
-            run = runs.run(option, FRAMES * round(steps / FRAMES))
-            if run.seconds > least:
-                break
-            if distance(runs, run, truth) <= error:
-                least, name = run.seconds, str(run.settings)
-                break
-            steps *= 1.5
-    return row | {"euler_ms": 1e3 * least, "euler": name}
-
-
-GROUPS = {"kept": kept, "beam": beam, "drop": drop, "fit": fit}
-
-
-def run(quick: bool, only: str | None = None, out: Path | None = None) -> dict[str, Any]:
-    chosen = list(GROUPS) if only is None else [name.strip() for name in only.split(",")]
-    if unknown := [name for name in chosen if name not in GROUPS]:
-        raise ValueError(f"only: expected groups among {', '.join(GROUPS)}, got {', '.join(unknown)}")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    environment = common.environment()
-    results = common.earlier(None if out is None else out / "advice.json", quick, environment["device"])
-    try:
-        for name in chosen:
-            results[name] = {"rows": GROUPS[name](quick), **common.stamp(environment)}
-            if out is not None:
-                common.write("advice", results, out, quick=quick)
-    finally:
-        torch.set_num_threads(threads)
-    return {name: results[name] for name in GROUPS if name in results}
-
-
-def shares(rows: list[Row]) -> list[tuple[Any, ...]]:
-    """Of each wanted error: how many scenes reach it, keep it, are not far below it, and what the advice cost."""
-    out = []
-    for gradient in (False, True):
-        for error in ERRORS:
-            found = [r for r in rows if r["asked"] == error and r["gradient"] == gradient]
-            told = [r for r in found if r["reached"]]
-            if not told:
-                continue
-            within = sum(r["true"] <= error for r in told)
-            near = sum(r["true"] >= error / 20 for r in told)
-            long = [r["cost"] for r in told if r["spent"] > 0.5]
-            out.append((error, gradient, len(found), len(told), within, near, max(long, default=None)))
-    return out
-
-
-def markdown(results: dict[str, Any]) -> str:
-    text = []
-    if "kept" in results:
-        rows = results["kept"]["rows"]
-        header = ("asked", "gradients too", "scenes", "said it can be had", "true error at most that",
-                  "at least a twentieth", "largest cost [rollouts]")  # fmt: skip
-        text += ["## Scenes drawn by a seed\n", markdown_table(header, shares(rows))]
-        compared = [r for r in rows if r.get("best_ms") and r["ms"] > 1e3 * FEWEST]
-        if compared:
-            twice = sum(r["ms"] <= 2 * r["best_ms"] for r in compared)
-            text.append(
-                f"Within twice the best time of the grid: {twice} of {len(compared)} that take {FEWEST} s or more.\n"
-            )
-        keys = ("scene", "asked", "gradient", "settings", "predicted", "true", "unsure", "ms", "best_ms", "best",
-                "cost", "why")  # fmt: skip
-        header = ("scene", "asked", "gradients", "settings", "predicted", "true error", "of which unsure", "ms",
-                  "best of the grid [ms]", "its settings", "cost", "why not")  # fmt: skip
-        text.append(markdown_table(header, ([row.get(key) for key in keys] for row in rows)))
-    for name in ("beam", "drop"):
-        if name in results:
-            keys = ("scene", "asked", "settings", "true", "ms", "euler_ms", "euler", "cost", "why")
-            header = ("scene", "asked", "advised", "true error", "ms", "implicit Euler [ms]", "its settings", "cost",
-                      "why not")  # fmt: skip
-            rows = results[name]["rows"]
-            text += [f"## {name}\n", markdown_table(header, ([row.get(key) for key in keys] for row in rows))]
-    if "fit" in results:
-        keys = ("fit", "young", "poisson", "left", "evaluations", "seconds", "over_first")
-        header = ("fit of E = 50,000 Pa, nu = 0.3", "E [Pa]", "nu", "left of the shapes", "evaluations", "s",
-                  "over the first")  # fmt: skip
-        rows = results["fit"]["rows"]
-        text += ["## fit\n", markdown_table(header, ([row.get(key) for key in keys] for row in rows))]
-    return "\n".join(text)
+THREADS = 1
+GROUPS = {"kept": kept}
+SHARES: dict[str, Any] = {
+    "scenes": count(), "said that it can be had": count("reached"), "true error at most that": count(is_kept),
+    "at least a twentieth": count(lambda row: row["reached"] and row["true"] >= row["asked"] / 20),
+    "largest cost [rollouts]": most("cost"),
+}  # fmt: skip
+TABLES = (
+    Table("Scenes drawn by a seed, by the error that is asked", "kept", SHARES, by="asked",
+          only=lambda row: not row["gradient"]),
+    Table("The same, gradients too", "kept", SHARES, by="asked", only=lambda row: row["gradient"]),
+    Table("Beside the best of a grid", "kept",
+          {"scene": "scene", "asked": "asked", "advised": "settings", "true error": "true", "unsure": "unsure",
+           "ms": "ms", "best of the grid [ms]": "best_ms", "its settings": "best"},
+          only=lambda row: row.get("best_ms")),
+)  # fmt: skip

@@ -1,15 +1,13 @@
-"""Speed and memory of the CPU backend: throughput, scaling, unrolled autograd, Model building, what a scene pays.
+"""Speed and memory of the CPU backend: throughput, scaling, Model building, what a scene pays.
 
 Times are the least of several repetitions, wall clock, of the public interface, predictor and checks included.
 """
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
+import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,31 +15,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
-from diffvbd import reference
-
-
-def run(quick: bool) -> dict[str, Any]:
-    threads = torch.get_num_threads()
-    try:
-        return {
-            "throughput": throughput(5 if quick else 11, 20, quick),
-            "scaling": scaling(9 if quick else 31, threads, quick),
-            "unrolled": unrolled(quick, threads),
-            "building": building(quick),
-            "requirements": requirements(5 if quick else 11, quick),
-        }
-    finally:
-        torch.set_num_threads(threads)
-
-
-def least(function: Callable[[], float], repetitions: int) -> float:
-    """The least of what a function returns; garbage of one run does not count in the next."""
-    best = float("inf")
-    for _ in range(repetitions):
-        gc.collect()
-        best = min(best, function())
-    return best
+from bench.measure import Card, kept_bytes, least
+from bench.tables import Table, times
 
 
 def clamped_cube(
@@ -68,8 +43,8 @@ def time_step(
     for group in wants:
         given.update({k: t.requires_grad_() for k, t in leaf[group].items()})
     start = time.perf_counter()
-    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), time_step=5e-3, sweeps=sweeps,
-                           adjoint=dv.ReverseSweep(tape), **given)  # type: ignore[arg-type]  # fmt: skip
+    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), dv.VBD(5e-3, sweeps, tape=tape),
+                           **given)  # type: ignore[arg-type]  # fmt: skip
     middle = time.perf_counter()
     if wants:
         (x_end.sum() + v_end.sum()).backward()
@@ -128,80 +103,6 @@ def scaling(n: int, threads: int, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def _beam_rollout(route: str, steps: int, threads: int) -> tuple[float, float]:
-    """Seconds of forward + backward, and growth of the peak resident memory [bytes], in a process of its own."""
-    torch.set_num_threads(threads)
-    mesh = dv.mesh.beam(21, 7, 7, size=(0.5, 0.2, 0.2), split="kuhn")
-    model = dv.Model(mesh, pinned=torch.from_numpy(mesh.points[:, 0] < 1e-9))
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-
-    def once(steps: int) -> None:
-        mu = torch.tensor(1e5, dtype=torch.float64, requires_grad=True)
-        given: dict[str, Any] = {"steps": steps, "mu": mu, "lam": 1e6, "time_step": 2e-3, "sweeps": 15}
-        if route == "unrolled":
-            end = reference.rollout(model, x, v, **given).x[-1]
-        else:
-            end = dv.rollout(model, x, v, **given, adjoint=dv.ReverseSweep(route), checkpoint_every=None).x[-1]  # type: ignore[arg-type]
-        end.square().sum().backward()
-        assert mu.grad is not None and mu.grad != 0
-
-    once(1)  # libraries, thread pool and allocator are warm
-    gc.collect()
-    before = reset_peak_memory()
-    start = time.perf_counter()
-    once(steps)
-    seconds = [time.perf_counter() - start]
-    growth = peak_memory() - before
-    for _ in range(0 if route == "unrolled" else 9):
-        start = time.perf_counter()
-        once(steps)
-        seconds.append(time.perf_counter() - start)
-    return min(seconds), float(growth)
-
-
-def reset_peak_memory() -> int:
-    """Resident bytes now; from here on the kernel counts the peak anew (Linux)."""
-    Path("/proc/self/clear_refs").write_text("5")
-    return _status("VmRSS")
-
-
-def peak_memory() -> int:
-    return _status("VmHWM")
-
-
-def _status(field: str) -> int:
-    line = next(a for a in Path("/proc/self/status").read_text().splitlines() if a.startswith(field))
-    return int(line.split()[1]) * 1024
-
-
-def unrolled(quick: bool, threads: int) -> list[dict[str, Any]]:
-    """Both routes on the same forward, with the same number of threads, each in a process of its own."""
-    steps = 2 if quick else 10
-    results = {}
-    for route in ("unrolled", "full", "compact"):
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            results[route] = pool.apply(_beam_rollout, (route, steps, threads))
-    name = f"1,029-vertex beam, K = 15, {steps} steps, {threads} cores"
-    rows = []
-    for route, (seconds, growth) in results.items():
-        label = "unrolled autograd" if route == "unrolled" else f"reverse sweep, {route} tape"
-        rows.append(
-            {"name": f"{name}: {label}", "unit": "ms forward + backward", "value": seconds * 1e3, "target": None}
-        )
-        rows.append(
-            {"name": f"{name}: {label}, growth of peak memory", "unit": "MB", "value": growth / 1e6, "target": None}
-        )
-    theirs, theirs_bytes = results["unrolled"]
-    for route in ("full", "compact"):
-        ours, ours_bytes = results[route]
-        rows.append(
-            {"name": f"{name}: {route} tape, less time", "unit": "times", "value": theirs / ours, "target": 80.0}
-        )
-        rows.append({"name": f"{name}: {route} tape, less memory", "unit": "times",
-                     "value": theirs_bytes / max(ours_bytes, 1), "target": 70.0})  # fmt: skip
-    return rows
-
-
 def building(quick: bool) -> list[dict[str, Any]]:
     rows = []
     for n in (10, 20) if quick else (15, 30, 59):
@@ -250,36 +151,25 @@ def requirements(n: int, quick: bool) -> list[dict[str, Any]]:
                 "name": f"{label}, gradients: {' + '.join(wants) or 'none'}",
                 "forward_ms": forward * 1e3,
                 "backward_ms": None if backward is None else backward * 1e3,
-                "kept_bytes": kept_bytes(model, x, sweeps, wants),
+                "kept_bytes": kept_bytes(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)),
             })  # fmt: skip
     return rows
 
 
-def kept_bytes(model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...]) -> int:
-    """Bytes of distinct storages that one step keeps for its backward, the Model's own and the arguments left out."""
-    own = {
-        t.untyped_storage().data_ptr() for t in (*vars(model).values(), *model._topology, x) if isinstance(t, Tensor)
-    }
-    kept: dict[int, int] = {}
-
-    def pack(t: Tensor) -> Tensor:
-        if t.untyped_storage().data_ptr() not in own:
-            kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
-        return t.detach()  # an output that keeps itself would never be freed
-
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
-        time_step(model, x, sweeps, wants)
-    return sum(kept.values())
+def _threads() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def markdown(results: dict[str, Any]) -> str:
-    rows = [r for part in ("throughput", "scaling", "unrolled", "building") for r in results[part]]
-    text = markdown_table(
-        ("what", "measured", "target", "unit"), [(r["name"], r["value"], r["target"], r["unit"]) for r in rows]
-    )
-    cells = [
-        (r["name"], f"{r['forward_ms']:.2f}", "-" if r["backward_ms"] is None else f"{r['backward_ms']:.2f}",
-         f"{r['kept_bytes'] / 1e6:.2f}")
-        for r in results["requirements"]
-    ]  # fmt: skip
-    return text + "\n" + markdown_table(("one step, K = 10", "forward [ms]", "backward [ms]", "kept [MB]"), cells)
+THREADS = 1
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    "throughput": lambda card: throughput(5 if card.quick else 11, 20, card.quick),
+    "scaling": lambda card: scaling(9 if card.quick else 31, _threads(), card.quick),
+    "building": lambda card: building(card.quick),
+    "requirements": lambda card: requirements(5 if card.quick else 11, card.quick),
+}
+COLUMNS = {"what": "name", "measured": "value", "target": "target", "unit": "unit"}
+TABLES = (
+    *(Table(name.capitalize(), name, COLUMNS) for name in ("throughput", "scaling", "building")),
+    Table("One step, K = 10", "requirements", {"gradients": "name", "forward [ms]": "forward_ms",
+                                               "backward [ms]": "backward_ms", "kept [MB]": times("kept_bytes", 1e-6)}),
+)  # fmt: skip

@@ -1,9 +1,9 @@
 """Error of each backward route against autograd through the executed sweeps, over sweeps K, meshes and scenes.
 
-The scene. A body of about 1 m with the paper's preset (`dv.Model.paper`: block "paper", saturation 0.1 m,
-regularization 1e-6 kg), 1000 kg/m^3, under gravity, held where x lies in the lowest tenth of the body. It starts
-twisted about its long axis by 1 rad from end to end, turning by another 5 rad/s, with uniform noise of `speed` on every
-component of the velocities, so that one sweep leaves it far from stationary. Two materials at h = 10 ms:
+The scene. A body of about 1 m with the paper's preset (`dv.VBD.paper`: block "paper", saturation 0.1 m, regularization
+1e-6 kg), 1000 kg/m^3, under gravity, held where x lies in the lowest tenth of the body. It starts twisted about its
+long axis by 1 rad from end to end, turning by another 5 rad/s, with uniform noise of `speed` on every component of the
+velocities, so that one sweep leaves it far from stationary. Two materials at h = 10 ms:
 
 * preset: mu = lam = 1e4 Pa, noise of 5 m/s; what `python -m bench cost` measures, too;
 * soft: mu = 2e3 Pa, lam = 1e3 Pa, so that inertia dominates; noise of 10 m/s, so that one sweep still falls short.
@@ -12,6 +12,13 @@ The gradient is that of a fixed random linear function of the end state (`testin
 errors are max |difference| / max |reference|, the larger of the two. The reference is autograd through
 `diffvbd.reference` on the CPU. Unrolled autograd is `dv.Unrolled()`, the same code on the device of the run: its error
 says only that the package's interface changes nothing, and what another device rounds differently.
+
+Residuals are norms of grad G over unpinned vertices in the h^2-scaled form [kg m], at the executed end of the worst
+step; relative ones are to the norm where the sweeps start. Both global routes solve by conjugate gradients to 1e-13,
+and their iterations are those of the longest solve. The paper publishes neither material nor initial state of its
+scene, so that only the course of its figures can agree: the reverse sweep at rounding level for every K, the global
+routes off by tens of per cent at K = 1 and better as the residual falls. A bar is max(5e-15, 10 x spread), where spread
+is the disagreement of two references that sum in another order.
 """
 
 from __future__ import annotations
@@ -28,7 +35,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import paper
-from bench.common import markdown_table
+from bench.tables import Table
 from diffvbd import reference, testing
 
 SWEEPS = (1, 5, 20)
@@ -74,8 +81,8 @@ class Scene:
     def options(self, sweeps: int) -> dict[str, Any]:
         c = self.case
         gravity = torch.tensor([c.amount * g for g in GRAVITY], dtype=self.x.dtype, device=self.x.device)
-        return {"steps": c.steps, "mu": c.mu, "lam": c.lam, "time_step": c.time_step, "sweeps": sweeps,
-                "gravity": gravity}  # fmt: skip
+        solver = dv.VBD.paper(c.time_step, sweeps, tape="full")
+        return {"solver": solver, "steps": c.steps, "mu": c.mu, "lam": c.lam, "gravity": gravity}
 
     def to(self, device: str) -> Scene:
         return Scene(self.case, self.model.to(device), self.x.to(device), self.v.to(device))
@@ -109,7 +116,7 @@ def build(case: Case, device: str = "cpu") -> Scene:
     spin = 5.0 * along[:, None] * np.stack([0 * along, -arm[:, 2], arm[:, 1]], -1)
     noise = testing.generator("exactness", case.kind, case.size).uniform(-1.0, 1.0, points.shape)
     v = np.where(pinned[:, None], 0.0, case.amount * (spin + case.speed * noise))
-    model = dv.Model.paper(mesh, pinned=pinned)
+    model = dv.Model(mesh, pinned=pinned)
     return Scene(case, model, torch.from_numpy(x), torch.from_numpy(v)).to(device)
 
 
@@ -134,27 +141,17 @@ class Solves:
                 "converged": all(bool(report.converged) for report in self.reports)}  # fmt: skip
 
 
-def reverse_sweep(solves: Solves | None, tolerance: float) -> Any:
-    return dv.ReverseSweep("full")
+def global_route(assembled: bool) -> Callable[[Solves | None, float], Any]:
+    return lambda solves, tolerance: dv.GlobalAdjoint(assembled=assembled, tolerance=tolerance, on_failure="warn",
+                                                      report=solves)  # fmt: skip
 
 
-def unrolled(solves: Solves | None, tolerance: float) -> Any:
-    return dv.Unrolled()
-
-
-def assembled(solves: Solves | None, tolerance: float) -> Any:
-    return dv.GlobalAdjoint(assembled=True, tolerance=tolerance, on_failure="warn", report=solves)
-
-
-def matrix_free(solves: Solves | None, tolerance: float) -> Any:
-    return dv.GlobalAdjoint(assembled=False, tolerance=tolerance, on_failure="warn", report=solves)
-
-
+# Adjoints by the collector of their solves and the tolerance of these
 ROUTES: dict[str, Callable[[Solves | None, float], Any]] = {
-    OURS: reverse_sweep,
-    UNROLLED: unrolled,
-    GLOBAL[0]: assembled,
-    GLOBAL[1]: matrix_free,
+    OURS: lambda solves, tolerance: dv.ReverseSweep(),
+    UNROLLED: lambda solves, tolerance: dv.Unrolled(),
+    GLOBAL[0]: global_route(True),
+    GLOBAL[1]: global_route(False),
 }
 
 
@@ -165,7 +162,7 @@ def end_of(scene: Scene, sweeps: int, adjoint: Any, x: Tensor, v: Tensor) -> tup
 
 
 def inputs_of(scene: Scene) -> dict[str, Any]:
-    return {"x": scene.x, "v": scene.v, "time_step": scene.case.time_step}
+    return {"x": scene.x, "v": scene.v}
 
 
 def expected_of(scene: Scene, sweeps: int) -> dict[str, Tensor]:
@@ -173,22 +170,22 @@ def expected_of(scene: Scene, sweeps: int) -> dict[str, Tensor]:
     here = scene.to("cpu")
     options = here.options(sweeps)
 
-    def run(x: Tensor, v: Tensor, time_step: float) -> tuple[Tensor, Tensor]:
+    def run(x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         done = reference.rollout(here.model, x, v, **options)
         return done.x[-1], done.v[-1]
 
-    return testing.evaluate(run, inputs_of(here))
+    return testing.evaluate(run, inputs_of(here), here.case.time_step)
 
 
 def result_of(scene: Scene, sweeps: int, adjoint: Any) -> dict[str, Tensor]:
     """End state and gradients by one of the package's routes."""
 
-    def run(x: Tensor, v: Tensor, time_step: float) -> tuple[Tensor, Tensor]:
+    def run(x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         return end_of(scene, sweeps, adjoint, x, v)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a solve that fails is a column of the tables
-        return testing.evaluate(run, inputs_of(scene))
+        return testing.evaluate(run, inputs_of(scene), scene.case.time_step)
 
 
 def forward_error(got: dict[str, Tensor], expected: dict[str, Tensor], time_step: float) -> float:
@@ -297,12 +294,13 @@ def _worst_over_sweeps(scene: Scene, quick: bool) -> Row:
     found = []
     for k in SWEEPS[:1] if quick else SWEEPS:
         expected = expected_of(scene, k)
-        got, other = (result_of(scene, k, adjoint) for adjoint in (dv.ReverseSweep("full"), dv.Unrolled()))
+        got, other = (result_of(scene, k, adjoint) for adjoint in (dv.ReverseSweep(), dv.Unrolled()))
         forward = max(verify_forward(scene, g, expected, r) for g, r in ((got, OURS), (other, UNROLLED)))
         here = scene.to("cpu")
-        options = {name: value for name, value in here.options(k).items() if name not in ("steps", "sweeps")}
-        inputs = {"x": here.x, "v": here.v, **options}
-        spread = max(testing.spread(here.model, inputs, k, scene.case.steps)[f"grad_{name}"] for name in "xv")
+        options = here.options(k)
+        inputs = {"x": here.x, "v": here.v, **{name: options[name] for name in ("mu", "lam", "gravity")}}
+        spreads = testing.spread(here.model, inputs, options["solver"], scene.case.steps)
+        spread = max(spreads[f"grad_{name}"] for name in "xv")
         found.append({"sweeps": k, "forward": forward, "error": gradient_error(got, expected),
                       "unrolled_error": gradient_error(other, expected), "spread": spread, "bar": scaled_bar(spread),
                       "update": _largest_update(scene)})  # fmt: skip
@@ -316,79 +314,32 @@ def scaled_bar(spread: float) -> float:
 
 def _largest_update(scene: Scene) -> float:
     """Longest way of a vertex in the first sweep [m]."""
-    options = {name: value for name, value in scene.options(1).items() if name != "steps"}
     with torch.no_grad():
-        ends = [dv.step(scene.model, scene.x, scene.v, **{**options, "sweeps": k})[0] for k in (0, 1)]
+        ends = [dv.rollout(scene.model, scene.x, scene.v, **scene.options(k) | {"steps": 1}).x[-1] for k in (0, 1)]
     return float((ends[1] - ends[0]).norm(dim=-1).max())
 
 
-# --- text -------------------------------------------------------------------------------------------------------------
-
-DIFFERENCE = """\
-The paper's figures stand under their K for orientation only: it publishes neither material nor initial state of its
-scene, and its Delaunay mesh is another one of the same size, so residuals and errors of the global routes differ with
-the scene. What must agree is their course: the reverse sweep at rounding level for every K, the global routes off by
-tens of per cent at K = 1 and better as the residual falls. How near they come at K = 20 depends on how tightly their
-systems are solved.
-"""
+# --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def markdown(results: dict[str, Any]) -> str:
-    first = results["scenes"]["preset"][0]
-    everything = [*(row for rows in results["scenes"].values() for row in rows), *results["meshes"]]
-    forward = max(row["forward"] for row in [*everything, *results["axes"]])
-    text = (
-        "Relative gradient error against autograd through the executed sweeps, max over x0 and v0, after a rollout "
-        f"of {first['steps']} steps of {first['mesh']}. Before any gradient, the end state of every route was "
-        f"compared with the reference's; the largest difference of all is {forward:.1e}, relative. The residual is "
-        "the norm of grad G over unpinned vertices, in the h^2-scaled form [kg m], at the executed end of the worst "
-        "step; *relative*: to that norm where the sweeps start. Both global routes solve by conjugate gradients to "
-        f"{TIGHT:g}; *iterations* are those of the longest solve. {_of_unrolled(everything)} The two global routes "
-        f"disagree by {max(row['global_difference'] for row in everything):.1e} at most (paper: "
-        f"{paper.GLOBAL_DIFFERENCE:g}).\n"
-    )
-    for name, rows in results["scenes"].items():
-        material = f"mu = {rows[0]['mu']:g} Pa, lam = {rows[0]['lam']:g} Pa, h = {rows[0]['time_step']:g} s"
-        text += f"\n## The {name} scene: {material}\n\n" + _table(rows, compare=name == "preset")
-        if name == "preset":
-            text += "\n" + DIFFERENCE
-    text += "\n## The preset scene on other meshes\n\n" + _table(results["meshes"], with_mesh=True)
-    worst = max(row["error"] for row in results["axes"])
-    text += "\n## The exact routes along the axes of the paper\n\n"
-    text += (
-        "One thing is changed at a time, from the preset scene; each row is the K of 1, 5, 20 with the largest "
-        "error of the reverse sweep. *Bar*: max(5e-15, 10 x spread), where spread is the disagreement of two "
-        f"references that sum in another order. Worst of the reverse sweep: {worst:.1e}; the paper's worst: "
-        f"{paper.WORST_OF_ALL_AXES:.1e}.\n\n"
-    )
-    header = ("axis", "value", "mesh", "largest first update [m]", "K", OURS, UNROLLED, "spread", "bar")
-    keys = ("axis", "value", "mesh", "update", "sweeps", "error", "unrolled_error", "spread", "bar")
-    return text + markdown_table(header, [[row[key] for key in keys] for row in results["axes"]])
+def theirs(route: str) -> Callable[[Row], Any]:
+    return lambda row: paper.EXACTNESS.get(row["sweeps"], {}).get(route)
 
 
-def _of_unrolled(rows: list[Row]) -> str:
-    worst = max(row["routes"][UNROLLED]["error"] for row in rows)
-    if worst == 0:
-        return "Unrolled autograd is the reference's own code: its gradients are the reference's to the bit."
-    return f"Unrolled autograd is the reference's own code: its largest error, {worst:.1e}, is rounding."
-
-
-def _table(rows: list[Row], compare: bool = False, with_mesh: bool = False) -> str:
-    header = [*(["mesh"] if with_mesh else []), "K", "residual [kg m]", "relative", *ROUTES, "iterations, assembled",
-              "iterations, matrix-free"]  # fmt: skip
-    lines = []
-    for row in rows:
-        routes = row["routes"]
-        lines.append([
-            *([row["mesh"]] if with_mesh else []), row["sweeps"], row["residual"], row["relative_residual"],
-            *(routes[route]["error"] for route in ROUTES),
-            *(_iterations(routes[route]) for route in GLOBAL),
-        ])  # fmt: skip
-        if compare and row["sweeps"] in paper.EXACTNESS:
-            theirs = paper.EXACTNESS[row["sweeps"]]
-            lines.append([f"{row['sweeps']}, paper", theirs["residual"], None, *map(theirs.get, ROUTES), None, None])
-    return markdown_table(header, lines)
-
-
-def _iterations(route: Row) -> str:
-    return f"{route['iterations']}{'' if route['converged'] else ', not converged'}"
+ERRORS: dict[str, Any] = {route: f"routes/{route}/error" for route in ROUTES}
+ITERATIONS: dict[str, Any] = {f"iterations, {route}": f"routes/{route}/iterations" for route in GLOBAL}
+RESIDUALS: dict[str, Any] = {"K": "sweeps", "residual [kg m]": "residual", "relative": "relative_residual"}
+TABLES = (
+    Table("Gradient error of each route, the {} scene", "scenes/*",
+          {**RESIDUALS, **ERRORS, **ITERATIONS, "the two global routes differ by": "global_difference"}),
+    Table("The paper's figures for its scene, beside the preset's", "scenes/preset",
+          {"K": "sweeps", "residual, paper": theirs("residual"), "residual": "residual",
+           **{f"{route}{who}": of for route in (OURS, *GLOBAL)
+              for who, of in ((", paper", theirs(route)), ("", ERRORS[route]))}}),
+    Table("The preset scene on other meshes", "meshes", {"mesh": "mesh", **RESIDUALS, **ERRORS, **ITERATIONS}),
+    Table("The exact routes along the axes of the paper", "axes",
+          {"axis": "axis", "value": "value", "mesh": "mesh", "largest first update [m]": "update", "K": "sweeps",
+           OURS: "error", UNROLLED: "unrolled_error", "spread": "spread", "bar": "bar"},
+          note=f"One thing is changed at a time; each row is the K with the largest error. The paper's worst error: "
+               f"{paper.WORST_OF_ALL_AXES:.1e}."),
+)  # fmt: skip

@@ -1,16 +1,25 @@
-"""Extreme inputs: is a step finite, does it descend, does its gradient match autograd through the reference?
+"""Extreme inputs: is a step finite, does it descend, does its gradient match; are features of no use without a word?
 
-Every case is one row of `CASES`. The gradient is held against the bar of the exactness tests, max(1e-12, 10 x spread),
-where spread is the disagreement of two references with permuted tets. Beyond the bar the conditioning decides: how far
-the reference's gradient moves when every input moves by one rounding of its largest entry. An error of that size says
-that the gradient has no more digits to give; one beyond it is a fault.
+Elastic cases: the gradient is held against the bar of the exactness tests, max(1e-12, 10 x spread), where spread is the
+disagreement of two references with permuted tets. Beyond the bar the conditioning decides: how far the reference's
+gradient moves when every input moves by one rounding of its largest entry. An error of that size says that the gradient
+has no more digits to give; one beyond it is a fault. Long rollouts: the gradient is held against central differences.
+
+Features: rollouts of 20 steps with coarse corrections, integrators, floors, colliders, pairs and friction, each over
+the extremes of `AXES`. Nothing drives them but gravity, so none may gain energy. A case is *silent* where its end is of
+no use - not finite, with more than 5 % more energy, a gradient that is not finite - and nothing was raised and nothing
+warned of. The gradient of a loss of the end, along a random direction of velocity and stiffness, is held against
+central differences.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import asdict, dataclass
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +27,9 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
-from diffvbd import reference, testing
+from bench.measure import Card
+from bench.tables import Table, count, median, most
+from diffvbd import mesh, reference, testing
 
 EPS = float(np.finfo(np.float64).eps)
 NO_DIGITS = 0.01  # conditioning beyond which a gradient has no digits to compare
@@ -55,6 +65,11 @@ class Extreme:
     regularization: float = 0.0
     floor: bool = False
     quick: bool = False
+
+    @property
+    def solver(self) -> dv.VBD:
+        return dv.VBD(self.time_step, self.sweeps, block=self.block, relaxation=self.relaxation,
+                      saturation=self.saturation, regularization=self.regularization)  # fmt: skip
 
     @property
     def must_descend(self) -> bool:
@@ -157,7 +172,7 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
     mesh = dv.TetMesh(points * case.size, tets)
     points = torch.from_numpy(mesh.points.copy())
     half = torch.from_numpy(mesh.points[mesh.tets].mean(1)[:, 1] > 0.5 * case.size)
-    energies: tuple[Any, ...] = (dv.StableNeoHookean(case.block),)
+    energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
     if case.floor:
         energies += (dv.FloorBarrier(height=-0.05 * case.size, kappa=1e4, dhat=0.04 * case.size, damping=10.0),)
     model = dv.Model(
@@ -165,9 +180,6 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
         density=torch.where(half, case.density * case.mass_contrast, case.density).to(torch.float64),
         pinned=mesh.points[:, 0] < 1e-9 * case.size if case.pinned else None,
         energies=energies,
-        saturation=case.saturation,
-        regularization=case.regularization,
-        relaxation=case.relaxation,
     )
     stiff = torch.where(half, case.contrast, 1.0).to(torch.float64)
     noise = torch.from_numpy(rng.uniform(-1, 1, (2, *mesh.points.shape)))
@@ -178,8 +190,7 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
     x = torch.where(model.pinned[:, None], points, x)
     inputs: dict[str, Any] = {"x": x, "v": v, "mu": case.mu * stiff, "lam": case.lam * stiff, "density": model.density,
                               "rest_points": points, "force": 0.1 * model.mass[:, None] * noise[1],
-                              "gravity": torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64),
-                              "time_step": case.time_step}  # fmt: skip
+                              "gravity": torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)}  # fmt: skip
     return model, inputs
 
 
@@ -217,18 +228,18 @@ def check(case: Extreme) -> dict[str, Any]:
     model, inputs = build(case)
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        trajectory = dv.rollout(model, steps=case.steps, sweeps=case.sweeps, save="last", **options)
+        trajectory = dv.rollout(model, solver=case.solver, steps=case.steps, save="last", **options)
         return trajectory.x[-1], trajectory.v[-1]
 
-    expected = testing.reference_result(model, inputs, case.sweeps, case.steps)
-    spread = testing.spread(model, inputs, case.sweeps, case.steps, expected)
-    got = testing.evaluate(run, inputs)
+    expected = testing.reference_result(model, inputs, case.solver, case.steps)
+    spread = testing.spread(model, inputs, case.solver, case.steps, expected)
+    got = testing.evaluate(run, inputs, case.time_step)
     errors = {k: testing.relative_error(got[k], expected[k]) for k in got if k.startswith("grad_")}
     margin = {k: errors[k] / testing.bar(spread[k]) for k in errors}
     condition = dict.fromkeys(errors, 0.0)
     # one perturbation underestimates the worst by chance: beyond the bar more are tried
     for seed in range(1 if all(m <= 1 for m in margin.values()) else 8):
-        rounded = testing.reference_result(model, _rounded(inputs, seed), case.sweeps, case.steps)
+        rounded = testing.reference_result(model, _rounded(inputs, seed), case.solver, case.steps)
         condition = {k: max(c, testing.relative_error(rounded[k], expected[k])) for k, c in condition.items()}
     beyond = {k: errors[k] / max(testing.bar(spread[k]), 10 * condition[k]) for k in errors}
     worst = max(margin, key=lambda k: margin[k] if math.isfinite(margin[k]) else math.inf)
@@ -260,8 +271,7 @@ def _rounded(inputs: dict[str, Any], seed: int) -> dict[str, Any]:
 def potential_rise(case: Extreme, model: dv.Model, inputs: dict[str, Any]) -> float:
     """Largest rise of the incremental potential from one sweep to the next, in roundings of its terms; without rigid
     corrections, since how much the last one takes off differs from one number of sweeps to the next."""
-    model = model.replace(rigid=False)
-    options = {k: inputs[k] for k in ("mu", "lam", "force", "gravity", "time_step")}
+    options = {k: inputs[k] for k in ("mu", "lam", "force", "gravity")}
     counts = [k for k in (*range(11), 12, 15, 20, 35, 50, 75, 100, 200, 500, 1000) if k <= max(case.sweeps, 5)]
     x, v, h = inputs["x"], inputs["v"], case.time_step
     y = x + h * v + h**2 * (options["gravity"] + options["force"] / model.mass[:, None])
@@ -269,7 +279,7 @@ def potential_rise(case: Extreme, model: dv.Model, inputs: dict[str, Any]) -> fl
     rise, last = 0.0, math.inf
     for k in counts:
         with torch.no_grad():
-            at, _ = dv.step(model, x, v, sweeps=k, **options)
+            at, _ = dv.step(model, x, v, replace(case.solver, sweeps=k, subspace=None), **options)
             value = float(reference.incremental_potential(model, at, y, options["mu"], options["lam"], h, x))
         if not math.isfinite(value):
             return math.inf
@@ -296,19 +306,19 @@ def _rounding_scale(model: dv.Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tens
 
 def check_rollout(case: Rollout) -> dict[str, Any]:
     mesh = dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
-    energies: tuple[Any, ...] = (dv.StableNeoHookean(case.block),)
+    energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
     if case.floor:
         energies += (dv.FloorBarrier(height=-0.2, kappa=1e4, damping=1.0),)
-    options = {"saturation": 0.1, "regularization": 1e-6} if case.block == "paper" else {}
+    make = dv.VBD.paper if case.block == "paper" else dv.VBD
+    solver = make(1 / 60, case.sweeps, relaxation=case.relaxation)
     pinned = None if case.floor else mesh.points[:, 0] < 1e-9
-    model = dv.Model(mesh, pinned=pinned, energies=energies, relaxation=case.relaxation, **options)
+    model = dv.Model(mesh, pinned=pinned, energies=energies)
     x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
     weights = torch.from_numpy(testing.generator("rollout").standard_normal(tuple(x.shape)))
     lowest: list[float] = []
 
     def loss(scale: Tensor, steps: int = case.steps) -> Tensor:
-        trajectory = dv.rollout(model, x, v, steps=steps, mu=1e5 * scale, lam=1.5e5 * scale, time_step=1 / 60,
-                                sweeps=case.sweeps, save="last")  # fmt: skip
+        trajectory = dv.rollout(model, x, v, solver, steps=steps, mu=1e5 * scale, lam=1.5e5 * scale, save="last")
         lowest.append(float(trajectory.x[-1][:, 1].detach().min()))
         return (weights * trajectory.x[-1]).sum()
 
@@ -329,14 +339,6 @@ def check_rollout(case: Rollout) -> dict[str, Any]:
     }
 
 
-def run(quick: bool) -> dict[str, Any]:
-    rollouts = [Rollout("cantilever", 300), Rollout("drop onto a floor", 300, floor=True)] if quick else ROLLOUTS
-    return {
-        "rows": [check(case) for case in CASES if case.quick or not quick],
-        "rollouts": [check_rollout(case) for case in rollouts],
-    }
-
-
 def verdict(row: dict[str, Any]) -> str:
     """One of "ok", "conditioning" (beyond the bar but not beyond that), "no digits" (nothing to compare), "fault"."""
     if row["condition"] > NO_DIGITS:
@@ -348,45 +350,326 @@ def verdict(row: dict[str, Any]) -> str:
     return "conditioning" if row["error_over_condition"] <= 1 else "fault"
 
 
-def markdown(results: dict[str, Any]) -> str:
-    rows = results["rows"]
-    summary = []
-    for axis in dict.fromkeys(row["axis"] for row in rows):
-        group = [row for row in rows if row["axis"] == axis]
-        promised = [row for row in group if row["must_descend"]]
-        summary.append(
-            (
-                axis,
-                len(group),
-                f"{sum(r['finite'] for r in group)}/{len(group)}",
-                f"{sum(r['rise'] <= RISE for r in promised)}/{len(promised)}",
-                f"{sum(r['error_over_bar'] <= 1 for r in group)}/{len(group)}",
-                sum(verdict(r) == "fault" for r in group),
-                float(np.nanmedian([r["gradient_error"] for r in group])),
-                float(np.nanmax([r["gradient_error"] for r in group])),
-                max(r["condition"] for r in group),
-            )
+GAIN = 0.05  # share of the energy that came in, beyond which a result counts as useless
+DIFFERENCES = (1e-5, 1e-7)  # relative steps of central differences; the best one counts
+ALIKE = 1e-3  # error against differences below which a gradient counts as matching them
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Case:
+    """A rollout. Lengths scale with `size`; everything else is absolute."""
+
+    feature: str = ""
+    axis: str = "none"
+    size: float = 0.4  # [m] length of the scene
+    mu: float = 1e5  # [Pa]
+    poisson: float = 0.3
+    contrast: float = 1.0  # stiffness of one half of each body over the other's
+    density: float = 1e3  # [kg/m^3]
+    mass_contrast: float = 1.0
+    time_step: float = 1e-2  # [s]
+    speed: float = 1.0  # [m/s]
+    sweeps: int = 10
+    steps: int = 20
+    single: bool = False  # float32
+    sliver: float = 0.0  # thickness of a layer of tets over that of the others; 0: none
+
+
+AXES: dict[str, dict[str, Any]] = {
+    "none": {},
+    "mu 1e2 Pa": {"mu": 1e2},
+    "mu 1e10 Pa": {"mu": 1e10},
+    "mu 1e10 Pa, K = 1": {"mu": 1e10, "sweeps": 1},
+    "contrast 1e6": {"mu": 1e4, "contrast": 1e6},
+    "nu 0.4999": {"poisson": 0.4999},
+    "h 1e-5 s": {"time_step": 1e-5},
+    "h 1 s": {"time_step": 1.0},
+    "h 1 s, K = 1": {"time_step": 1.0, "sweeps": 1},
+    "size 1e-4 m": {"size": 1e-4, "speed": 2.5e-4},
+    "size 1e3 m": {"size": 1e3, "speed": 2.5e3},
+    "0.01 m/s": {"speed": 0.01},
+    "1000 m/s": {"speed": 1e3},
+    "1000 m/s, K = 1": {"speed": 1e3, "sweeps": 1},
+    "density 1 kg/m^3": {"density": 1.0},
+    "density 1e5 kg/m^3": {"density": 1e5},
+    "K = 1": {"sweeps": 1},
+    "K = 100": {"sweeps": 100},
+    "float32": {"single": True},
+    "float32, mu 1e10 Pa": {"single": True, "mu": 1e10},
+    "float32, 1000 m/s": {"single": True, "speed": 1e3},
+    "float32, size 1e-4 m": {"single": True, "size": 1e-4, "speed": 2.5e-4},
+    "float32, size 1e3 m": {"single": True, "size": 1e3, "speed": 2.5e3},
+    "slivers 1e-3": {"sliver": 1e-3},
+    "mass contrast 1e6": {"mass_contrast": 1e6, "density": 1.0},
+}
+QUICK_AXES = ("none", "mu 1e10 Pa, K = 1", "1000 m/s", "float32, size 1e-4 m")
+
+# scene, friction, options of the solver
+FEATURES: dict[str, tuple[str, float, dict[str, Any]]] = {
+    "plain, pinned": ("pinned", 0.0, {}),
+    "plain, free": ("free", 0.0, {}),
+    "coarse, pinned": ("pinned", 0.0, {"subspace": "coarse"}),
+    "coarse, free": ("free", 0.0, {"subspace": "coarse", "relaxation": 1.5}),
+    "SDIRK2, pinned": ("pinned", 0.0, {"integrator": dv.SDIRK2()}),
+    "SDIRK2, free": ("free", 0.0, {"integrator": dv.SDIRK2()}),
+    "BDF2, pinned": ("pinned", 0.0, {"integrator": dv.BDF2()}),
+    "BDF2, free": ("free", 0.0, {"integrator": dv.BDF2()}),
+    "floor": ("floor", 0.0, {}),
+    "floor, friction": ("floor", 0.5, {}),
+    "floor, coarse, BDF2": ("floor", 0.0, {"subspace": "coarse", "integrator": dv.BDF2()}),
+    "plane": ("plane", 0.0, {}),
+    "plane, friction": ("plane", 0.5, {}),
+    "sphere, friction": ("sphere", 0.5, {}),
+    "pairs": ("pairs", 0.0, {}),
+    "pairs, friction": ("pairs", 0.5, {}),
+    "pairs, friction, coarse": ("pairs", 0.5, {"subspace": "coarse"}),
+    "pairs, SDIRK2": ("pairs", 0.0, {"integrator": dv.SDIRK2()}),
+    "pairs, BDF2": ("pairs", 0.0, {"integrator": dv.BDF2()}),
+    "self-contact": ("horseshoe", 0.0, {}),
+    "self-contact, friction, coarse": ("horseshoe", 0.5, {"subspace": "coarse"}),
+}  # fmt: skip
+
+FEATURE_CASES = [replace(Case(), feature=f, axis=a, **given) for f in FEATURES for a, given in AXES.items()]
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def bodies(case: Case) -> dv.TetMesh:
+    """Of length 1: a bar, a block above y = 0, two of them above each other, or a horseshoe that opens upwards."""
+    kind = FEATURES[case.feature][0]
+    if kind in ("pinned", "free"):
+        return _with_slivers(mesh.box((6, 3, 3), (1.0, 0.3, 0.3), split="kuhn"), case.sliver)
+    block = _with_slivers(mesh.box(3, 0.4, split="kuhn"), case.sliver)
+    if kind == "pairs":
+        return mesh.join([block, block.translate((0.07, 0.5, 0.04))])
+    if kind == "horseshoe":
+        whole = mesh.box((6, 4, 2), (1.0, 0.6, 0.2), split="kuhn")
+        center = whole.points[whole.tets].mean(1)
+        tets = whole.tets[(np.abs(center[:, 0] - 0.5) > 0.1) | (center[:, 1] < 0.2)]
+        used, numbers = np.unique(tets, return_inverse=True)
+        return _with_slivers(dv.TetMesh(whole.points[used], numbers.reshape(-1, 4)), case.sliver)
+    return block.translate((0.0, 0.1, 0.0))
+
+
+def _with_slivers(body: dv.TetMesh, thickness: float) -> dv.TetMesh:
+    """The lowest inner layer of points moved down to just above the layer below."""
+    if not thickness:
+        return body
+    points = body.points.copy()
+    levels = np.unique(points[:, 1].round(9))
+    points[np.isclose(points[:, 1], levels[1]), 1] = levels[0] + thickness * (levels[1] - levels[0])
+    return dv.TetMesh(points, body.tets, body.body)
+
+
+def build_feature(case: Case) -> tuple[dv.Model, Tensor, Tensor, dict[str, Any]]:
+    """Model, state, and the material of each tet."""
+    kind, friction, _ = FEATURES[case.feature]
+    tets = bodies(case)
+    scaled = tets.transform(case.size * np.eye(3))
+    upper = np.array(tets.points[tets.tets].mean(1)[:, 0] > 0.5 * np.ptp(tets.points[:, 0]))
+    half = torch.from_numpy(upper)
+    energies: list[Any] = [dv.StableNeoHookean()]
+    # about as stiff as the softer half
+    barrier: dict[str, Any] = {"kappa": case.mu * case.size, "dhat": 0.05 * case.size}
+    colliders: tuple[Any, ...] = ()
+    if kind == "floor":
+        energies.append(dv.FloorBarrier(**barrier))
+    if kind in ("plane", "sphere", "pairs", "horseshoe"):
+        energies.append(dv.PairBarrier(**barrier, self_contact=kind == "horseshoe"))
+    if kind == "plane":
+        colliders = (dv.colliders.Plane(),)
+    elif kind == "sphere":
+        colliders = (dv.colliders.Sphere((0.2 * case.size, -0.5 * case.size, 0.2 * case.size), 0.5 * case.size),)
+    if friction:
+        energies.append(dv.Friction(friction, velocity=0.01 * case.speed))
+    pinned = np.isclose(tets.points[:, 0], 0.0) if kind == "pinned" else None
+    density = torch.where(half, case.density * case.mass_contrast, case.density).to(torch.float64)
+    dtype = torch.float32 if case.single else torch.float64
+    model = dv.Model(scaled, density=density.to(dtype), pinned=pinned, energies=energies, colliders=colliders,
+                     dtype=dtype)  # fmt: skip
+    stiffness = torch.where(half, case.contrast, 1.0).to(dtype) * case.mu
+    lam = stiffness * (2 * case.poisson / (1 - 2 * case.poisson))
+    points = torch.from_numpy(tets.points.copy()).to(dtype)
+    return model, model.rest_points.clone(), case.speed * _motion(kind, points, tets), {"mu": stiffness, "lam": lam}
+
+
+def _motion(kind: str, points: Tensor, tets: dv.TetMesh) -> Tensor:
+    """Velocities of about 1 m/s."""
+    v = torch.zeros_like(points)
+    if kind in ("pinned", "free"):
+        v[:, 1], v[:, 2] = points[:, 0].square(), 0.3 * points[:, 0]
+    elif kind == "pairs":
+        v[:, 1] = torch.where(torch.from_numpy(np.asarray(tets.body) == 1), -1.0, 0.0)
+        v[:, 0] = 0.2 * points[:, 1]
+    elif kind == "horseshoe":  # its legs go to each other
+        v[:, 0] = -torch.sign(points[:, 0] - 0.5) * points[:, 1] / 0.6
+    else:
+        v[:, 0], v[:, 1] = 0.5, -1.0
+    return v
+
+
+# --- what is looked at ------------------------------------------------------------------------------------------------
+
+
+def check_feature(case: Case) -> dict[str, Any]:
+    """All figures of one case."""
+    row: dict[str, Any] = {"feature": case.feature, "axis": case.axis, "raised": "", "warned": ""}
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        try:
+            row |= _run(case)
+        except (ValueError, RuntimeError) as error:
+            row |= {
+                "raised": str(error).split("\n")[0][:200],
+                "finite": False,
+                "gain": math.nan,
+                "gradient_finite": False,
+            }
+    row["warned"] = ", ".join(sorted({str(w.message).split(":")[0] for w in found}))
+    useless = not row["finite"] or not row["gain"] <= GAIN or not row["gradient_finite"]
+    row["useless"] = useless
+    row["silent"] = useless and not row["raised"] and not row["warned"]
+    return row
+
+
+def _run(case: Case) -> dict[str, Any]:
+    model, x, v, material = build_feature(case)
+    solver = dv.VBD(case.time_step, case.sweeps, **FEATURES[case.feature][2])
+    options: dict[str, Any] = {"steps": case.steps, "solver": solver}
+    begun = time.perf_counter()
+    given: dict[str, Any] = {**options, **material}
+    with torch.no_grad():
+        motion = dv.rollout(model, x, v, **given)
+    seconds = time.perf_counter() - begun
+    finite = bool(torch.isfinite(motion.x).all()) and bool(torch.isfinite(motion.v).all())
+    row: dict[str, Any] = {"finite": finite, "seconds": seconds, "gain": math.nan}
+    if finite:
+        corners = motion.x[-1][model.tets].to(torch.float64)
+        row |= {"gain": gained(case, motion, material), "inverted": int((_volumes(corners) < 0).sum()),
+                "crossings": _crossings(case, model, motion)}  # fmt: skip
+    return row | _gradient(case, model, x, v, material, options)
+
+
+def gained(case: Case, motion: dv.results.Trajectory, material: dict[str, Tensor]) -> float:
+    """Most energy of a frame beyond that of the first, over what the scene had and what gravity did; barriers, which
+    hold none at the start and are never negative, left out."""
+    double = build_feature(replace(case, single=False))[0]
+    body = dv.Model(double.mesh, density=double._density, energies=(dv.StableNeoHookean(),))
+    x, v = motion.x.to(torch.float64), motion.v.to(torch.float64)
+    mu, lam = (material[k].to(torch.float64) for k in ("mu", "lam"))
+    elastic = torch.stack([reference.incremental_potential(body, a, a, mu, lam, 1.0) for a in x])
+    mass = body.mass[:, None]
+    moving = 0.5 * (mass * v.square()).sum((-1, -2))
+    fallen = GRAVITY * (mass[:, 0] * x[..., 1]).sum(-1)
+    fallen = fallen - fallen[0]
+    scale = moving[0] + elastic[0] + GRAVITY * mass.sum() * case.size + fallen.abs().max()
+    if motion.x.dtype == torch.float32:  # energy that rounding of positions alone is worth
+        scale = scale + elastic[0]
+    return float(((moving + elastic + fallen).max() - moving[0] - elastic[0]) / scale)
+
+
+def _crossings(case: Case, model: dv.Model, motion: dv.results.Trajectory) -> int:
+    """Edges through triangles at the end, and vertices of the surface at or below the floor or plane."""
+    kind = FEATURES[case.feature][0]
+    end = motion.x[-1]
+    if kind in ("floor", "plane"):
+        return int((end[np.unique(model.mesh.surface), 1] <= 0).sum())
+    if kind not in ("pairs", "horseshoe"):
+        return 0
+    found = dv.contact.intersections(model, end)
+    if kind == "horseshoe":
+        return len(found)
+    surface = model.surface_of_contact
+    assert surface is not None
+    # of bodies without self-contact, edges through another body
+    body = model.body.cpu()
+    return int((body[surface.edges[found[:, 1], 0].long()] != body[surface.triangles[found[:, 2], 0].long()]).sum())
+
+
+def _volumes(corners: Tensor) -> Tensor:
+    return torch.linalg.det(corners[:, 1:] - corners[:, :1])
+
+
+def _gradient(case: Case, model: dv.Model, x: Tensor, v: Tensor, material: dict[str, Tensor],
+              options: dict[str, Any]) -> dict[str, Any]:  # fmt: skip
+    """Whether the gradient is finite, and its error against differences along one direction (None in float32)."""
+    random = testing.generator("features", case.feature)
+    weights, way = (torch.from_numpy(random.standard_normal(tuple(x.shape))).to(x) for _ in range(2))
+    way = case.speed * torch.where(model.pinned[:, None], 0.0, way)
+
+    def loss(s: Tensor) -> Tensor:
+        given: dict[str, Any] = {k: m * (1 + s) for k, m in material.items()}
+        end = dv.rollout(
+            model, x, v + s * way, **options, **given, save="last", checks=dv.Checks(contact=False, energy=False)
         )
-    header = ("axis", "cases", "finite", "descends", "gradient within bar", "faults", "median gradient error",
-              "largest", "largest conditioning")  # fmt: skip
-    text = "## Cases by axis\n\n" + markdown_table(header, summary)
-    columns = ("axis", "name", "gradient_error", "spread", "condition", "forward_error", "worst_argument")
-    names = ("axis", "case", "gradient error", "spread", "conditioning", "forward error", "argument")
+        return (weights * (end.x[-1] - x)).sum() / case.size
 
-    def listed(title: str, chosen: list[dict[str, Any]], also: tuple[str, ...] = ()) -> str:
-        if not chosen:
-            return ""
-        table = markdown_table((*names, *also), [[r[k] for k in (*columns, *also)] for r in chosen])
-        return f"\n## {title}\n\n" + table
+    at = torch.zeros((), dtype=x.dtype, requires_grad=True)
+    value = loss(at)
+    (slope,) = torch.autograd.grad(value, at)
+    row: dict[str, Any] = {"gradient_finite": bool(torch.isfinite(slope)), "gradient": float(slope), "difference": None}
+    if case.single or not row["gradient_finite"]:
+        return row
+    with torch.no_grad():
+        found = [float(loss(at + d) - loss(at - d)) / (2 * d) for d in DIFFERENCES]
+    scale = max(abs(float(slope)), 1e-300)
+    return row | {"difference": min(abs(f - float(slope)) / scale for f in found)}
 
-    text += listed("Faults", [r for r in rows if verdict(r) == "fault"], ("finite", "rise", "error_over_bar"))
-    beyond = [r for r in rows if verdict(r) == "conditioning"]
-    text += listed("Beyond the bar, within the conditioning", beyond, ("error_over_bar",))
-    lost = [r for r in rows if verdict(r) == "no digits"]
-    text += listed("No digits left in double precision", lost, ("finite", "rise", "error_over_bar"))
-    text += listed("Worst conditioned", sorted(rows, key=lambda r: -r["condition"])[:12])
-    risen = [r for r in rows if r["rise"] > RISE]
-    text += listed("Potential rose (not promised for the paper's block and floors)", risen, ("rise", "block"))
-    header = ("rollout", "steps", "sweeps", "finite", "gradient against differences")
-    long = [(r["name"], r["steps"], r["sweeps"], r["finite"], r["difference_error"]) for r in results["rollouts"]]
-    return text + "\n## Long rollouts\n\n" + markdown_table(header, long)
+
+def gradient_verdict(row: dict[str, Any]) -> str:
+    """Of the gradient: "alike", "kink" (finite, and not as differences have it), "not finite", "-" (not compared)."""
+    if row["raised"] or row.get("difference") is None and row.get("gradient_finite"):
+        return "-"
+    if not row["gradient_finite"]:
+        return "not finite"
+    return "alike" if row["difference"] <= ALIKE else "kink"
+
+
+# --- groups and tables ------------------------------------------------------------------------------------------------
+
+
+def long_rollouts(card: Card) -> list[dict[str, Any]]:
+    few = [Rollout("cantilever", 300), Rollout("drop onto a floor", 300, floor=True)]
+    return [check_rollout(case) for case in (few if card.quick else ROLLOUTS)]
+
+
+def is_fault(row: dict[str, Any]) -> bool:
+    return verdict(row) == "fault"
+
+
+THREADS = 1
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    "elastic": lambda card: [check(case) for case in CASES if case.quick or not card.quick],
+    "rollouts": long_rollouts,
+    "features": lambda card: [check_feature(c) for c in FEATURE_CASES if c.axis in QUICK_AXES or not card.quick],
+}
+WORST = ("axis", "name", "gradient_error", "spread", "condition", "forward_error", "worst_argument", "finite", "rise")
+FEATURE = ("feature", "axis", "finite", "gain", "inverted", "crossings", "gradient_finite", "difference", "warned",
+           "raised")  # fmt: skip
+OF_FEATURES: dict[str, Any] = {
+    "cases": count(), "finite": count("finite"), "raised": count("raised"),
+    "gain > 5 %": count(lambda row: row["finite"] and row["gain"] > GAIN), "silent": count("silent"),
+    "crossings": count("crossings"), "inverted tets": count("inverted"), "gradient finite": count("gradient_finite"),
+    "gradient as differences": count(lambda row: gradient_verdict(row) == "alike"),
+    "not": count(lambda row: gradient_verdict(row) == "kink"),
+}  # fmt: skip
+TABLES = (
+    Table("Elastic cases", "elastic",
+          {"cases": count(), "finite": count("finite"), "must descend": count("must_descend"),
+           "of these rise": count(lambda row: row["must_descend"] and row["rise"] > RISE),
+           "gradient within bar": count(lambda row: row["error_over_bar"] <= 1), "faults": count(is_fault),
+           "median gradient error": median("gradient_error"), "largest": most("gradient_error"),
+           "largest conditioning": most("condition")}, by="axis"),
+    Table("Faults", "elastic", WORST, only=is_fault),
+    Table("Beyond the bar, within the conditioning", "elastic", WORST, only=lambda row: verdict(row) == "conditioning"),
+    Table("No digits left in double precision", "elastic", WORST, only=lambda row: verdict(row) == "no digits"),
+    Table("Long rollouts", "rollouts", ("name", "steps", "sweeps", "finite", "difference_error")),
+    Table("Features", "features", OF_FEATURES, by="feature"),
+    Table("Features by extreme", "features", OF_FEATURES, by="axis"),
+    Table("Of no use, and nothing said", "features", FEATURE, only=lambda row: row["silent"]),
+    Table("Crossings", "features", FEATURE, only=lambda row: row.get("crossings")),
+    Table("Gradients unlike differences", "features", FEATURE,
+          only=lambda row: gradient_verdict(row) in ("kink", "not finite")),
+)  # fmt: skip

@@ -17,21 +17,19 @@ import numpy as np
 import torch
 
 import diffvbd as dv
-from bench.common import RESULTS
+from bench.common import ROOT, chosen
 from diffvbd import losses, viz
 from diffvbd.tasks import TASKS, Settings, beam, dress, solve
 from diffvbd.viz.motion import load_motions
 
-FOLDER = RESULTS.parents[1] / "docs" / "images" / "gallery"
+FOLDER = ROOT / "docs" / "images" / "gallery"
 MOST_BYTES = 400_000
 SIZE = (440, 300)
 
 
 def main(only: str | None = None, out: Path | None = None) -> int:
     """Render all, or some by name; returns the exit status."""
-    names = [*SCENES] if only is None else [name.strip() for name in only.split(",")]
-    if unknown := [name for name in names if name not in SCENES]:
-        sys.exit(f"--only: expected names among {', '.join(SCENES)}, got {', '.join(unknown)}")
+    names = chosen(only, SCENES)
     folder = out or FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
@@ -53,12 +51,13 @@ def still(model: dv.Model) -> tuple[torch.Tensor, torch.Tensor]:
 def twisted_beam(path: Path) -> None:
     """A twisted beam with the first guess of its shear modulus, the observed one and the identified one."""
     mesh = dv.mesh.beam(17, 6, 6, size=beam.SIZE, split="kuhn")
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=beam.RELAXATION, coarse="auto")
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
     x = beam.twisted(model.rest_points, beam.TWIST)
 
     def simulate(mu: torch.Tensor) -> torch.Tensor:
-        return dv.rollout(model, x, torch.zeros_like(x), steps=80, mu=mu, lam=beam.LAM, gravity=(0.0, 0.0, 0.0),
-                          time_step=beam.TIME_STEP, sweeps=beam.SWEEPS).x  # fmt: skip
+        solver = dv.VBD(beam.TIME_STEP, beam.SWEEPS, relaxation=beam.RELAXATION, subspace="coarse")
+        return dv.rollout(model, x, torch.zeros_like(x), solver, steps=80, mu=mu, lam=beam.LAM,
+                          gravity=(0.0, 0.0, 0.0)).x  # fmt: skip
 
     with torch.no_grad():
         start, true = (simulate(torch.tensor(mu, dtype=x.dtype)) for mu in (beam.START_MU, beam.TRUE_MU))
@@ -106,7 +105,7 @@ def many_cubes(path: Path) -> None:
         dv.Friction(0.4, velocity=0.05),
     )
     model = dv.Model(dv.mesh.join(cubes), density=300.0, energies=energies)
-    motion = dv.rollout(model, *still(model), steps=240, mu=3e4, lam=3e4, time_step=0.005, sweeps=20)
+    motion = dv.rollout(model, *still(model), solver=dv.VBD(0.005, 20), steps=240, mu=3e4, lam=3e4)
     viz.render(path, motion, model, time_step=0.005, size=SIZE, seconds=3.0, view=(18.0, 50.0), zoom=1.5)
 
 
@@ -139,8 +138,8 @@ def stacked_boxes(path: Path) -> None:
         dv.PairBarrier(2e3, 2 * gap, self_contact=False, damping=10.0),
         dv.Friction(0.6, velocity=0.01),
     )
-    model = dv.Model(mesh, density=500.0, energies=energies, coarse="auto", acceleration=dv.Anderson(2))
-    motion = dv.rollout(model, *still(model), steps=110, mu=2e5, lam=2e5, time_step=0.01, sweeps=12)
+    model = dv.Model(mesh, density=500.0, energies=energies)
+    motion = dv.rollout(model, *still(model), solver=dv.VBD(0.01, 24, subspace="coarse"), steps=110, mu=2e5, lam=2e5)
     viz.render(path, motion, model, time_step=0.01, size=SIZE, seconds=2.6, view=(12.0, 75.0), zoom=1.15)
 
 
@@ -155,7 +154,7 @@ def cloth(path: Path) -> None:
     )
     ball = dv.colliders.Sphere((0.02, 0.32, 0.01), 0.2)
     model = dv.Model(sheet, density=120.0, energies=energies, colliders=[ball])
-    motion = dv.rollout(model, *still(model), steps=110, mu=1.5e3, lam=1e3, time_step=0.01, sweeps=15)
+    motion = dv.rollout(model, *still(model), solver=dv.VBD(0.01, 15), steps=110, mu=1.5e3, lam=1e3)
     viz.render(path, motion, model, time_step=0.01, size=SIZE, seconds=3.0, view=(22.0, 50.0), zoom=1.2)
 
 
@@ -193,7 +192,7 @@ def gripper(path: Path) -> None:
     places = rest + torch.stack(
         [close[:, None] * sign, lift[:, None].expand(-1, len(rest)), 0 * sign.expand(steps + 1, -1)], -1
     )
-    motion = dv.rollout(model, *still(model), steps=steps, mu=1e4, lam=1e4, time_step=h, sweeps=15,
+    motion = dv.rollout(model, *still(model), solver=dv.VBD(h, 15), steps=steps, mu=1e4, lam=1e4,
                         colliders=dv.per_step(places[1:]))  # fmt: skip
     viz.render(path, motion, model, time_step=h, colliders=places, size=SIZE, seconds=3.2, view=(14.0, 70.0), zoom=1.1)
 

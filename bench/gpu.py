@@ -1,189 +1,431 @@
-"""Speed and memory of the CUDA backend: steps, batches, the grid of sweeps and vertices, regimes, peers, contact.
+"""Speed and memory of the CUDA backend: steps, batches, the grid of sweeps and vertices, regimes, contact.
 
-`--only NAME,...` runs some groups; each is written as it ends, beside what earlier runs on the same device have left.
+Times are milliseconds a step of the public interface, predictor and velocity included, in float64 unless said: *graph*
+is the median of 20 replays, by CUDA events, of one CUDA graph of 10 steps (or as many as a row says), *eager* the same
+steps called from Python. A backward cannot be captured alone, so *reverse* is the time of a graph of forward and
+reverse less that of a graph of the forward with its tape; state and material gradients are asked for. Regimes are the
+median of up to 10 replays of graphs of 10 steps (2 with reverse). With tape="auto" a tape is compact where a full one
+would be large.
 """
 
 from __future__ import annotations
 
-import sys
-import time
+import math
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from bench import common, newton
-from bench.common import cell, markdown_table
-from bench.gpu_contact import small_contact
-from bench.gpu_contact import table as contact_table
-from bench.gpu_grid import REGIMES, grid, memory, regimes
-from bench.gpu_measure import Card, Row
-from bench.gpu_scenes import batches, bunny, cost, cubes, steps
-from diffvbd.adjoint.routes import FULL_TAPE_LIMIT, FULL_TAPE_SHARE
+import diffvbd as dv
+from bench.measure import (
+    STEP,
+    Card,
+    Row,
+    Scene,
+    Work,
+    attempt,
+    forward,
+    forward_reverse,
+    milliseconds,
+    model_of,
+    scene_of,
+)
+from bench.tables import Table, times
+from bench.tradeoff import gripper
+from diffvbd.tasks import cover_the_spot
+from diffvbd.tasks.problem import Settings
+from diffvbd.testing import regime
+
+GRADIENTS = ("x", "v", "material")
+
+
+def label(model: dv.Model, sweeps: int) -> str:
+    return f"{model.num_vertices} v / {model.num_tets} t, K = {sweeps}, {str(model.dtype)[6:]}"
+
+
+def timed_forward(
+    card: Card, scene: Scene, sweeps: int, steps: int, tape: Any = "auto", budget: float | None = None
+) -> Row:
+    """Graph and eager time per step; with a tape where a tensor of the scene requires grad."""
+    work = forward(scene, sweeps, steps, tape)
+    eager = card.eager(work)
+    return {"ms": milliseconds(card.graph(work, budget=budget), steps), "eager_ms": milliseconds(eager, steps)}
+
+
+def timed_reverse(
+    card: Card, scene: Scene, sweeps: int, steps: int, tape: Any = "auto", budget: float | None = None
+) -> tuple[Row, Row]:
+    """Times per step of the forward with tape, and of the reverse: forward with reverse, less the former."""
+    taped = timed_forward(card, scene, sweeps, steps, tape, budget)
+    work = forward_reverse(scene, sweeps, steps, tape)
+    eager = milliseconds(card.eager(work), steps)
+    both = milliseconds(card.graph(work, budget=budget), steps)
+    reverse = {
+        "ms": None if both is None or taped["ms"] is None else both - taped["ms"],
+        "eager_ms": None if eager is None else eager - taped["eager_ms"],
+        "both_ms": both,
+        "both_eager_ms": eager,
+    }
+    return taped, reverse
+
+
+# --- one mesh, many scenes --------------------------------------------------------------------------------------------
+
+
+def timed_parts(card: Card, rows: list[Row], about: Row, scene: Scene, sweeps: int, steps: int, tapes: tuple[str, ...],
+                targets: tuple[float | None, float | None] = (None, None),
+                wrt: tuple[str, ...] = GRADIENTS) -> None:  # fmt: skip
+    """Rows of a forward without tape, and of a forward with each tape and its reverse."""
+    about = {"name": label(scene.model, sweeps), "steps": steps, **about}
+    attempt(card, rows, {**about, "part": "forward", "target_ms": targets[0]},
+            lambda: timed_forward(card, scene, sweeps, steps))  # fmt: skip
+    for tape in tapes:
+
+        def both(tape: str = tape) -> list[Row]:
+            taped, reverse = timed_reverse(card, scene.requiring(*wrt), sweeps, steps, tape)
+            whole = {"ms": reverse["both_ms"], "eager_ms": reverse["both_eager_ms"]}
+            parts = {f"forward with {tape} tape": taped, f"reverse, {tape} tape": reverse, "forward + reverse": whole}
+            return [{"part": part, "target_ms": targets[1] if "reverse," in part else None, **row}
+                    for part, row in parts.items()]  # fmt: skip
+
+        attempt(card, rows, {**about, "part": f"reverse, {tape} tape"}, both)
+
+
+def steps(card: Card) -> list[Row]:
+    """Forward and reverse of a step of cubes from 125 to 200k vertices, moduli as one number and per tet."""
+    large, rows = (3.0, 6.0), []  # targets [ms]
+    cases = [(5, (0.2, 0.25)), (11, (0.35, None)), (31, (0.6, None)), (58, large)]
+    for n, targets in [(4, (None, None))] if card.quick else cases:
+        model = model_of(dv.mesh.cube(n, split="five"), card)
+        for material in ("scalar", "per tet"):
+            scene = scene_of(model, material=material)
+            timed_parts(card, rows, {"material": material}, scene, 20, 2 if card.quick else 10, ("full", "compact"),
+                        targets)  # fmt: skip
+    single = scene_of(model_of(dv.mesh.cube(4 if card.quick else 58, split="five"), card, torch.float32))
+    timed_parts(card, rows, {"material": "scalar"}, single, 20, 2 if card.quick else 10, (), (1.8, None))
+    return rows
+
+
+def bunny(card: Card) -> list[Row]:
+    """40 steps of the rabbit in one graph, against the paper's 3 and 5 ms per step for 339 vertices."""
+    scene, count, rows = scene_of(model_of(dv.mesh.bunny(), card, pinned=False)), 2 if card.quick else 40, []
+    timed_parts(card, rows, {"material": "scalar"}, scene, 20, count, ("full",), (3.0, 5.0))
+    return rows
+
+
+def cubes(card: Card) -> list[Row]:
+    """A million scenes of one cube of eight vertices, mu of each scene; forward without tape, and with reverse. By
+    sweeps alone, too: to choose a start and to correct rigid motion is work around them."""
+    scenes, rows = (100 if card.quick else 1_000_000), []
+    model = model_of(dv.mesh.cube(size=0.003, split="kuhn"), card, pinned=False)
+    scene = scene_of(model, scenes, "per scene", noise=1e-5)
+    for note, plain in (("", False), (", sweeps alone", True)):
+        about = {"name": f"{scenes} scenes of {label(model, 5)}{note}", "material": "per scene"}
+        timed_parts(card, rows, about, replace(scene, plain=plain), 5, 2 if card.quick else 10, ("recompute",),
+                    (1.2, None), ("x", "v", "mu"))  # fmt: skip
+    return rows
+
+
+def batches(card: Card, sweeps: int = 10) -> list[Row]:
+    """Scenes of 1,331 vertices in one call; throughput and its share of the best of the series."""
+    model, count = model_of(dv.mesh.cube(3 if card.quick else 11, split="five"), card), 2 if card.quick else 10
+    rows: list[Row] = []
+    for scenes in (2, 4) if card.quick else (128, 256, 512, 1024, 2048, 4096, 8192):
+
+        def one(scenes: int = scenes) -> Row:
+            row = timed_forward(card, scene_of(model, scenes), sweeps, count)
+            return row | {"updates": model.num_active * sweeps * scenes / 1e6 / (row["ms"] or row["eager_ms"])}  # [G/s]
+
+        attempt(card, rows, {"name": f"{scenes} scenes of {label(model, sweeps)}", "steps": count}, one)
+    best = max((r["updates"] for r in rows if "updates" in r), default=0.0)
+    return [row | ({"share_of_best": row["updates"] / best} if "updates" in row else {}) for row in rows]
+
+
+# --- sizes ------------------------------------------------------------------------------------------------------------
+
+
+PARTS = ("forward", "forward + reverse")
+REGIMES = ("thread", "block", "grid", "color")
+GRID_STEPS = 50  # of a rollout of the grid, as in the paper
+SLOW = 0.1  # [s] a step of a regime that is not followed to larger batches
+
+
+def rollout_reverse(scene: Scene, sweeps: int, steps: int, tape: Any, every: Any) -> Work:
+    """A rollout and its gradients; only the last frame is kept."""
+    ones = torch.ones_like(scene.x)
+    wanted = [t for t in scene.leaves if t.requires_grad]
+
+    def work() -> Any:
+        end = dv.rollout(scene.model, scene.x, scene.v, dv.VBD(STEP, sweeps, tape=tape), steps=steps, mu=scene.mu,
+                         lam=scene.lam, checkpoint_every=every, save="last")  # fmt: skip
+        return torch.autograd.grad((end.x[-1], end.v[-1]), wanted, (ones, ones))
+
+    return work
+
+
+def room(card: Card) -> int:
+    """Bytes that a measurement may take."""
+    return int(0.5 * torch.cuda.get_device_properties(card.device).total_memory) if card.cuda else 2**30
+
+
+# --- sweeps x vertices ------------------------------------------------------------------------------------------------
+
+
+def grid(card: Card) -> list[Row]:
+    """Refinements of one box from 560 to 204k vertices: forward, reverse, their ratio and peak memory."""
+    mesh = dv.mesh.box((4, 3, 3) if card.quick else (10, 8, 7), size=(0.9, 0.7, 0.6), split="kuhn")
+    rows: list[Row] = []
+    for level in range(2 if card.quick else 4):
+        if level:
+            mesh = dv.mesh.subdivide(mesh)
+        for sweeps in (5, 10) if card.quick else (5, 10, 20, 50, 100, 200):
+            about = {"level": level, "vertices": mesh.num_vertices, "tets": mesh.num_tets, "sweeps": sweeps}
+            attempt(card, rows, about, lambda m=mesh, k=sweeps: _grid_row(card, m, k))
+    return rows
+
+
+def _grid_row(card: Card, mesh: dv.TetMesh, sweeps: int) -> Row:
+    before = card.allocated()
+    model = model_of(mesh, card)
+    scene = scene_of(model).requiring(*GRADIENTS)
+    size = model.num_vertices * sweeps
+    count = 10 if size < 2_000_000 else 3
+    row: Row = {"steps": count, **timed_forward(card, scene_of(model), sweeps, count, budget=2.0)}
+    taped, reverse = timed_reverse(card, scene, sweeps, count, budget=2.0)
+    row |= {"taped_ms": taped["ms"], "reverse_ms": reverse["ms"], "reverse_eager_ms": reverse["eager_ms"]}
+    if reverse["ms"] is not None:
+        row["ratio"] = reverse["ms"] / taped["ms"]
+    card.tidy()
+    step_ms = reverse["both_ms"] or reverse["both_eager_ms"]
+    if 2 * GRID_STEPS * step_ms > 15e3 or not card.cuda:
+        return {**row, "note": f"peak of {GRID_STEPS} steps not measured"}
+    row["rollout_peak"] = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "auto", "auto"))
+    predicted = model.memory(dv.VBD(0.01, sweeps, tape="full"), steps=GRID_STEPS, checkpoint_every=None)
+    if predicted["total"] < room(card):
+        own = card.allocated() - before - scene.bytes
+        peak = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None))
+        if peak is not None:
+            row["full_peak"] = peak + own
+            row["full_peak_bytes_per_vertex_sweep_step"] = (peak + own) / (size * GRID_STEPS)
+    return row
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+# --- regimes ----------------------------------------------------------------------------------------------------------
+
+
+def regimes(card: Card, sweeps: int = 10) -> list[Row]:
+    """Each regime where it can run, sizes 8 to 195k vertices times 1 to 1e6 scenes: forward, and with reverse."""
+    rows: list[Row] = []
+    for n in (2, 3) if card.quick else (2, 3, 5, 7, 11, 21, 31, 58):
+        mesh = dv.mesh.cube(n, split="five")
+        exhausted: set[tuple[str, str]] = set()
+        for scenes in (1, 8) if card.quick else (1, 8, 64, 512, 4096, 32_768, 262_144, 1_000_000):
+            if mesh.num_vertices * scenes > 9_000_000:
+                continue
+            about = {"vertices": mesh.num_vertices, "scenes": scenes, "sweeps": sweeps}
+            attempt(card, rows, about, lambda m=mesh, b=scenes, e=exhausted: _regimes_row(card, m, b, sweeps, e))
+    return rows
+
+
+def _regimes_row(card: Card, mesh: dv.TetMesh, scenes: int, sweeps: int, exhausted: set[tuple[str, str]]) -> Row:
+    model = model_of(mesh, card, pinned=mesh.num_vertices > 8)
+    plain = scene_of(model, scenes)
+    wanted = plain.requiring("x", "v")
+    cells: dict[str, Row] = {part: {} for part in PARTS}
+    for name in ("auto", *REGIMES):
+        for part, cell in cells.items():
+            if (name, part) in exhausted:
+                cell[name] = "slow"
+                continue
+            steps = 10 if part == "forward" else 2
+            make = forward if part == "forward" else forward_reverse
+            scene = plain if part == "forward" else wanted
+            try:
+                with nullcontext() if name == "auto" else regime(name):
+                    cell[name] = _cell(card, make(scene, sweeps, 1), make(scene, sweeps, steps), steps)
+            except ValueError as error:
+                if "regime" not in str(error):
+                    raise
+                cell[name] = None  # cannot run this scene
+            except RuntimeError as error:
+                cell[name] = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+            if isinstance(cell[name], float) and cell[name] > 1e3 * SLOW:
+                exhausted.add((name, part))
+            card.tidy()
+    row: Row = dict(cells)
+    for part, cell in cells.items():
+        times = {k: t for k, t in cell.items() if isinstance(t, float) and k != "auto"}
+        if times:
+            best = min(times, key=lambda k: times[k])
+            row[f"best, {part}"] = best
+            if isinstance(cell["auto"], float):
+                row[f"auto over best, {part}"] = cell["auto"] / times[best]
+    return row
+
+
+def _cell(card: Card, one: Work, several: Work, steps: int) -> float | None:
+    """Milliseconds per step: of a graph, or of one eager step where a graph would take long."""
+    one()
+    first = card.eager(one, 1)
+    if first > SLOW or not card.cuda:
+        return milliseconds(first)
+    return milliseconds(card.graph(several, replays=10, budget=0.2), steps)
+
+
+# Of grippers. With this reach a scene has about 1,000 pairs, and a vertex may go 1 mm in each of two parts of a step:
+# they lift by 1.5 mm a step.
+CLAMPED_STEP, CLAMPED_SWEEPS, DETECTIONS, REACH = 0.005, 10, 2, 4e-3
+CLOSING, CLAMPED_STEPS = 32, 5  # steps until they hold and lift evenly; steps timed
+SPARE = 1.25  # of the pairs that there are then, what lists have room for
+
+
+def small_contact(card: Card) -> list[Row]:
+    """Milliseconds of a step of one scene, and how many steps of scenes a second many at once take."""
+    rows: list[Row] = []
+    attempt(card, rows, {"name": "cover-the-spot"}, lambda: _cover(card))
+    for scenes in (2,) if card.quick else (1, 64, 1024):
+        name = "gripper" if scenes == 1 else f"{scenes} grippers"
+        attempt(card, rows, {"name": name}, lambda scenes=scenes: _grippers(card, scenes))
+    return rows
+
+
+def _cover(card: Card) -> list[Row]:
+    settings = Settings(Path("unused"), str(card.device), 0, card.quick)
+    fall = cover_the_spot.Fall(settings, cover_the_spot.RADIUS,
+                               cover_the_spot.QUICK if card.quick else cover_the_spot.FULL)  # fmt: skip
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return fall.simulate()
+
+    def both() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(fall.simulate().sum(), (fall.velocity, fall.offset))
+
+    about = {"vertices": fall.model.num_vertices, "scenes": 1, "sweeps": fall.version.sweeps}
+    return _timed(card, about, fall.version.steps, forward, both, (0.25, 0.6))
+
+
+def landed_step(card: Card) -> Work:
+    """A step and its gradients where disks lie on the floor and on one another."""
+    settings = Settings(Path("unused"), str(card.device))
+    fall = cover_the_spot.Fall(settings, cover_the_spot.RADIUS, cover_the_spot.FULL)
+    given: dict[str, Any] = {"mu": cover_the_spot.MU, "lam": cover_the_spot.LAM,
+                             "solver": dv.VBD(cover_the_spot.TIME_STEP, cover_the_spot.SWEEPS)}  # fmt: skip
+    x, v = fall.model.rest_points, fall.velocity[:, None].expand(-1, fall.disk.num_vertices, -1).flatten(0, 1)
+    with torch.no_grad():
+        end = dv.rollout(fall.model, x, v, steps=fall.version.steps, save="last", **given)
+    leaves = tuple(t[-1].detach().requires_grad_() for t in (end.x, end.v))
+    return lambda: torch.autograd.grad(sum(t.sum() for t in dv.step(fall.model, *leaves, **given)), leaves)
+
+
+def _grippers(card: Card, scenes: int) -> list[Row]:
+    about, forward, both = grippers(card, scenes, CLAMPED_STEPS)
+    many = scenes >= 1024
+    rows = _timed(card, about, CLAMPED_STEPS, forward, both, (None, None))
+    for row, target in zip(rows, (1e5, 3.5e4), strict=True):
+        row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
+        row["target_rate"] = target if many else None
+    return rows
+
+
+def grippers(card: Card, scenes: int, steps: int) -> tuple[Row, Work, Work]:
+    """Scenes in which clamps hold a bar: what they are, some steps of them, and these with their gradients."""
+    scene = gripper(5, (3, 5, 5), detections=DETECTIONS, reach=REACH)
+    model, clamps = scene.model.to(card.device), scene.given["prescribed"]
+    rest = model.rest_points
+    shares = torch.ones((scenes, 1, 3)).to(rest)  # they close differently, and lift alike
+    shares[..., 0] += 0.5 * torch.rand((scenes, 1), generator=torch.Generator().manual_seed(0)).to(rest)
+    x, v = rest.expand(scenes, -1, -1).clone(), rest.new_zeros((scenes, *rest.shape))
+
+    def ends(step: int) -> Tensor:
+        end = clamps(step * CLAMPED_STEP).to(rest)
+        return rest + shares * (end - rest)
+
+    def step(at: Tensor, speed: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        return dv.step(model, at, speed, dv.VBD(CLAMPED_STEP, CLAMPED_SWEEPS), mu=1e5, lam=2e5, prescribed=ends_of[k])
+
+    ends_of = [ends(k + 1) for k in range(CLOSING + steps)]
+    with torch.no_grad():
+        for k in range(CLOSING):
+            x, v = step(x, v, k)
+    leaves = tuple(t.requires_grad_() for t in (x, v))
+
+    def moved() -> Tensor:
+        at, speed = leaves
+        for k in range(CLOSING, CLOSING + steps):
+            at, speed = step(at, speed, k)
+        return at
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return moved()
+
+    def both() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(moved().sum(), leaves)
+
+    forward()
+    status = dv.contact.status(model)
+    pairs = status.pairs / scenes
+    dv.contact.reserve(model, math.ceil(SPARE * pairs))
+    held_up = sum(status.cut) / (scenes * model.num_active)
+    about: dict[str, Any] = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": CLAMPED_SWEEPS,
+                             "pairs_per_scene": pairs, "held_up": held_up}  # fmt: skip
+    return about, forward, both
+
+
+def _timed(card: Card, about: dict[str, Any], steps: int, forward: Any, both: Any,
+           targets: tuple[float | None, float | None]) -> list[Row]:  # fmt: skip
+    """A row of the forward and one of forward and reverse, in milliseconds a step."""
+    rows: list[Row] = []
+    for part, work, target in zip(("forward", "forward + reverse"), (forward, both), targets, strict=True):
+        eager = milliseconds(card.eager(work, 3), steps)
+        ms = milliseconds(card.graph(work, 5, 3.0), steps)
+        rows.append(about | {"part": part, "ms": ms, "eager_ms": eager, "target_ms": target})
+        card.tidy()
+    return rows
+
 
 DEVICE = "cuda"
 
 
-def peers(card: Card, rate: float) -> list[Row]:
-    """Newton's VBD solver in the same run, where it is installed."""
-    return newton.rows(str(card.device), card.quick)
-
-
-GROUPS: dict[str, Callable[[Card, float], list[Row]]] = {
+DEVICE, ANYWHERE = "cuda", True
+GROUPS: dict[str, Callable[[Card], list[Row]]] = {
     "steps": steps,
     "bunny": bunny,
     "cubes": cubes,
     "batches": batches,
-    "cost": cost,
-    "memory": memory,
     "grid": grid,
     "regimes": regimes,
-    "newton": peers,
     "contact": small_contact,
 }
-
-
-def run(quick: bool, *, device: str = DEVICE, only: str = "", out: Path | None = None) -> dict[str, Any]:
-    names = [name.strip() for name in only.split(",") if name.strip()] or list(GROUPS)
-    unknown = [name for name in names if name not in GROUPS]
-    if unknown:
-        raise SystemExit(f"only: expected names among {', '.join(GROUPS)}, got {', '.join(unknown)}")
-    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
-        raise SystemExit(f"device: no CUDA device here; `--device {device}` needs one, `--device cpu --quick` does not")
-    card = Card(torch.device(device), quick)
-    environment = common.environment(device)
-    results = common.earlier(None if out is None else out / "gpu.json", quick, environment["device"])
-    rate = card.copy_rate()
-    card.tidy()
-    for name in names:
-        start = time.perf_counter()
-        rows = GROUPS[name](card, rate)
-        results[name] = {
-            "rows": rows,
-            "copy_GB_per_s": rate / 1e9,
-            "seconds": time.perf_counter() - start,
-            **common.stamp(common.environment(device)),
-        }
-        failed = sum("error" in row for row in rows)
-        print(
-            f"{name}: {results[name]['seconds']:.0f} s, {len(rows)} rows, {failed} failed", file=sys.stderr, flush=True
-        )
-        if out is not None:
-            common.write("gpu", results, out, quick=quick, device=device)
-    return {name: results[name] for name in GROUPS if name in results}
-
-
-# --- text -------------------------------------------------------------------------------------------------------------
-
-NOTE = """\
-Times are milliseconds per step of the public interface, predictor and velocity included, in float64 unless said:
-*graph* is the median of 20 replays, by CUDA events, of one CUDA graph of 10 steps (or as many as a row says), *eager*
-the same steps called from Python. A backward cannot be captured alone, so *reverse* is the time of a graph of forward
-and reverse less that of a graph of the forward with its tape; state and material gradients are asked for. *Bytes* must
-move through memory in a step whatever the kernel does; *floor* is the time that they take at the copy rate of this card
-({rate:.0f} GB/s, read and written, measured in the same run), and *achieved* is floor over time. Scenes that fit the L2
-cache may beat their floor. Regimes are the median of up to 10 replays of graphs of 10 steps (2 with reverse).
-"""
-
-
-def markdown(results: dict[str, Any]) -> str:
-    first = next(iter(results.values()), {})
-    parts = [NOTE.format(rate=float(first.get("copy_GB_per_s", 0.0)))]
-    if several := common.of_several_runs(results):
-        parts.append(several)
-    for name, table in TABLES.items():
-        if name in results:
-            rows = results[name]["rows"]
-            good = [row for row in rows if "error" not in row]
-            failed = [f"{_about(row)}: {row['error']}" for row in rows if "error" in row]
-            text = table(good) if good else ""
-            parts.append(text + "".join(f"\nNot measured: {line}\n" for line in failed))
-    return "\n".join(parts)
-
-
-def _about(row: Row) -> str:
-    known = (row.get(k) for k in ("name", "part", "material", "vertices", "sweeps", "scenes"))
-    return ", ".join(str(v) for v in known if v is not None)
-
-
-def _millions(value: Any) -> str:
-    return cell(None if value is None else value / 1e6)
-
-
-def _step_table(rows: list[Row]) -> str:
-    header = ("step", "part", "moduli", "graph [ms]", "target", "eager [ms]", "bytes [MB]", "from L2 [MB]",
-              "floor [ms]", "achieved")  # fmt: skip
-    return markdown_table(header, [
-        (r["name"], r["part"], r.get("material"), r["ms"], r.get("target_ms"), r["eager_ms"], _millions(r["bytes"]),
-         _millions(r.get("l2_bytes")), r["floor_ms"], r["fraction"]) for r in rows])  # fmt: skip
-
-
-def _batch_table(rows: list[Row]) -> str:
-    header = ("batch", "graph [ms]", "eager [ms]", "G vertex updates/s", "target", "share of the best", "target")
-    return markdown_table(header, [
-        (r["name"], r["ms"], r["eager_ms"], r["updates"], r["target_updates"], r["share_of_best"], r["target_share"])
-        for r in rows])  # fmt: skip
-
-
-def _cost_table(rows: list[Row]) -> str:
-    header = (f"against unrolled autograd: {rows[0]['name']}", "measured", "target", "unit")
-    return markdown_table(header, [(r["what"], _number(r["value"]), r.get("target"), r["unit"]) for r in rows])
-
-
-def _memory_table(rows: list[Row]) -> str:
-    header = ("peak memory", "part", "measured [MB]", "predicted [MB]", "measured / predicted", "target")
-    return markdown_table(header, [
-        (r["name"], r["part"], _millions(r.get("peak")), _millions(r["predicted"]), r.get("ratio"),
-         f"<= {r['target_ratio']}" if "target_ratio" in r else None) for r in rows])  # fmt: skip
-
-
-def _grid_table(rows: list[Row]) -> str:
-    header = ("vertices", "K", "forward [ms]", "forward, tape [ms]", "reverse [ms]", "reverse / forward", "eager [ms]",
-              "steps timed", "peak of 50 steps, auto [MB]", "peak, all tapes [MB]",
-              "B per vertex, sweep, step")  # fmt: skip
-    text = markdown_table(header, [
-        (r["vertices"], r["sweeps"], r["ms"], r.get("taped_ms"), r.get("reverse_ms"), r.get("ratio"),
-         f"{cell(r['eager_ms'])} + {cell(r.get('reverse_eager_ms'))}", r["steps"], _millions(r.get("rollout_peak")),
-         _millions(r.get("full_peak")), r.get("full_peak_bytes_per_vertex_sweep_step")) for r in rows])  # fmt: skip
-    limit = f"{FULL_TAPE_LIMIT >> 20} MiB a step, or 1/{1 / FULL_TAPE_SHARE:.0f} of the device's memory if that is more"
-    text += f'\nTimes with tape="auto": beyond {limit}, the tape is compact, and the reverse takes longer.\n'
-    each = [float(r["full_peak_bytes_per_vertex_sweep_step"]) for r in rows if r.get("full_peak")]
-    if each:
-        spread = (max(each) - min(each)) / (max(each) + min(each))
-        text += f"\nPeak memory with all tapes kept is linear in K x V within +- {100 * spread:.1f} % (target 13 %).\n"
-    return text
-
-
-def _regime_table(rows: list[Row]) -> str:
-    tables = []
-    for part in ("forward", "forward + reverse"):
-        header = (f"{part}, K = {rows[0]['sweeps']}: vertices", "scenes", *REGIMES, "auto", "best", "auto / best")
-        tables.append(markdown_table(header, [
-            (r["vertices"], r["scenes"], *(_number(r[part].get(k)) for k in (*REGIMES, "auto")), r.get(f"best, {part}"),
-             r.get(f"auto over best, {part}")) for r in rows]))  # fmt: skip
-    return "\n".join(tables)
-
-
-def _number(value: Any) -> str:
-    return cell(float(value)) if isinstance(value, (int, float)) else cell(value)
-
-
-def _peer_table(rows: list[Row]) -> str:
-    header = ("peer", "part", "graph [ms]", "eager [ms]", "earlier version, H100 [ms]", "colors")
-    return markdown_table(header, [
-        (r["name"], r["part"], r["ms"], r["eager_ms"], r["earlier_ms"], r["colors"]) for r in rows])  # fmt: skip
-
-
-TABLES: dict[str, Callable[[list[Row]], str]] = {
-    "steps": _step_table,
-    "bunny": _step_table,
-    "cubes": _step_table,
-    "batches": _batch_table,
-    "cost": _cost_table,
-    "memory": _memory_table,
-    "grid": _grid_table,
-    "regimes": _regime_table,
-    "newton": _peer_table,
-    "contact": contact_table,
-}
+STEP_COLUMNS: dict[str, Any] = {
+    "step": "name", "part": "part", "moduli": "material", "graph [ms]": "ms", "target": "target_ms",
+    "eager [ms]": "eager_ms", "not measured": "error",
+}  # fmt: skip
+TABLES = (
+    Table("Steps of one mesh", "steps", STEP_COLUMNS),
+    Table("The bunny, beside the paper's 3 and 5 ms a step", "bunny", STEP_COLUMNS),
+    Table("A million cubes", "cubes", STEP_COLUMNS),
+    Table("Batches", "batches",
+          {"batch": "name", "graph [ms]": "ms", "eager [ms]": "eager_ms", "G vertex updates/s": "updates",
+           "share of the best": "share_of_best"}),
+    Table("Sweeps and vertices", "grid",
+          {"vertices": "vertices", "K": "sweeps", "forward [ms]": "ms", "forward, tape [ms]": "taped_ms",
+           "reverse [ms]": "reverse_ms", "reverse / forward": "ratio", "eager [ms]": "eager_ms", "steps timed": "steps",
+           "peak of 50 steps, auto [MB]": times("rollout_peak", 1e-6), "peak, all tapes [MB]": times("full_peak", 1e-6),
+           "B per vertex, sweep, step": "full_peak_bytes_per_vertex_sweep_step"}),
+    *(Table(f"Regimes, {part}", "regimes",
+            {"vertices": "vertices", "scenes": "scenes", **{k: f"{part}/{k}" for k in (*REGIMES, "auto")},
+             "best": f"best, {part}", "auto / best": f"auto over best, {part}"}) for part in PARTS),
+    Table("Small scenes with contact", "contact",
+          {"scene": "name", "part": "part", "vertices": "vertices", "K": "sweeps", "pairs a scene": "pairs_per_scene",
+           "vertices held up": "held_up", "graph [ms a step]": "ms", "target": "target_ms",
+           "eager [ms a step]": "eager_ms", "scene-steps/s": "scene_steps_per_s", "target rate": "target_rate"}),
+)  # fmt: skip

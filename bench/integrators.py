@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import titled_tables
+from bench.tables import Table
 from diffvbd import colliders, reference
 
 INTEGRATORS = {"implicit Euler": dv.ImplicitEuler(), "SDIRK2": dv.SDIRK2(), "BDF2": dv.BDF2()}
@@ -19,30 +19,17 @@ GAIN = 1e-6  # share of its energy that a scene must gain to count
 MATERIAL: dict[str, Any] = {"mu": 1e5, "lam": 2e5}
 
 
-def run(quick: bool) -> dict[str, Any]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return {"beam": beam(quick), "bounce": bounce(quick), "impacts": impacts(quick)}
-    finally:
-        torch.set_num_threads(threads)
-
-
 def beam(quick: bool) -> list[dict[str, Any]]:
     """A cantilever of 0.6 m released from rest: error of its end state over its motion after 0.4 s, and the time that
     takes, of ladders of steps. Sweeps fall with the step, so that each ladder does about the same number of them."""
-    mesh = (
-        dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15), split="kuhn")
-        if quick
-        else dv.mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
-    )
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, relaxation=1.6)
+    mesh = dv.mesh.beam(*((7, 3, 3) if quick else (13, 4, 4)), size=(0.6, 0.15, 0.15), split="kuhn")
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 
     def end(steps: int, sweeps: int, integrator: Any) -> Tensor:
-        options = {"steps": steps, "time_step": SECONDS / steps, "sweeps": sweeps, "save": "last", **MATERIAL}
+        solver = dv.VBD(SECONDS / steps, sweeps, relaxation=1.6, integrator=integrator)
         with torch.no_grad():
-            return dv.rollout(model, x, v, integrator=integrator, **options).x[-1]
+            return dv.rollout(model, x, v, solver, steps=steps, save="last", **MATERIAL).x[-1]
 
     exact = end(200 if quick else 3200, 40, dv.SDIRK2())
     motion, out = float((exact - x).norm()), []
@@ -52,30 +39,6 @@ def beam(quick: bool) -> list[dict[str, Any]]:
         for name, integrator in INTEGRATORS.items():
             begun = time.perf_counter()
             error = float((end(steps, sweeps, integrator) - exact).norm()) / motion
-            row |= {f"{name}, error": error, f"{name} [s]": time.perf_counter() - begun}
-        out.append(row)
-    return out
-
-
-def bounce(quick: bool) -> list[dict[str, Any]]:
-    """A soft ball of 10 cm that falls 1 cm on a FloorBarrier at 1 m/s and rises: error over motion at four times."""
-    ball, dhat = dv.mesh.blob(4 if quick else 5, 1, 0.1), 2e-3
-    ball = ball.translate((0, 0.01 + dhat - ball.points[:, 1].min(), 0))
-    model = dv.Model(ball, energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3, dhat=dhat)), coarse="auto")
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    v[:, 1] = -1.0
-
-    def end(steps: int, integrator: Any) -> Tensor:
-        options = {"steps": steps, "time_step": 0.1 / steps, "sweeps": 8, "young": 1e5, "poisson": 0.3}
-        with torch.no_grad():
-            return dv.rollout(model, x, v, integrator=integrator, save=steps // 4, **options).x[1:]
-
-    exact, out = end(256 if quick else 8192, dv.SDIRK2()), []
-    for steps in (32,) if quick else (64, 128, 256, 512, 1024):
-        row: dict[str, Any] = {"time step [ms]": 100 / steps}
-        for name, integrator in INTEGRATORS.items():
-            begun = time.perf_counter()
-            error = float((end(steps, integrator) - exact).norm() / (exact - x).norm())
             row |= {f"{name}, error": error, f"{name} [s]": time.perf_counter() - begun}
         out.append(row)
     return out
@@ -115,8 +78,8 @@ def impacts(quick: bool) -> list[dict[str, Any]]:
     for kind, time_step, (name, integrator) in cases[:3] if quick else cases:
         with torch.no_grad():
             steps = round((0.1 if quick else 0.3) / time_step)
-            motion = dv.rollout(models[kind], x, v, steps=steps, time_step=time_step, sweeps=15, mu=mu, lam=lam,
-                                integrator=integrator, check_contact=False)  # fmt: skip
+            motion = dv.rollout(models[kind], x, v, dv.VBD(time_step, 15, integrator=integrator), steps=steps, mu=mu,
+                                lam=lam, checks=dv.Checks(contact=False))  # fmt: skip
             over = torch.stack([energy(a, b) for a, b in zip(motion.x[1:], motion.v[1:], strict=True)]) / start - 1
         out.append({"integrator": name, "floor": kind, "time step [s]": time_step, "impacts": count,
                     "scenes that gain": int((over.amax(0) > GAIN).sum()), "most gained": float(over.max()),
@@ -125,10 +88,9 @@ def impacts(quick: bool) -> list[dict[str, Any]]:
     return out
 
 
-def markdown(results: dict[str, Any]) -> str:
-    titles = {
-        "beam": "Cantilever of 0.6 m after 0.4 s: error over motion, and seconds on one thread",
-        "bounce": "Ball that bounces on a FloorBarrier for 0.1 s: error over motion, K = 8, coarse corrections",
-        "impacts": "Cubes that fall on a plane: energy over that at the start, worst and median scene",
-    }
-    return titled_tables(results, titles)
+THREADS = 1
+GROUPS = {"beam": lambda card: beam(card.quick),          "impacts": lambda card: impacts(card.quick)}  # fmt: skip
+TABLES = (
+    Table("Cantilever of 0.6 m after 0.4 s: error over motion, and seconds on one thread", "beam"),
+    Table("Cubes that fall on a plane: energy over that at the start, worst and median scene", "impacts"),
+)

@@ -5,6 +5,12 @@ and launches of each kernel, by torch's profiler, and once under ncu, which tell
 share of the device's rates it reaches. Of scenes with contact, which make hundreds of launches, ncu looks at the first
 of a kernel and at every tenth. A kernel that takes more than a small share of the time has a row. ncu fixes the clock
 at its base, below what the times are taken at, and leaves the caches as they are.
+
+A kernel with at least 3 % of the time has a row. Rates are means of the launches that ncu looked at. *Warps active* is
+of those that a multiprocessor has room for, *issue active* of the cycles in which a scheduler could issue an
+instruction, *threads of 32* those that an instruction is for, and *memory*, *L2* and *float64* are of the device's
+rates. A kernel is bound by a rate of which it reaches 60 %, or else by what its warps wait for most. Kernels of the
+regime `"color"` count the time in which they wait for the one before.
 """
 
 from __future__ import annotations
@@ -17,7 +23,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,9 +31,9 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
-from bench import common, gpu_contact
-from bench.common import markdown_table
-from bench.gpu_measure import Card, Work, forward_reverse, model_of, scene_of
+from bench import common, gpu
+from bench.measure import Card, Work, forward_reverse, model_of, scene_of
+from bench.tables import Table, times
 
 DEVICE = "cuda"
 LEAST = 0.03  # share of the time of all kernels from which one has a row
@@ -64,14 +69,6 @@ STALLS = {
     "branch_resolving": "branches",
     "no_instruction": "fetch of instructions",
 }
-ABOUT = """\
-Of a step and its reverse, kernels with at least 3 % of the time: how many launches, of what length, by torch's
-profiler; the rest by NVIDIA's ncu at its base clock, means of the launches that it looked at. *Warps active* is of
-those that a multiprocessor has room for, *issue active* of the cycles in which a scheduler could issue an
-instruction, *threads of 32* those that an instruction is for, and *memory*, *L2* and *float64* are of the device's
-rates. A kernel is bound by a rate of which it reaches 60 %, or else by what its warps wait for most. Kernels of the
-regime `"color"` count the time in which they wait for the one before.
-"""
 Row = dict[str, Any]
 
 
@@ -92,8 +89,8 @@ def _cubes(card: Card) -> Work:
 # Launches of a kernel, counted from 1. Those of the warm-up may count, so that the second and third are first ones too.
 EACH, TENTH = (), ("--kernel-id", "::regex:.*:[1-3]|.*7")
 SCENES: dict[str, tuple[Callable[[Card], Work], tuple[str, ...]]] = {
-    "1,024 grippers": (lambda card: gpu_contact.grippers(card, 1024, 1)[2], TENTH),
-    "cover-the-spot, disks that lie on each other": (gpu_contact.landed_step, TENTH),
+    "1,024 grippers": (lambda card: gpu.grippers(card, 1024, 1)[2], TENTH),
+    "cover-the-spot, disks that lie on each other": (gpu.landed_step, TENTH),
     "195,112 vertices, K = 20": (_plain(58), EACH),
     "125 vertices, K = 20": (_plain(5), EACH),
     "1,000,000 cubes, K = 5, recompute": (_cubes, EACH),
@@ -102,28 +99,21 @@ SCENES: dict[str, tuple[Callable[[Card], Work], tuple[str, ...]]] = {
 
 
 def run(quick: bool, device: str = DEVICE, only: str = "", out: Path | None = None) -> dict[str, Any]:
-    """``only``: scenes, split by semicolons, since their names have commas. Each is written as it ends, beside what
-    earlier runs on the same device have left of the others."""
+    """Each scene is written as it ends, beside what earlier runs on the same device have left of the others; ``only``:
+    scenes, split by semicolons, since their names have commas."""
     if shutil.which("ncu") is None:
         raise SystemExit("ncu: expected NVIDIA Nsight Compute on the path, and it is not there")
-    names = [name for name in only.split(";") if name] or list(SCENES)[: 1 if quick else None]
-    if unknown := [name for name in names if name not in SCENES]:
-        raise SystemExit(f"only: expected names among {'; '.join(SCENES)}, got {'; '.join(unknown)}")
-    card = common.environment(device)["device"]
-    results = common.earlier(None if out is None else out / "kernels.json", quick, card)
-    for name in names:
-        began, failed, rows = time.perf_counter(), "", []
-        try:
-            rows = _rows(name, _times(name, device), list(_launches(name, device)))
-        except (subprocess.TimeoutExpired, RuntimeError) as error:  # the others still come
-            failed = str(error).strip()[-300:]
-        results[name] = {"rows": rows, "failed": failed, **common.stamp(common.environment(device))}
-        print(f"{name}: {time.perf_counter() - began:.0f} s {failed}", file=sys.stderr, flush=True)
-        if rows and out is not None:
-            common.write("kernels", results, out, quick=quick, device=device)
-    if not any(results[name]["rows"] for name in names):
-        raise SystemExit(f"no scene ended: {[results[name]['failed'] for name in names]}")
-    return results
+    names = common.chosen(only, SCENES)[: 1 if quick and not only else None]
+    groups = {name: lambda name=name: measured(name, device) for name in SCENES}
+    return common.by_group("kernels", groups, quick=quick, device=device, home=DEVICE, only=";".join(names), out=out)
+
+
+def measured(name: str, device: str) -> list[Row]:
+    """The rows of a scene; one that says why, where it failed, so that the others still come."""
+    try:
+        return _rows(name, _times(name, device), list(_launches(name, device)))
+    except (subprocess.TimeoutExpired, RuntimeError) as error:
+        return [{"scene": name, "failed": str(error).strip()[-300:]}]
 
 
 def _process(command: list[str], name: str) -> str:
@@ -210,21 +200,13 @@ def _bound(row: Row) -> str:
     return STALLS[max(STALLS, key=lambda stall: row[f"stalled by {stall}"])]
 
 
-def markdown(results: dict[str, Any]) -> str:
-    header = ("scene", "kernel", "of the time", "launches", "us each", "blocks", "registers", "warps active",
-              "issue active", "threads of 32", "memory", "L2", "float64", "bound by")  # fmt: skip
-
-    def shown(row: Row, name: str, form: str = "{:.0%}") -> str:
-        return form.format(row[name]) if name in row else "-"
-
-    given = [row for name in SCENES if name in results for row in results[name]["rows"]]
-    rows = [(r["scene"], f"`{r['kernel']}`", shown(r, "share"), r["launches"], f"{1e6 * r['seconds']:.3g}",
-             *(shown(r, name, "{:.0f}") for name in ("blocks", "registers")), shown(r, "warps"), shown(r, "issues"),
-             shown(r, "threads", "{:.0f}"), *(shown(r, f"rate of {name}") for name in RATES),
-             r["bound"] or "not looked at") for r in given]  # fmt: skip
-    failed = "".join(f"\nNot measured: {name}.\n" for name, group in results.items() if group["failed"])
-    table = markdown_table(header, rows)
-    return f"### What bounds each kernel\n\n{ABOUT}\n{table}{failed}\n{common.of_several_runs(results)}"
+TABLES = (
+    Table("What bounds each kernel: {}", "*",
+          {"kernel": "kernel", "of the time": "share", "launches": "launches", "us each": times("seconds", 1e6),
+           "blocks": "blocks", "registers": "registers", "warps active": "warps", "issue active": "issues",
+           "threads of 32": "threads", **{rate: f"rate of {rate}" for rate in RATES}, "bound by": "bound",
+           "failed": "failed"}),
+)  # fmt: skip
 
 
 def main(arguments: list[str]) -> None:

@@ -1,9 +1,16 @@
-"""Where the solver's limits lie: the F = 0 well, float32, gradient conditioning, relaxation, small bodies, momentum."""
+"""Where the solver's limits lie: the F = 0 well, float32, conditioning, relaxation, rest, stiff
+directions.
+
+The last two are of one direction that is far stiffer than the others: small gaps to planes, and lam far above mu. There
+the gradient farthest from a step in 120 digits has a row: its error over what an ulp in every input does to that
+gradient, the worst of one and three sweeps, full and compact tape.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -11,22 +18,14 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import titled_tables
+from bench.measure import Card
+from bench.tables import Table
 from diffvbd import testing
 from diffvbd.inspect.diagnose import collapse_stretch
+from diffvbd.model.system import system_of
+from diffvbd.testing import many_digits
 
 ARGUMENTS = ("grad_x", "grad_v", "grad_mu", "grad_lam")
-
-
-def run(quick: bool) -> dict[str, Any]:
-    return {
-        "well": well(quick),
-        "float32": float32(quick),
-        "conditioning": conditioning(quick),
-        "relaxation": relaxation(quick),
-        "paper_preset": paper_preset(quick),
-        "momentum": momentum(quick),
-    }
 
 
 # --- the F = 0 well ---------------------------------------------------------------------------------------------------
@@ -64,7 +63,7 @@ def _collapsed(model: dv.Model, f: Tensor, mu: float, lam: float) -> Tensor:
     # steps short enough to follow the force, long enough in all to arrive
     for h, steps in ((0.02, 400), (0.2, 100)):
         for _ in range(steps):
-            x, _ = dv.step(model, x, v, mu=mu, lam=lam, time_step=h, sweeps=20, gravity=(0.0, 0.0, 0.0))
+            x, _ = dv.step(model, x, v, dv.VBD(h, 20), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
     return (x[:, 1:] - x[:, :1]).norm(dim=(-2, -1)) < 1e-2
 
 
@@ -88,14 +87,14 @@ def float32(quick: bool) -> list[dict[str, Any]]:
         small = {k: t.float() for k, t in exact.items()}
         same = {k: t.double() for k, t in small.items()}
         local, truth = _float32_step(model.to(dtype=torch.float32), small), _float32_step(model, same)
-        naive = testing.reference_result(model.to(dtype=torch.float32), small | {"time_step": 1 / 60}, 10)
+        naive = testing.reference_result(model.to(dtype=torch.float32), small, dv.VBD(1 / 60, 10))
         unrounded = _float32_step(model, exact)
 
         def worst(value: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
             return max(testing.relative_error(value[k], expected[k]) for k in ARGUMENTS)
 
         versions = ((model, exact), (model.to(dtype=torch.float32), small))
-        options = {"mu": 1e4, "lam": 2e4, "time_step": 1 / 60, "sweeps": 10, "save": "last"}
+        options = {"mu": 1e4, "lam": 2e4, "save": "last", "solver": dv.VBD(1 / 60, 10)}
         ends = [dv.rollout(m, i["x"], i["v"], steps=100, **options).x[-1] for m, i in versions]
         row = {
             "offset": float(offset),
@@ -111,7 +110,7 @@ def float32(quick: bool) -> list[dict[str, Any]]:
 
 
 def _float32_step(model: dv.Model, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-    return testing.evaluate(lambda **o: dv.step(model, sweeps=10, **o), inputs | {"time_step": 1 / 60})
+    return testing.evaluate(lambda **o: dv.step(model, solver=dv.VBD(1 / 60, 10), **o), inputs, 1 / 60)
 
 
 # --- conditioning of the gradient -------------------------------------------------------------------------------------
@@ -126,10 +125,10 @@ def conditioning(quick: bool) -> list[dict[str, Any]]:
         )
         with mock.patch.dict(testing.CASES, {"strain": case}):
             scene = testing.build_scene("strain")
-        model, inputs = scene.model(), scene.inputs()
-        expected = testing.reference_result(model, inputs, 5)
-        spread = testing.spread(model, inputs, 5, expected=expected)
-        got = testing.evaluate(lambda m=model, **o: dv.step(m, sweeps=5, **o), inputs)
+        model, inputs, solver = scene.model(), scene.inputs(), scene.solver(5)
+        expected = testing.reference_result(model, inputs, solver)
+        spread = testing.spread(model, inputs, solver, expected=expected)
+        got = testing.evaluate(lambda m=model, s=solver, **o: dv.step(m, solver=s, **o), inputs, solver.time_step)
         errors = {k: testing.relative_error(got[k], expected[k]) for k in expected if k.startswith("grad_")}
         worst = max(errors, key=lambda k: errors[k])
         out.append(
@@ -159,13 +158,13 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
     mu, lam = (torch.tensor([m[i] for _ in range(3) for m in materials])[:, None].double() for i in (0, 1))
     out = []
     for omega in (1.0, 1.9) if quick else (1.0, 1.5, 1.6, 1.7, 1.8, 1.85, 1.9, 1.95):
-        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=omega)
+        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
         grown, total = 0, 0
         for h in (1 / 60, 0.2):
             x = torch.where(model.pinned[:, None], points, states)
             v, lost = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool)
             for _ in range(50 if quick else 300):
-                x, v = dv.step(model, x, v, mu=mu, lam=lam, time_step=h, sweeps=5, gravity=(0.0, 0.0, 0.0))
+                x, v = dv.step(model, x, v, dv.VBD(h, 5, relaxation=omega), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
                 # no start is longer than 3 m: at 30 m the sweeps have added energy
                 lost |= (~torch.isfinite(x).all(-1) | (x.norm(dim=-1) > 30)).any(-1)
                 x, v = torch.where(lost[:, None, None], points, x), torch.where(lost[:, None, None], 0.0, v)
@@ -175,65 +174,195 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
     return out
 
 
-# --- the paper's preset on bodies of other sizes ----------------------------------------------------------------------
+# --- bodies at rest ---------------------------------------------------------------------------------------------------
+
+REST_SWEEPS = (0, 1, 2, 3, 5, 10)
+H, GROUND = 0.01, {"height": 0.0, "kappa": 1e3, "dhat": 1e-2}
 
 
-def paper_preset(quick: bool) -> list[dict[str, Any]]:
-    """Error of one step after 20 sweeps relative to the converged one, for the preset and for the default."""
-    out = []
-    for size in (3e-3, 1.0) if quick else (1e-3, 3e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3):
-        mesh = dv.mesh.cube(3, size=size, split="kuhn")
-        pinned = mesh.points[:, 0] < 1e-9 * size
-        models = {"paper": dv.Model.paper(mesh, pinned=pinned), "exact": dv.Model(mesh, pinned=pinned)}
-        points = models["exact"].rest_points
-        noise = torch.from_numpy(testing.generator("paper").uniform(-1, 1, (2, *points.shape)))
-        x = torch.where(models["exact"].pinned[:, None], points, points + 0.1 * size * noise[0])
-        # stiffness and speed follow the size and there is no gravity: without safeguards every size behaves alike
-        options = {"mu": 1e5 * size**2, "lam": 1.5e5 * size**2, "time_step": 1 / 60, "gravity": (0.0, 0.0, 0.0)}
-        v = size * noise[1]
-        goal, _ = dv.step(models["exact"], x, v, sweeps=2000 if quick else 20_000, **options)
-        light = float(models["exact"].mass[models["exact"].color_vertices].min())
-        row = {"size": size, "regularization_over_mass": 1e-6 / light, "saturation_over_edge": 0.1 / (size / 2)}
-        for name, model in models.items():
-            got, _ = dv.step(model, x, v, sweeps=20, **options)
-            row[f"error_{name}"] = float((got - goal).norm() / (goal - x).norm())
-        out.append(row)
+def at_rest(quick: bool, device: str) -> list[dict[str, Any]]:
+    """A cube of 27 vertices, 0.2 m and 3000 kg/m^3, let go 2 mm above where the barrier of a frictionless floor begins,
+    1,500 steps."""
+    mesh = dv.mesh.cube(3, size=0.2, split="kuhn").translate((0.0, 0.012, 0.0))
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND))
+    model, out = dv.Model(mesh, density=3000.0, energies=energies, device=device), []
+    steps = 50 if quick else (1500 if device == "cpu" else 400)
+    for subspace in (None, "rigid"):
+        for sweeps in (1, 5) if quick else REST_SWEEPS:
+            for relaxation in (1.0,) if quick else (0.5, 1.0, 1.6):
+                solver = dv.VBD(H, sweeps, relaxation=relaxation, subspace=subspace)
+                row = {"rigid": subspace == "rigid", "sweeps": sweeps, "relaxation": relaxation, "steps": steps}
+                out.append(row | _watched(model, solver, steps))
     return out
 
 
-# --- momentum ---------------------------------------------------------------------------------------------------------
-
-
-def momentum(quick: bool) -> list[dict[str, Any]]:
-    """What unconverged sweeps of a free body add to its momentum in one step without the rigid correction. (Converged,
-    or with it: nothing.)"""
-    mesh = dv.mesh.cube(4, split="kuhn")
-    model = dv.Model(mesh, rigid=False)
-    noise = torch.from_numpy(testing.generator("momentum").uniform(-1, 1, (2, mesh.num_vertices, 3)))
-    x, v = model.rest_points + 0.03 * noise[0], noise[1]
-    mass, h, out = model.mass[:, None], 1 / 60, []
-    for mu in (1e5, 1e7):
-        for k in (5, 100) if quick else (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 5000):
-            x1, v1 = dv.step(model, x, v, mu=mu, lam=1.5 * mu, time_step=h, sweeps=k, gravity=(0.0, 0.0, 0.0))
-            turn = mass * (torch.linalg.cross(x1, v1) - torch.linalg.cross(x, v) - h * torch.linalg.cross(v1, v))
-            out.append(
-                {
-                    "mu": mu,
-                    "sweeps": k,
-                    "linear": float((mass * (v1 - v)).sum(0).norm() / (mass * v.norm(dim=-1, keepdim=True)).sum()),
-                    "angular": float(turn.sum(0).norm() / (mass * torch.linalg.cross(x, v)).norm(dim=-1).sum()),
-                }
-            )
-    return out
-
-
-def markdown(results: dict[str, Any]) -> str:
-    titles = {
-        "well": "The F = 0 well: uniform stretch; share of random tets with |F| = margin sqrt(3) s* that collapse",
-        "float32": "float32: largest relative error of the gradients of one step (x, v, mu, lam), K = 10",
-        "conditioning": "Conditioning of the gradient over the strain of one step, K = 5",
-        "relaxation": "Rollouts of 300 steps that grow without bound, K = 5",
-        "paper_preset": "The paper's preset on a cube of another size: error of one step after 20 sweeps",
-        "momentum": "Momentum that one unconverged step adds without the rigid correction, relative",
+@torch.no_grad()
+def _watched(model: dv.Model, solver: dv.VBD, steps: int) -> dict[str, Any]:
+    """What became of a body that was let go."""
+    x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
+    low, mu = torch.full((), torch.inf, dtype=x.dtype, device=x.device), 2e5
+    for _ in range(steps):
+        try:
+            x, v = dv.step(model, x, v, solver, mu=mu, lam=2 * mu)
+        except ValueError:  # the state before was no longer finite, or below the floor
+            x, v, low = x * torch.nan, v * torch.nan, low * torch.nan
+            break
+        low = torch.minimum(low, x[:, 1].min())
+    moved = (x - model.rest_points).mean(0)
+    return {
+        "lowest_gap": float(low),
+        "gap": float(x[:, 1].min()),
+        "speed": float(v.norm(dim=-1).max()),
+        "drift": float(moved[[0, 2]].norm()),
     }
-    return titled_tables(results, titles)
+
+
+# --- one direction far stiffer than the others ------------------------------------------------------------------------
+
+GAPS = (1e-3, 1e-4, 1e-5, 1e-6, 3e-7, 1e-7)  # [m]
+NORMALS = ((0.0, 1.0, 0.0), (0.3, 0.9, -0.3), (1.0, 2.0, 3.0), (-0.7, 0.7, 0.02))
+CORNER = ((0.3, 0.9, -0.3), (0.9, 0.2, 0.3))  # two planes that meet at the same vertex of the cube
+RATIOS = (1.0, 1e2, 1e4, 1e6, 1e8, 1e9, 1e10, 1e12)  # lam / mu
+SWEEPS = (1, 3)
+GRAVITY = (0.0, -9.81, 0.0)
+PLACE = np.array([0.3, 0.7, 0.2])  # of the cube [m]: coordinates without zeros have an ulp to move by
+STATE = ("x", "mu", "lam")
+PLANES = ("floor_height", "floor_normal", "floor_kappa", "floor_dhat")
+TIME_STEP = 1 / 60  # [s]
+
+
+class Scene(NamedTuple):
+    model: dv.Model
+    inputs: dict[str, Any]
+    names: tuple[str, ...]  # of the inputs that are differentiated
+    options: dict[str, Any]  # of the solver
+
+    def solver(self, sweeps: int, tape: Any = "full") -> dv.VBD:
+        return dv.VBD(TIME_STEP, sweeps, start="predictor", tape=tape, **self.options)
+
+
+def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
+    """A cube of 8 vertices, 1 m and 1000 kg, with a vertex `gap` above planes; the predictor moves along them, and
+    away by a hundredth of the gap, so that rounding does not decide whether the start has an approach to remove."""
+    mesh = dv.mesh.cube(2, split="kuhn")
+    points = mesh.points + PLACE
+    planes = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
+    height = (points @ planes.T).min(0) - gap
+    floor = dv.FloorBarrier(height=height.tolist(), normal=planes.tolist(), kappa=2e4, dhat=0.1, damping=0.0)
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor))
+    noise = testing.generator("oblique").uniform(-1, 1, points.shape)
+    across = np.linalg.pinv(planes) @ planes  # what of a vector changes the gaps
+    away = np.linalg.pinv(planes) @ np.full(len(planes), 0.01 * gap * 60)
+    v = noise - (noise + np.array(GRAVITY) / 60) @ across + away
+    number = {"kappa": 2e4, "dhat": 0.1, "height": height, "normal": planes}
+    inputs = {
+        "x": torch.from_numpy(points),
+        "v": torch.from_numpy(v),
+        "mu": torch.tensor(1e4, dtype=torch.float64),
+        "lam": torch.tensor(2e4, dtype=torch.float64),
+        "gravity": torch.tensor(GRAVITY, dtype=torch.float64),
+        **{f"floor_{k}": torch.as_tensor(v, dtype=torch.float64) for k, v in number.items()},
+    }
+    return Scene(model, inputs, STATE + PLANES, {"subspace": None})
+
+
+def volumetric(ratio: float, block: str = "exact") -> Scene:
+    """A cube of 8 vertices, 1 m, one face pinned, strained by some per cent, with lam = ratio mu."""
+    mesh = dv.mesh.cube(2, split="kuhn")
+    rng = testing.generator("volumetric")
+    points = torch.from_numpy(mesh.points.copy())
+    pinned = mesh.points[:, 0] < 1e-9
+    model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(),))
+    mu = 1e4 * torch.from_numpy(rng.uniform(0.8, 1.2, mesh.num_tets))
+    inputs = {
+        "x": points + 0.05 * torch.from_numpy(rng.uniform(-1, 1, points.shape)) + torch.from_numpy(PLACE),
+        "v": torch.from_numpy(rng.uniform(-1, 1, points.shape)),
+        "mu": mu,
+        "lam": ratio * mu,
+    }
+    return Scene(model, inputs, STATE, {"block": block})
+
+
+class Errors(NamedTuple):
+    """Relative to the largest entry, by entry of `testing.evaluate`."""
+
+    sensitivity: dict[str, float]
+    errors: dict[str, float]
+
+    def ratios(self) -> dict[str, float]:
+        """Of each gradient, its error over what an ulp in the inputs does to it; below an ulp counts as an ulp."""
+        return {
+            k: e / max(self.sensitivity[k], many_digits.ULP) for k, e in self.errors.items() if k.startswith("grad_")
+        }
+
+    def worst(self) -> str:
+        ratios = self.ratios()
+        return max(ratios, key=lambda k: ratios[k])
+
+
+def measure(scene: Scene, truth: many_digits.Exact, sweeps: int, tape: Any = "full", device: str = "cpu") -> Errors:
+    """A step and its gradients against 120 digits, which `exact` has of the same scene."""
+    there, solver = scene.model.to(device), scene.solver(sweeps, tape)
+
+    def run(**options: Any) -> tuple[Tensor, Tensor]:
+        return dv.step(there, solver=solver, **options)
+
+    found = testing.evaluate(run, testing.on_device(scene.inputs, device), TIME_STEP)
+    found = testing.on_device(found, "cpu")
+    errors = {name: testing.relative_error(found[name], value) for name, value in truth.values.items()}
+    return Errors(truth.sensitivity, errors)
+
+
+def exact(scene: Scene, sweeps: int) -> many_digits.Exact:
+    rng = testing.generator("loss")  # that of testing.evaluate
+    weights = [torch.as_tensor(rng.standard_normal(tuple(scene.inputs["x"].shape))) for _ in range(2)]
+    inputs = {**scene.inputs, "time_step": TIME_STEP}
+    system = system_of(scene.model, scene.solver(sweeps))  # it has what the solver decides
+    return many_digits.exact_step(system, inputs, sweeps, weights, scene.names, scene.solver(sweeps).block)
+
+
+def row(scene: Scene, device: Any) -> dict[str, Any]:
+    """The worst of one and three sweeps and all tapes."""
+    found = []
+    for k in SWEEPS:
+        truth = exact(scene, k)
+        found += [(measure(scene, truth, k, tape, str(device)), k) for tape in ("full", "compact")]
+    errors, sweeps = max(found, key=lambda entry: max(entry[0].ratios().values()))
+    name = errors.worst()
+    return {
+        "sweeps": sweeps,
+        "argument": name.removeprefix("grad_"),
+        "error": errors.errors[name],
+        "sensitivity": errors.sensitivity[name],
+        "error_over_sensitivity": errors.ratios()[name],
+    }
+
+
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    # these have no device of their own
+    "well": lambda card: [] if card.cuda else well(card.quick),
+    "float32": lambda card: [] if card.cuda else float32(card.quick),
+    "conditioning": lambda card: [] if card.cuda else conditioning(card.quick),
+    "relaxation": lambda card: [] if card.cuda else relaxation(card.quick),
+    "rest": lambda card: at_rest(card.quick, str(card.device)),
+    "oblique": lambda card: [
+        {"normals": str(normals), "gap": gap, **row(oblique(gap, normals), card.device)}
+        for normals in ([NORMALS[1:2]] if card.quick else [*((n,) for n in NORMALS), CORNER])
+        for gap in GAPS[:: 5 if card.quick else 1]
+    ],
+    "volumetric": lambda card: [
+        {"block": block, "lam_over_mu": ratio, **row(volumetric(ratio, block), card.device)}
+        for block in ("exact", "paper")
+        for ratio in RATIOS[:: 7 if card.quick else 1]
+    ],
+}
+ANYWHERE = True
+TABLES = (
+    Table("The F = 0 well: uniform stretch; share of random tets with |F| = margin sqrt(3) s* that collapse", "well"),
+    Table("float32: largest relative error of the gradients of one step (x, v, mu, lam), K = 10", "float32"),
+    Table("Conditioning of the gradient over the strain of one step, K = 5", "conditioning"),
+    Table("Rollouts of 300 steps that grow without bound, K = 5", "relaxation"),
+    Table("A cube at rest on a frictionless floor: gaps [m], speed [m/s], drift [m]", "rest"),
+    Table("Gradients beside a plane at a small gap", "oblique"),
+    Table("Gradients with lam far above mu", "volumetric"),
+)

@@ -1,15 +1,15 @@
-"""Figures of the paper that the benchmarks set beside their own: the one place that has them.
+"""Figures of the paper, the one place that has them; `beside` sets them beside ours, from the files of results."""
 
-`beside` sets those of runtime, scale and limitations, which belong to no single benchmark, beside ours.
-"""
+from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.common import cell, markdown_table
+from bench.common import cell
+from bench.tables import markdown_table
 
 # Table "Gradient error vs. the autograd reference": |V| = 115, four steps, by K.
 EXACTNESS = {
@@ -53,19 +53,6 @@ ABLATION = {
     "validity gate det F > 0.5": {26: 4.2e-16, 115: 8.2e-3, 631: 1.2e-1},
 }
 
-# Table of the appendix "The construction on other block solvers"; by vertices, then K
-GENERALITY = {
-    "XPBD, one constraint after another": {
-        26: {1: 3.9e-16, 5: 4.8e-16, 20: 7.0e-16},
-        115: {1: 6.2e-16, 5: 6.0e-16, 20: 5.0e-16},
-    },
-    "PD, springs": {
-        26: {1: 9.3e-16, 5: 9.7e-16, 20: 9.7e-16},
-        115: {1: 2.5e-15, 5: 5.9e-15, 20: 1.1e-14},
-    },
-}
-
-
 # Appendix on depth and outcome, cube-bounce: best distance [m] over 8 starts, and from its default start, by sweeps;
 # Welch's t of the means of two numbers of sweeps; what the task itself reaches [m]
 DEPTH = {
@@ -96,21 +83,6 @@ BUNNY_RATIO, BUNNY_WARP_RATIO = 1.7, 4.2  # backward over forward, appendix on t
 COVER_SECONDS = 40
 DRESS_SINGLE_STAGE = {"dress-mu-lam": (1471, 880), "dress-silhouette": (1528, 900)}
 DRESS_ALTERNATION = (1325, 3310)  # stage B alone: a fixed point that is none of the problem
-
-# Section "Discussion and limitations", and what became of each here
-LIMITATIONS = (
-    ("(i)", "one solver family in full; projective dynamics and XPBD on springs",
-     "partly lifted: XPBD and projective dynamics are public (`dv.solvers`), the latter with tets, and `compose` takes "
-     "any sequence of block updates; tasks, contact and CUDA kernels are those of Vertex Block Descent alone"),
-    ("(ii)", "the derivative of a converged solve is left to equation-level methods",
-     "lifted: `dv.solve` sweeps until a residual meets a tolerance, and `dv.GlobalAdjoint` differentiates the "
-     "equation; the latter takes no pairs and no friction"),
-    ("(iii)", "the backward scatters by atomic additions",
-     "lifted: rows along edges, one writer each, no atomics; the same bits from run to run"),
-    ("(iv)", "Coulomb friction with changing active sets is future work",
-     "partly lifted: lagged, smoothed Coulomb friction on floors, pairs and colliders is differentiated as executed; "
-     "which pairs there are is not differentiated"),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -148,39 +120,29 @@ TASKS = {
 }  # fmt: skip
 
 
-# --- figures of runtime, scale and limitations ------------------------------------------------------------------------
+# --- beside ours ------------------------------------------------------------------------------------------------------
+
+OURS, GLOBAL = "reverse sweep", ("global, assembled", "global, matrix-free")
+FULL, UNROLLED = "reverse sweep, full tape", "unrolled autograd"
+Line = tuple[Any, ...]  # figure, paper, ours on the CPU and on a GPU
 
 
 def beside(results: Path) -> str:
-    """What the paper says of runtime, scale and its limitations beside ours, from the files of a folder of results; a
-    figure that is not there is "-"."""
-    gpu, logs = _content(results / "gpu.json"), results / "tasks"
-    rows: list[tuple[Any, ...]] = [
-        *_grid(gpu.get("results", {}).get("grid", {}).get("rows", [])),
-        *_bunny(gpu.get("results", {}).get("bunny", {}).get("rows", [])),
-        *_cover(logs),
-        *_dress(logs),
-    ]
-    table = markdown_table(("figure", "paper", "ours"), rows)
-    limits = markdown_table(("limitation", "the paper says", "here"), LIMITATIONS)
-    return f"{BESIDE}\n{table}\n### Its limitations\n\n{limits}"
-
-
-NO_WARP = "no such backend, not measured"
-BESIDE = """\
-## The paper's runtime and scale beside ours
-
-The paper measures its grid on an RTX A6000, the bunny and the tasks on an RTX 4090 Laptop GPU; the machines of ours
-stand below under `gpu` and with the tasks. Compare ratios, not times: meshes and scenes are of like size and not the
-same. The paper does not say whether the times of its grid are of a step or of all 50, so none stand here. Our ratios
-divide the reverse by a forward that writes its tape, both from CUDA graphs. Memory is the peak of torch's allocator in
-a rollout of 50 steps, on both sides; ours keeps all tapes, 72 bytes a vertex, sweep and step. One stage of Adam is here
-stage A of the task, on the sum of both objectives.
-"""
+    """A table of what the paper says and what we measure on each device, from a folder of results; a figure that is not
+    there is "-"."""
+    lines = [*_exactness(results), *_ablation(results), *_cost(results), *_differences(results), *_grid(results),
+             *_bunny(results), *_depth(results), *_cover(results / "tasks"), *_dress(results / "tasks")]  # fmt: skip
+    return markdown_table(("figure", "paper", "ours, CPU", "ours, GPU"), lines)
 
 
 def _content(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def _both(results: Path, name: str, figure: Callable[[dict[str, Any]], Any]) -> list[Any]:
+    """A figure of a benchmark's results on the CPU and on a GPU."""
+    contents = [_content(results / f"{name}{suffix}.json").get("results") for suffix in ("", "-cuda")]
+    return [None if content is None else figure(content) for content in contents]
 
 
 def _range(values: Iterable[Any]) -> str | None:
@@ -192,77 +154,96 @@ def _slashed(values: Iterable[Any]) -> str:
     return " / ".join(cell(value) for value in values)
 
 
-def _grid(rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
+def _exactness(results: Path) -> Iterator[Line]:
+    """By K: the reverse sweep, and the worse global route."""
+    for n, (sweeps, theirs) in enumerate(EXACTNESS.items()):
+        for label, names in ((OURS, (OURS,)), ("global adjoint", GLOBAL)):
+
+            def worst(r: dict[str, Any], n: int = n, names: tuple[str, ...] = names) -> float:
+                return max(r["scenes"]["preset"][n]["routes"][name]["error"] for name in names)
+
+            ours = _both(results, "exactness", worst)
+            yield f"gradient error, K = {sweeps}, {label}", max(theirs[name] for name in names), *ours
+
+
+def _ablation(results: Path) -> Iterator[Line]:
+    for variant, theirs in ABLATION.items():
+
+        def error(r: dict[str, Any], wanted: tuple = (variant, 631, 1)) -> float | None:
+            rows = {(row["variant"], row["vertices"], row["sweeps"]): row["error"] for row in r["rows"]}
+            return rows.get(wanted)
+
+        if "diffvbd" not in variant:
+            yield f"ablation, {variant}", theirs[631], *_both(results, "ablation", error)
+
+
+def _cost(results: Path) -> Iterator[Line]:
+    def of(route: str, key: str = "backward_ms") -> Callable[[dict[str, Any]], float]:
+        return lambda r: next(row[key] for row in r["routes"] if row["route"] == route)
+
+    def unrolled(key: str) -> Callable[[dict[str, Any]], float]:
+        return lambda r: of(UNROLLED, key)(r) / of(FULL, key)(r)
+
+    def faster(r: dict[str, Any]) -> float:
+        return min(of(name)(r) for name in GLOBAL) / of(FULL)(r)
+
+    def stiff(r: dict[str, Any]) -> str:
+        row = next(row for row in r["stiffness"] if row["modulus"] == STIFF_MODULUS)
+        return _slashed(row["routes"][name]["total_iterations"] for name in GLOBAL)
+
+    lines: list[tuple[str, Any, Callable[[dict[str, Any]], Any]]] = [
+        ("backward of four steps [ms]", COST[FULL]["backward_ms"], of(FULL)),
+        ("less time than unrolled autograd, backward", LESS_TIME_THAN_UNROLLED, unrolled("backward_ms")),
+        ("less peak memory than unrolled autograd", LESS_MEMORY_THAN_UNROLLED, unrolled("memory")),
+        ("less time than the faster global route", LESS_TIME_THAN_GLOBAL, faster),
+        (f"global routes at {STIFF_MODULUS:g} Pa, iterations", STIFF_ITERATIONS, stiff),
+    ]
+    yield from ((label, theirs, *_both(results, "cost", ours)) for label, theirs, ours in lines)
+
+
+def _differences(results: Path) -> Iterator[Line]:
+    worst = lambda r: max(row["error"] for row in r["checks"] if "error" in row)  # noqa: E731
+    yield "finite differences, worst check", max(FINITE_DIFFERENCES.values()), *_both(results, "fd", worst)
+
+
+def _grid(results: Path) -> Iterator[Line]:
+    rows = _content(results / "gpu.json").get("results", {}).get("grid", {}).get("rows", [])
     sizes = sorted({row["vertices"] for row in rows})
     peaks = {(row["vertices"], row["sweeps"]): row["full_peak"] for row in rows if row.get("full_peak")}
     ends = [peaks[n, 10] for n in (sizes[0], sizes[-1]) if (n, 10) in peaks] if sizes else []
     more = (None, None) if len(ends) < 2 else (sizes[-1] / sizes[0], ends[1] / ends[0])
-    by_size = [
-        (f"the same at {n} vertices (paper {theirs})", _range(_ratios(theirs)),
-         _range(row.get("ratio") for row in rows if row["vertices"] == n))
-        for n, theirs in zip(sizes, sorted({v for v, _ in GRID}), strict=False)
-    ]  # fmt: skip
     each = [peak / vertices / sweeps / 1e3 for (vertices, sweeps), peak in peaks.items()]
-    return [
-        ("K x V grid, backward over forward", _range(GRID_RATIO), _range(row.get("ratio") for row in rows)),
-        *by_size,
-        ("grid, peak memory [KB per vertex and sweep]", f"about 4, {_range(GRID_KB)}", _range(each)),
-        ("grid at K = 10, times more vertices / times more memory", _slashed((GRID_MORE_VERTICES, GRID_MORE_MEMORY)),
-         _slashed(more)),
-    ]  # fmt: skip
+    yield "K x V grid, backward over forward", _range(GRID_RATIO), None, _range(row.get("ratio") for row in rows)
+    yield "grid, peak memory [KB per vertex and sweep]", f"about 4, {_range(GRID_KB)}", None, _range(each)
+    yield ("grid at K = 10, times more vertices / times more memory", _slashed((GRID_MORE_VERTICES, GRID_MORE_MEMORY)),
+           None, _slashed(more))  # fmt: skip
 
 
-def _ratios(vertices: int) -> list[float]:
-    """Backward over forward of the paper's rows of a mesh, without its first call, which compiles."""
-    return [back / forth for (n, k), (forth, back, _) in GRID.items() if n == vertices and (n, k) != (558, 5)]
-
-
-def _bunny(rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
-    times = {row["part"]: row.get("ms") for row in rows}
-    both = times.get("forward with full tape"), times.get("reverse, full tape")
+def _bunny(results: Path) -> Iterator[Line]:
+    rows = _content(results / "gpu.json").get("results", {}).get("bunny", {}).get("rows", [])
+    found = {row["part"]: row.get("ms") for row in rows}
+    both = found.get("forward with full tape"), found.get("reverse, full tape")
     ratio = both[1] / both[0] if both[0] and both[1] else None
-    name = rows[0]["name"] if rows else "bunny"
-    return [
-        (f"{name}: forward / backward of a step [ms]", f"about {_slashed(BUNNY_MS)}", _slashed(both)),
-        ("bunny, backward over forward", BUNNY_RATIO, ratio),
-        ("Warp backend, bunny, forward / backward of a step [ms]", _slashed(BUNNY_WARP_MS), NO_WARP),
-        ("Warp backend, bunny, backward over forward", BUNNY_WARP_RATIO, NO_WARP),
-        ("Warp backend, times slower than the CUDA one", _range(WARP_SLOWER), NO_WARP),
-    ]
+    yield "bunny, K = 20: forward / backward of a step [ms]", f"about {_slashed(BUNNY_MS)}", None, _slashed(both)
+    yield "bunny, backward over forward", BUNNY_RATIO, None, ratio
 
 
-def _cover(logs: Path) -> list[tuple[Any, ...]]:
-    out: list[tuple[Any, ...]] = []
-    for name, where in (("cover-the-spot-cuda", "GPU"), ("cover-the-spot", "CPU")):
-        history = _content(logs / f"{name}.json").get("history", [])
-        first = next((row for row in history if row["uncovered"] == 0), None)
-        total = f"{history[-1]['seconds']:.0f} s for {len(history)} evaluations" if history else None
-        if total and first:
-            total += f"; first 0.0 % in row {first['iteration']:.0f} of the log, after {first['seconds']:.0f} s"
-        out.append((f"cover-the-spot, {where}", f"< {COVER_SECONDS} s for 600" if where == "GPU" else None, total))
-    return out
+def _depth(results: Path) -> Iterator[Line]:
+    for n, (sweeps, theirs) in enumerate(DEPTH.items()):
+        found = _both(results, "depth", lambda r, n=n: f"{r['depths'][n]['mean']:.3f} +- {r['depths'][n]['std']:.3f}")
+        yield f"cube-bounce, {sweeps} sweeps: mean distance [m]", f"{theirs['mean']:.3f} +- {theirs['std']:.3f}", *found
 
 
-def _dress(logs: Path) -> list[tuple[Any, ...]]:
-    out: list[tuple[Any, ...]] = []
+def _cover(logs: Path) -> Iterator[Line]:
+    histories = [_content(logs / f"cover-the-spot{suffix}.json").get("history", []) for suffix in ("", "-cuda")]
+    yield ("cover-the-spot [s], 600 evaluations", f"< {COVER_SECONDS}",
+           *(f"{h[-1]['seconds']:.0f}" if h else None for h in histories))  # fmt: skip
+
+
+def _dress(logs: Path) -> Iterator[Line]:
     for name, theirs in DRESS_SINGLE_STAGE.items():
-        log = _content(logs / f"{name}.json")
-        first = [row for row in log.get("history", []) if row["stage"] == 0]
-        alone = log.get("findings", {}).get("alternation_alone")
-        fixed = str(DRESS_ALTERNATION) if name == "dress-mu-lam" else None
-        out += [
-            (f"{name}, true (1500, 800): (mu, lam) [Pa] of one stage of Adam", str(theirs),
-             _material(first[-1]) + _verdict(name, first[-1], log["truth"]) if first else None),
-            (f"{name}, the alternation of stage B alone", fixed, _material(alone) if alone else None),
-        ]  # fmt: skip
-    return out
-
-
-def _material(row: dict[str, Any]) -> str:
-    return f"({row['mu']:.1f}, {row['lam']:.1f})"
-
-
-def _verdict(name: str, row: dict[str, Any], truth: dict[str, float]) -> str:
-    """Whether this row meets the bars of its task."""
-    met = all(abs(row[key] / truth[key] - 1) <= bar for key, bar in TASKS[name].bars.items())
-    return ", meets the bar alone" if met else ", misses the bar alone"
+        found = []
+        for suffix in ("", "-cuda"):
+            first = [row for row in _content(logs / f"{name}{suffix}.json").get("history", []) if row["stage"] == 0]
+            found.append(f"({first[-1]['mu']:.0f}, {first[-1]['lam']:.0f})" if first else None)
+        yield f"{name}, one stage of Adam, (mu, lam) [Pa]", str(theirs), *found

@@ -14,7 +14,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -23,8 +22,10 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench import common
+from bench.tables import Table
 from diffvbd import mesh
+from diffvbd.testing import regime
 
 DEVICE = "cuda"
 SANITIZER = "compute-sanitizer"
@@ -42,28 +43,30 @@ WORKERS = 14  # processes side by side: each keeps one core and little of the de
 Scene = Callable[[], tuple[dv.Model, Tensor, dict[str, Any]]]
 
 
-def _free(regime: str | None, energies: tuple[Any, ...] = (), **options: Any) -> Scene:
+def _free(regime: str | None, energies: tuple[Any, ...] = (), dtype: torch.dtype = torch.float64, **solver: Any
+          ) -> Scene:  # fmt: skip
     """Scenes without pairs: a beam that is held at one end, bent by its weight, and one that flies."""
 
     def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
         body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
         both = mesh.join([body, body.translate((0.0, 0.3, 0.0))])
         held = torch.tensor((both.points[:, 0] < 1e-9) & (both.body == 0))
-        model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, **options)
-        return model, _moving(model, 3), {"regime": regime}
+        model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, dtype=dtype)
+        return model, _moving(model, 3), {"regime": regime, "solver": solver}
 
     return scene
 
 
-def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, ...] = (), **options: Any) -> Scene:
+def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, ...] = (),
+              dtype: torch.dtype = torch.float64, **solver: Any) -> Scene:  # fmt: skip
     """Three cubes that fly into one another, on what else there is."""
 
     def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
         cube = mesh.box(size, 0.1, split="kuhn")
         bodies = mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
         model = dv.Model(bodies, energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=2e-3), *energies),
-                         colliders=colliders, device=DEVICE, **options)  # fmt: skip
-        return model, _moving(model, scenes), {"regime": None}
+                         colliders=colliders, device=DEVICE, dtype=dtype)  # fmt: skip
+        return model, _moving(model, scenes), {"regime": None, "solver": solver}
 
     return scene
 
@@ -86,11 +89,11 @@ SCENES: dict[str, Scene] = {
     "floor, float32": _free("block", (FLOOR,), dtype=torch.float32),
     "floor, thread": _free("thread", (FLOOR,)),
     "floor and friction": _free("color", (FLOOR, FRICTION)),
-    "coarse": _free(None, coarse="auto", relaxation=1.5),
+    "coarse": _free(None, subspace="coarse", relaxation=1.5),
     "pairs": _touching(1),
     "pairs, friction, a collider": _touching(2, FRICTION, colliders=(PLANE,)),
     "pairs, floor, float32": _touching(2, FLOOR, dtype=torch.float32),
-    "pairs, coarse": _touching(1, coarse="auto"),
+    "pairs, coarse": _touching(1, subspace="coarse"),
     "pairs, many scenes": _touching(70),
     "pairs, a larger scene": _touching(1, size=12),
 }
@@ -104,19 +107,17 @@ def step_of(scene: Scene, steps: int, sweeps: int) -> None:
     for tape in tapes:
         leaves = [t.clone().requires_grad_() for t in (x, v, x.new_full((1, model.num_tets), 1e5))]
         now, speed, mu = leaves
-        with dv.regime(options["regime"]):
+        solver = dv.VBD(0.005, sweeps, tape=tape, **options["solver"])
+        with regime(options["regime"]):
             for _ in range(steps):
-                now, speed = dv.step(model, now, speed, mu=mu, lam=1e5, time_step=0.005, sweeps=sweeps,
-                                     adjoint=dv.ReverseSweep(tape))  # fmt: skip
+                now, speed = dv.step(model, now, speed, solver, mu=mu, lam=1e5)
             gradients = torch.autograd.grad((now - x).square().sum(), leaves)
         assert all(bool(g.abs().max() > 0) for g in gradients)
 
 
 def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
     """``only``: tools or scenes, split by semicolons, since names of scenes have commas."""
-    began, wanted = time.perf_counter(), [name for name in only.split(";") if name]
-    if unknown := [name for name in wanted if name not in (*TOOLS, *SCENES)]:
-        raise SystemExit(f"only: expected names among {'; '.join((*TOOLS, *SCENES))}, got {'; '.join(unknown)}")
+    wanted = [] if not only else common.chosen(only, (*TOOLS, *SCENES))
     if shutil.which(SANITIZER) is None:
         raise SystemExit(f"sanitize: expected NVIDIA's {SANITIZER} on the PATH, and found none")
     tools = [tool for tool in TOOLS if tool in wanted] or list(TOOLS)
@@ -132,7 +133,7 @@ def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
                      "first": next((f["first"] for f in done if f["found"]), ""),
                      "not found again": [f"{f['scene']}: {f['once']}" for f in done if f["once"]],
                      "not done": [f["scene"] for f in own if f["found"] is None]})  # fmt: skip
-    return {"rows": rows, "scenes": names, "seconds": time.perf_counter() - began}
+    return {"rows": rows, "scenes": names}
 
 
 def _of_processes(tool: str, name: str, device: str) -> dict[str, Any]:
@@ -173,12 +174,12 @@ def _first(text: str) -> str:
     return " | ".join(line.strip() for line in lines[1:4] if "SUMMARY" not in line)
 
 
-def markdown(results: dict[str, Any]) -> str:
-    header = ("tool", "scenes", "found", "the first", "not found again", "not done in time")
-    rows = ([row["tool"], row["scenes"], row["found"], row["first"] or "-",
-             *("; ".join(row[key]) or "-" for key in ("not found again", "not done"))]
-            for row in results["rows"])  # fmt: skip
-    return "## compute-sanitizer\n\n" + markdown_table(header, rows) + "\nScenes: " + "; ".join(results["scenes"]) + "."
+TABLES = (
+    Table("compute-sanitizer", "rows",
+          {"tool": "tool", "scenes": "scenes", "found": "found", "the first": "first",
+           "not found again": lambda row: "; ".join(row["not found again"]),
+           "not done in time": lambda row: "; ".join(row["not done"])}),
+)  # fmt: skip
 
 
 def main(arguments: list[str]) -> None:

@@ -3,6 +3,8 @@
 On CUDA with nccl, a GPU for each rank; with `--device cpu --quick` two processes with gloo try the script out. All
 steps of scenes are called eagerly, those of the cubes are a CUDA graph, as in the task. Times are the median of several
 iterations of forward and reverse, from when all ranks begin until all have ended; memory is that of the first.
+
+Of scenes: 10 steps, K = 10, gradients of a network and of mu by `dv.distributed.backward`.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import torch.multiprocessing as mp
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench.tables import Table
 from diffvbd.tasks import Settings, million_cubes
 from diffvbd.tasks.runner import captured
 
@@ -124,8 +126,8 @@ def _scenes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
 
     def loss(part: slice) -> Tensor:
         v = network(goals[part])[:, None].expand(-1, model.num_vertices, -1)
-        end = dv.rollout(model, stretched.expand_as(v), v, steps=STEPS, mu=log_mu.exp(), lam=MODULUS, time_step=STEP,
-                         sweeps=SWEEPS, save="last")  # fmt: skip
+        end = dv.rollout(model, stretched.expand_as(v), v, dv.VBD(STEP, SWEEPS), steps=STEPS, mu=log_mu.exp(),
+                         lam=MODULUS, save="last")  # fmt: skip
         return (end.x[-1] - goals[part, None]).square().sum() / scenes
 
     def gradient(parts: int) -> Tensor:
@@ -167,27 +169,11 @@ def _cubes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
     return [{"ranks": ranks, "bodies": version.bodies, "parts": None, "steps": version.steps, **row}]
 
 
-def markdown(results: dict[str, Any]) -> str:
-    def memory(row: Row) -> str:
-        return ", ".join(f"{peak / 1e9:.2f}" for peak in row["peak_bytes"])
-
-    one = {(row["parts"], row.get("scenes")): row["seconds"] for rows in results.values() for row in rows
-           if row["ranks"] == 1}  # fmt: skip
-
-    def times(row: Row) -> float | None:
-        """How much faster than one rank: with as many parts, or for a part for each rank with one part."""
-        base = one.get((1 if row["parts"] == row["ranks"] else row["parts"], row.get("scenes")))
-        return None if base is None else base / row["seconds"]
-
-    scenes = markdown_table(
-        ("ranks", "parts", "scenes", "vertices of each", "scenes/s, forward and reverse", "times one rank",
-         "peak of each rank [GB]", "bits of one rank"),
-        [(r["ranks"], r["parts"], r["scenes"], r["vertices"], r["scenes_per_s"], times(r), memory(r), r["same_bits"])
-         for r in results["scenes"]])  # fmt: skip
-    cubes = markdown_table(
-        ("ranks", "bodies", "steps", "forward and reverse [s]", "times one rank", "peak of each rank [GB]",
-         "bits of one rank", "of the graph"),
-        [(r["ranks"], r["bodies"], r["steps"], r["seconds"], times(r), memory(r), r["same_bits"], r.get("repeats"))
-         for r in results["cubes"]])  # fmt: skip
-    text = f"{STEPS} steps, K = {SWEEPS}, gradients of a network and of mu, `dv.distributed.backward`.\n\n"
-    return f"## Scenes\n\n{text}{scenes}\n## The task million-cubes, with pushes\n\n{cubes}"
+PEAKS = {"peak of each rank [GB]": lambda row: ", ".join(f"{peak / 1e9:.2f}" for peak in row["peak_bytes"]),
+         "bits of one rank": "same_bits", "of the first call": "repeats"}  # fmt: skip
+TABLES = (
+    Table("Scenes", "scenes", {"ranks": "ranks", "parts": "parts", "scenes": "scenes", "vertices of each": "vertices",
+                               "scenes/s, forward and reverse": "scenes_per_s", **PEAKS}),
+    Table("The task million-cubes, with pushes", "cubes",
+          {"ranks": "ranks", "bodies": "bodies", "steps": "steps", "forward and reverse [s]": "seconds", **PEAKS}),
+)  # fmt: skip

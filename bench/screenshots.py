@@ -13,9 +13,9 @@ from typing import Any
 import torch
 
 import diffvbd as dv
-from bench.common import RESULTS
+from bench.common import ROOT
 
-FOLDER = RESULTS.parents[1] / "docs" / "images"
+FOLDER = ROOT / "docs" / "images"
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SETTLED = 4.0  # [s] until a browser that draws in software has drawn
 
@@ -67,7 +67,7 @@ def motion(picture: Callable[[dv.viz.Viewer], None]) -> None:
     """Bodies that land, colored by speed."""
     model, x, v = scene()
     material = {"mu": 4e4, "lam": 4e4}
-    run = dv.rollout(model, x, v, steps=60, time_step=0.01, sweeps=12, **material)
+    run = dv.rollout(model, x, v, dv.VBD(0.01, 12), steps=60, **material)
     with dv.viz.live(run, model, time_step=0.01, color="speed", play=False, **material) as viewer:
         viewer.frame = 32
         picture(viewer)
@@ -80,7 +80,7 @@ def optimisation(picture: Callable[[dv.viz.Viewer], None]) -> None:
     x0 = model.rest_points
 
     def simulate(mu: Any) -> torch.Tensor:
-        return dv.rollout(model, x0, torch.zeros_like(x0), steps=30, time_step=0.01, sweeps=12, mu=mu, lam=5e4).x
+        return dv.rollout(model, x0, torch.zeros_like(x0), dv.VBD(0.01, 12), steps=30, mu=mu, lam=5e4).x
 
     with torch.no_grad():
         observed = simulate(6e4)
@@ -102,9 +102,9 @@ def sliders(picture: Callable[[dv.viz.Viewer], None]) -> None:
     """A motion behind two sliders."""
     model, x, _ = scene()
 
-    def simulate(mu: float, speed: float) -> dv.Trajectory:
+    def simulate(mu: float, speed: float) -> dv.results.Trajectory:
         v = torch.tensor([speed, 0.0, 0.0], dtype=x.dtype).expand_as(x)
-        return dv.rollout(model, x, v, steps=40, time_step=0.01, sweeps=10, mu=mu, lam=4e4)
+        return dv.rollout(model, x, v, dv.VBD(0.01, 10), steps=40, mu=mu, lam=4e4)
 
     ranges = {"mu": (1e4, 1e5, 2e4), "speed": (-1.0, 1.0, 0.5)}
     with dv.viz.live(simulate, model, time_step=0.01, sliders=ranges, play=False) as viewer:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +19,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table, side_by_side
+from bench.measure import Card
+from bench.tables import Table, count
 
 WRONG, CONVERGED = 0.05, 0.005  # of the motion
 MOST_SWEEPS = 15_000
@@ -27,15 +30,12 @@ SEED = 61
 
 class Scene(NamedTuple):
     model: dv.Model
-    x: Tensor
     v: Tensor
-    gravity: tuple[float, float, float]
+    gravity: float  # [m/s^2], along y
     steps: int
-    time_step: float
-    sweeps: int
+    solver: dv.VBD
     young: float
     poisson: float
-    integrator: Any
 
 
 def _relaxation(rng: np.random.Generator) -> float:
@@ -50,38 +50,39 @@ def on_floor(rng: np.random.Generator, bounces: bool) -> Scene:
     dhat, h = 10 ** rng.uniform(-2.6, -2), 10 ** rng.uniform(-3.3, -2)
     gap = rng.uniform(1.5, 6) * dhat
     floor = dv.FloorBarrier(height=-gap, kappa=10 ** rng.uniform(3, 5.5), dhat=dhat)
-    model = dv.Model(body, energies=(dv.StableNeoHookean(), floor), relaxation=_relaxation(rng))
-    x, speed = model.rest_points, rng.uniform(0.5, 3) if bounces else rng.uniform(0, 0.5)
-    v = torch.zeros_like(x)
+    model, relaxation = dv.Model(body, energies=(dv.StableNeoHookean(), floor)), _relaxation(rng)
+    speed = rng.uniform(0.5, 3) if bounces else rng.uniform(0, 0.5)
+    v = torch.zeros_like(model.rest_points)
     v[:, 1] = -speed
     duration = 2.5 * gap / speed + 0.12 if bounces else FLOOR_TIME
-    return Scene(model, x, v, (0.0, 0.0 if bounces else -9.81, 0.0), _steps(duration, h), h, int(rng.integers(2, 25)),
-                 10 ** rng.uniform(4, 7), rng.uniform(0.2, 0.45), dv.ImplicitEuler())  # fmt: skip
+    solver = dv.VBD(h, int(rng.integers(2, 25)), relaxation=relaxation)
+    return Scene(model, v, 0.0 if bounces else -9.81, _steps(duration, h), solver, 10 ** rng.uniform(4, 7),
+                 rng.uniform(0.2, 0.45))  # fmt: skip
 
 
 def cantilever(rng: np.random.Generator) -> Scene:
     width, length = rng.uniform(0.03, 0.1), 0.4
     body = dv.mesh.beam(int(rng.integers(4, 10)), 3, 3, size=(length, width, width))
-    model = dv.Model(body, pinned=body.points[:, 0] < 1e-9, relaxation=_relaxation(rng))
-    x, young, h = model.rest_points, 10 ** rng.uniform(4, 7), 10 ** rng.uniform(-3.3, -1.7)
-    v, falls = torch.zeros_like(x), rng.random() < 0.5
+    model, relaxation = dv.Model(body, pinned=body.points[:, 0] < 1e-9), _relaxation(rng)
+    young, h = 10 ** rng.uniform(4, 7), 10 ** rng.uniform(-3.3, -1.7)
+    v, falls = torch.zeros_like(model.rest_points), rng.random() < 0.5
     if not falls:
-        v[:, 1] = rng.uniform(1, 9) * x[:, 0].square()
-    duration = 1.5 * _period(young, length, width)
+        v[:, 1] = rng.uniform(1, 9) * model.rest_points[:, 0].square()
     integrator = rng.choice(np.array([dv.ImplicitEuler(), dv.ImplicitEuler(), dv.BDF2(), dv.SDIRK2()], dtype=object))
-    return Scene(model, x, v, (0.0, -9.81 if falls else 0.0, 0.0), _steps(duration, h), h, 10, young,
-                 rng.uniform(0.2, 0.45), integrator)  # fmt: skip
+    solver = dv.VBD(h, 10, relaxation=relaxation, integrator=integrator)
+    return Scene(model, v, -9.81 if falls else 0.0, _steps(1.5 * _period(young, length, width), h), solver, young,
+                 rng.uniform(0.2, 0.45))  # fmt: skip
 
 
 def taper(rng: np.random.Generator) -> Scene:
     body, h, young = sliver_taper(rng), 10 ** rng.uniform(-3, -1.7), 10 ** rng.uniform(4, 7)
-    coarse = rng.random() < 0.5
-    model = dv.Model(body, pinned=body.points[:, 0] < 1e-9, relaxation=1.5 if coarse else _relaxation(rng),
-                     coarse="auto" if coarse else None)  # fmt: skip
-    x = model.rest_points
+    model, coarse = dv.Model(body, pinned=body.points[:, 0] < 1e-9), rng.random() < 0.5
+    relaxation = 1.5 if coarse else _relaxation(rng)
     integrator = dv.SDIRK2() if rng.random() < 0.5 else dv.ImplicitEuler()
-    return Scene(model, x, torch.zeros_like(x), (0.0, -9.81, 0.0), _steps(1.5 * _period(young, 0.6, 0.1), h), h,
-                 int(rng.integers(2, 20)), young, rng.uniform(0.2, 0.4), integrator)  # fmt: skip
+    solver = dv.VBD(h, int(rng.integers(2, 20)), relaxation=relaxation, integrator=integrator,
+                    subspace="coarse" if coarse else "rigid")  # fmt: skip
+    return Scene(model, torch.zeros_like(model.rest_points), -9.81, _steps(1.5 * _period(young, 0.6, 0.1), h), solver,
+                 young, rng.uniform(0.2, 0.4))  # fmt: skip
 
 
 def sliver_taper(rng: np.random.Generator, least: float = 0.02) -> dv.TetMesh:
@@ -116,13 +117,12 @@ KINDS = {"drop on a floor": lambda rng: on_floor(rng, False), "bounce": lambda r
          "cantilever, K = 10": cantilever, "taper with slivers": taper}  # fmt: skip
 
 
-def rolled(scene: Scene, model: dv.Model, sweeps: int) -> Tensor | None:
+def rolled(scene: Scene, solver: dv.VBD) -> Tensor | None:
     """Frames, or None where the rollout refuses to go on."""
     try:
         with torch.no_grad():
-            return dv.rollout(model, scene.x, scene.v, steps=scene.steps, young=scene.young, poisson=scene.poisson,
-                              time_step=scene.time_step, sweeps=sweeps, integrator=scene.integrator,
-                              gravity=scene.gravity).x  # fmt: skip
+            return dv.rollout(scene.model, scene.model.rest_points, scene.v, solver, steps=scene.steps,
+                              young=scene.young, poisson=scene.poisson, gravity=(0, scene.gravity, 0)).x  # fmt: skip
     except ValueError:
         return None
 
@@ -136,10 +136,11 @@ def apart(a: Tensor, b: Tensor) -> float:
 
 def converged(scene: Scene, floor: bool) -> Tensor | None:
     """Frames of the same steps, whose sweeps trebled change nothing to speak of."""
-    changes: dict[str, Any] = {"relaxation": 1.3, "coarse": None} if floor else {"relaxation": 1.0, "coarse": "auto"}
-    model, sweeps, before = scene.model.replace(**changes), 100, None
+    relaxation, subspace = (1.3, "rigid") if floor else (1.0, "coarse")
+    solver = replace(scene.solver, relaxation=relaxation, subspace=subspace)
+    sweeps, before = 100, None
     while sweeps < MOST_SWEEPS:
-        now = rolled(scene, model, sweeps)
+        now = rolled(scene, replace(solver, sweeps=sweeps))
         if before is not None and now is not None and apart(before, now) < CONVERGED:
             return now
         before, sweeps = now, 3 * sweeps
@@ -153,7 +154,7 @@ def measure(case: tuple[str, int]) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         began = time.perf_counter()
-        frames = rolled(scene, scene.model, scene.sweeps)
+        frames = rolled(scene, scene.solver)
         seconds = time.perf_counter() - began
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -161,30 +162,26 @@ def measure(case: tuple[str, int]) -> dict[str, Any]:
     error = None if reference is None else math.inf if frames is None else apart(frames, reference)
     return {"error": error, "warned": bool(said) or frames is None,
             "of": sorted({str(w.message).split(":")[0] for w in said}),
-            "sweeps": scene.sweeps, "time_step": scene.time_step, "steps": scene.steps, "young": scene.young,
-            "poisson": scene.poisson, "relaxation": scene.model.relaxation, "coarse": scene.model.coarse is not None,
-            "integrator": type(scene.integrator).__name__, "seconds": seconds}  # fmt: skip
+            "sweeps": scene.solver.sweeps, "time_step": scene.solver.time_step, "steps": scene.steps,
+            "young": scene.young, "poisson": scene.poisson, "relaxation": scene.solver.relaxation,
+            "coarse": scene.solver.coarse is not None, "integrator": type(scene.solver.integrator).__name__,
+            "seconds": seconds}  # fmt: skip
 
 
-def counted(rows: list[dict[str, Any]]) -> dict[str, int]:
-    known = [r for r in rows if r["error"] is not None]
-    wrong = [r for r in known if r["error"] > WRONG]
-    return {"wrong, silent": sum(not r["warned"] for r in wrong), "wrong, warned": sum(r["warned"] for r in wrong),
-            "right, warned": sum(r["warned"] for r in known) - sum(r["warned"] for r in wrong),
-            "of these off by 1 % or less": sum(r["warned"] and r["error"] <= 0.01 for r in known),
-            "right, silent": sum(not r["warned"] for r in known) - sum(not r["warned"] for r in wrong),
-            "reference not converged": len(rows) - len(known)}  # fmt: skip
+def kind(name: str) -> Callable[[Card], list[dict[str, Any]]]:
+    return lambda card: [measure((name, number)) for number in range(1 if card.quick else 20)]
 
 
-def run(quick: bool) -> dict[str, Any]:
-    cases = [(kind, number) for kind in KINDS for number in range(1 if quick else 20)]
-    found = dict(side_by_side(measure, cases, at_once=False))
-    rows = {kind: [found[kind, n] for k, n in cases if k == kind] for kind in KINDS}
-    return {"wrong_above": WRONG, "counts": {kind: counted(r) for kind, r in rows.items()}, "rows": rows}
+def wrong(row: Any) -> bool:
+    return row["error"] is not None and not (isinstance(row["error"], float) and row["error"] <= WRONG)
 
 
-def markdown(results: dict[str, Any]) -> str:
-    counts = results["counts"]
-    header = ("kind", *next(iter(counts.values())))
-    table = markdown_table(header, [(kind, *row.values()) for kind, row in counts.items()])
-    return f"## Rollouts off by more than {100 * results['wrong_above']:g} % of their motion\n\n{table}"
+GROUPS = {name: kind(name) for name in KINDS}
+THREADS = 1
+TABLES = (
+    Table(f"Rollouts off by more than {100 * WRONG:g} % of their motion: {{}}", "*",
+          {"rollouts": count(), "wrong, silent": count(lambda row: wrong(row) and not row["warned"]),
+           "wrong, warned": count(lambda row: wrong(row) and row["warned"]),
+           "right, warned": count(lambda row: row["error"] is not None and not wrong(row) and row["warned"]),
+           "reference not converged": count(lambda row: row["error"] is None)}, by="coarse"),
+)  # fmt: skip

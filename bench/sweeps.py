@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import titled_tables
-from diffvbd.inspect.diagnose import diagnose
+from bench.measure import Card, least, timed
+from bench.tables import Table
 
 SWEEPS = (5, 10, 20, 50, 100, 200, 500, 1000)
 RELAXATIONS = (1.0, 1.6)
@@ -19,22 +19,17 @@ MATERIAL = {"mu": 1e5, "lam": 1.5e5}
 STEP = 1 / 60
 
 
-def run(quick: bool) -> dict[str, Any]:
-    sweeps = (5, 50) if quick else SWEEPS
-    return {
-        "hanging_bar": hanging_bar(sweeps, quick),
-        "equal_work": equal_work(quick),
-        "swinging_beam": swinging_beam(sweeps, quick),
-    }
-
-
-def bar(relaxation: float = 1.0, start: Any = "predictor") -> dv.Model:
-    """A bar of 1 m, 11 layers of vertices, held at its upper end. What `start` does, `bench starts` measures."""
+def bar() -> dv.Model:
+    """A bar of 1 m, 11 layers of vertices, held at its upper end."""
     mesh = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2), split="kuhn")
     # x is the long axis of beam(); turned so that it hangs down
     points = np.stack([mesh.points[:, 1], -mesh.points[:, 0], mesh.points[:, 2]], -1)
     mesh = dv.TetMesh(points, mesh.tets, orient=True)
-    return dv.Model(mesh, pinned=points[:, 1] > -1e-9, relaxation=relaxation, start=start)
+    return dv.Model(mesh, pinned=points[:, 1] > -1e-9)
+
+
+def solver(h: float, sweeps: int, relaxation: float = 1.0) -> dv.VBD:
+    return dv.VBD(h, sweeps, relaxation=relaxation, start="predictor")
 
 
 def hanging_bar(sweeps: tuple[int, ...], quick: bool) -> list[dict[str, Any]]:
@@ -44,35 +39,35 @@ def hanging_bar(sweeps: tuple[int, ...], quick: bool) -> list[dict[str, Any]]:
     """
     start = _equilibrium(MATERIAL, quick)
     cases = [(h, omega, k) for h in ((STEP,) if quick else (STEP, 0.1)) for omega in RELAXATIONS for k in sweeps]
-    return [_at_rest(bar(omega), start, h, k, MATERIAL, quick) for h, omega, k in cases]
+    return [_at_rest(start, solver(h, k, omega), MATERIAL, quick) for h, omega, k in cases]
 
 
 def equal_work(quick: bool) -> list[dict[str, Any]]:
     """The bar made 100 times stiffer, 100 sweeps per 1/60 s: few long steps or many short ones."""
     material = {k: 100 * value for k, value in MATERIAL.items()}
     start = _equilibrium(material, quick)
-    return [
-        _at_rest(bar(), start, STEP / n, 100 // n, material, quick) for n in ((1, 20) if quick else (1, 2, 5, 20, 100))
-    ]
+    parts = (1, 20) if quick else (1, 2, 5, 20, 100)
+    return [_at_rest(start, solver(STEP / n, 100 // n), material, quick) for n in parts]
 
 
 def _equilibrium(material: dict[str, float], quick: bool) -> Tensor:
     """Positions of the bar at rest, by steps whose sweeps have converged."""
-    return _settle(bar(1.6), bar().rest_points, 0.1, 500 if quick else 20_000, 20 if quick else 100, material)[1]
+    long = solver(0.1, 500 if quick else 20_000, 1.6)
+    return _settle(bar(), bar().rest_points, long, 20 if quick else 100, material)[1]
 
 
-def _at_rest(
-    model: dv.Model, start: Tensor, h: float, sweeps: int, material: dict[str, float], quick: bool
-) -> dict[str, Any]:
-    before, after = _settle(model, start, h, sweeps, 60 if quick else 5000, material)
-    state = (before, torch.zeros_like(before))
-    left = diagnose(model, after, time_step=h, previous=state, warn=False, **material)
+def _at_rest(start: Tensor, solver: dv.VBD, material: dict[str, float], quick: bool) -> dict[str, Any]:
+    model = bar()
+    before, after = _settle(model, start, solver, 60 if quick else 5000, material)
+    still = torch.zeros_like(before)
+    left = dv.diagnose(model, after, solver, previous=(before, still), warn=False, **material)
+    seconds = least(lambda: timed(lambda: dv.step(model, model.rest_points, still, solver, **material)), 7)
     return {
         "mu": material["mu"],
-        "time_step": h,
-        "relaxation": model.relaxation,
-        "sweeps": sweeps,
-        "ms_per_step": _milliseconds(model, h, sweeps, **material),
+        "time_step": solver.time_step,
+        "relaxation": solver.relaxation,
+        "sweeps": solver.sweeps,
+        "ms_per_step": 1e3 * seconds,
         "elongation": float(-1.0 - after[:, 1].min()),
         "error": float((1.0 + after[:, 1].min()) / (1.0 + start[:, 1].min())) - 1,
         "unbalanced": left.unbalanced,
@@ -80,14 +75,13 @@ def _at_rest(
     }
 
 
-def _settle(
-    model: dv.Model, start: Tensor, h: float, sweeps: int, steps: int, material: dict[str, float]
-) -> tuple[Tensor, Tensor]:
+def _settle(model: dv.Model, start: Tensor, solver: dv.VBD, steps: int, material: dict[str, float]
+            ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """The last two positions of up to `steps` steps without inertia."""
     before = after = checked = start
     for n in range(1, steps + 1):
         before = after
-        after, _ = dv.step(model, before, torch.zeros_like(before), time_step=h, sweeps=sweeps, **material)
+        after, _ = dv.step(model, before, torch.zeros_like(before), solver, **material)
         if n % 20 == 0:
             if float((after - checked).abs().max()) < 1e-9:
                 break
@@ -95,58 +89,15 @@ def _settle(
     return before, after
 
 
-def _milliseconds(model: dv.Model, h: float, sweeps: int, mu: float, lam: float) -> float:
-    """Least time of a step [ms] in a few repetitions."""
-    x = model.rest_points
-    times = []
-    for _ in range(7):
-        begun = time.perf_counter()
-        dv.step(model, x, torch.zeros_like(x), time_step=h, sweeps=sweeps, mu=mu, lam=lam)
-        times.append(time.perf_counter() - begun)
-    return 1e3 * min(times)
+def counts(card: Card) -> tuple[int, ...]:
+    return (5, 50) if card.quick else SWEEPS
 
 
-def swinging_beam(sweeps: tuple[int, ...], quick: bool) -> list[dict[str, Any]]:
-    """Position error after 0.5 s of a cantilever falling from rest, against converged steps of the same h."""
-    steps = 5 if quick else 30
-    out = []
-    for stiffness in (1.0,) if quick else (1.0, 100.0):
-        material = {k: stiffness * value for k, value in MATERIAL.items()}
-        goal = swing(beam(1.6), 500 if quick else 5000, steps, material)
-        moved = float((goal - beam().rest_points).norm(dim=-1).max())
-        for relaxation in RELAXATIONS:
-            for k in sweeps:
-                model = beam(relaxation)
-                error = float((swing(model, k, steps, material) - goal).norm(dim=-1).max())
-                out.append(
-                    {
-                        "mu": material["mu"],
-                        "relaxation": relaxation,
-                        "sweeps": k,
-                        "ms_per_step": _milliseconds(model, STEP, k, **material),
-                        "error": error,
-                        "error_over_motion": error / moved,
-                    }
-                )
-    return out
-
-
-def beam(relaxation: float = 1.0, start: Any = "predictor") -> dv.Model:
-    mesh = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2), split="kuhn")
-    return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=relaxation, start=start)
-
-
-def swing(model: dv.Model, sweeps: int, steps: int, material: dict[str, float]) -> Tensor:
-    """Positions after the last of `steps` steps."""
-    x = model.rest_points
-    options = {"steps": steps, "time_step": STEP, "sweeps": sweeps, "save": "last", **material}
-    return dv.rollout(model, x, torch.zeros_like(x), **options).x[-1]
-
-
-def markdown(results: dict[str, Any]) -> str:
-    titles = {
-        "hanging_bar": "Hanging bar of 1 m: elongation at rest against equilibrium",
-        "equal_work": "The same bar 100 times stiffer, 100 sweeps per 1/60 s",
-        "swinging_beam": "Cantilever of 1 m released from rest: position after 0.5 s against converged steps",
-    }
-    return titled_tables(results, titles)
+GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
+    "hanging_bar": lambda card: hanging_bar(counts(card), card.quick),
+    "equal_work": lambda card: equal_work(card.quick),
+}
+TABLES = (
+    Table("Hanging bar of 1 m: elongation at rest against equilibrium", "hanging_bar"),
+    Table("The same bar 100 times stiffer, 100 sweeps per 1/60 s", "equal_work"),
+)

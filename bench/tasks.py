@@ -15,12 +15,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bench.common import RESULTS, as_json, cell, commit, device_suffix, digits, environment, markdown_table, place
+from bench.common import RESULTS, ROOT, as_json, cell, commit, device_suffix, digits, environment, keep_picture, place
 from bench.paper import TASKS as PAPER
-from bench.plots import keep_picture
+from bench.tables import markdown_table
 from diffvbd.tasks import TASKS, Settings, dress, solve
 
-ROOT = Path(__file__).resolve().parents[1]
 SHARED = {"dress-mu-lam": dress}  # what several tasks share is told once, in the section of the first
 IMAGES = ROOT / "docs" / "images" / "tasks"
 

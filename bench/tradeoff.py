@@ -4,28 +4,142 @@ Nine scenes from soft to extreme. Each way runs with ever shorter steps and seve
 distance to a reference of much shorter steps and more sweeps (root mean square over vertices and four frames, over the
 motion), and that of the gradient of the mean squared way with respect to each modulus and a velocity of all vertices.
 Times are those of one rollout, and of one with its backward. Scenes run side by side, one thread each.
+
+On the two cantilevers other solvers of the same law take part: converged steps, and Newton's SolverVBD where it is
+installed.
 """
 
 from __future__ import annotations
 
+import importlib
+import io
 import math
 import sys
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 import diffvbd as dv
 from bench import common
-from bench.advice_scenes import Scene
-from bench.common import digits, markdown_table
-from bench.tradeoff_peers import peers
-from bench.tradeoff_scenes import SCENES, gripper, pile
-from diffvbd.rollout.tune import FRAMES, Pilot, Pilots, converted, pilots_of
-from diffvbd.rollout.tune import start_of
+from bench.advice import DHAT, FRAMES, Run, Runs, Scene, advised
+from bench.common import digits
+from bench.tables import Table, markdown_table
+from diffvbd import mesh
+
+ELASTIC = dv.StableNeoHookean()
+
+
+def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, speed: float = 0.0, name: str = "") -> Scene:
+    """A beam of 0.6 m held at one end, some swings of it. contrast: of its two halves' stiffness, in layers; speed:
+    of its free end at first [m/s], where it would hardly sag."""
+    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
+    lam = 2 * mu * poisson / (1 - 2 * poisson)
+    share = np.where(body.points[body.tets].mean(1)[:, 1] > 0.075, 1.0, 1 / contrast)
+    scale = torch.tensor(share) if contrast > 1 else torch.tensor(1.0, dtype=torch.float64)
+    swing = math.sqrt(1e5 / mu)
+    duration = float(np.clip(0.4 * swing, 0.02, 0.4))
+    v = torch.zeros_like(model.rest_points)
+    v[:, 1] = speed * (model.rest_points[:, 0] / 0.6) ** 2
+    material = {"mu": mu * scale, "lam": lam * scale}
+    return Scene(name or f"cantilever, mu = {mu:.0e} Pa", model, v, duration, material)
+
+
+def cloth() -> Scene:
+    """A sheet of 0.3 m, 15 mm thick, held at two corners."""
+    body = mesh.sheet(12, 12, (0.3, 0.3), 0.015)
+    points = torch.tensor(body.points)
+    corner = (points[:, 0] < 1e-9) & ((points[:, 2] < 0.02) | (points[:, 2] > 0.28))
+    model = dv.Model(body, pinned=corner)
+    return Scene("cloth of 15 mm", model, torch.zeros_like(model.rest_points), 0.3, {"mu": 3e4, "lam": 3e4})
+
+
+def twist() -> Scene:
+    """A bar whose ends are turned against each other by half a turn in 0.3 s."""
+    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    rest = torch.tensor(body.points)
+    left, right = rest[:, 0] < 1e-9, rest[:, 0] > 0.6 - 1e-9
+    model = dv.Model(body, pinned=left | right)
+    middle = torch.tensor([0.0, 0.075, 0.075], dtype=rest.dtype)
+
+    def turned(t: float) -> Tensor:
+        angle = math.pi / 2 * t / 0.3
+        out = rest.clone()
+        for end, sign in ((left, -1.0), (right, 1.0)):
+            arm = rest[end] - middle
+            c, s = math.cos(sign * angle), math.sin(sign * angle)
+            out[end, 1] = middle[1] + c * arm[:, 1] - s * arm[:, 2]
+            out[end, 2] = middle[2] + s * arm[:, 1] + c * arm[:, 2]
+        return out
+
+    return Scene("twist by half a turn", model, torch.zeros_like(rest), 0.3,
+                 {"mu": 1e5, "lam": 2e5, "prescribed": turned})  # fmt: skip
+
+
+def drop() -> Scene:
+    """A soft ball that falls 1 cm on a floor at 1 m/s, and rises."""
+    body = mesh.blob(5, 1, 0.1)
+    body = body.translate((0, 0.01 + DHAT - body.points[:, 1].min(), 0))
+    model = dv.Model(body, energies=(ELASTIC, dv.FloorBarrier(kappa=1e3, dhat=DHAT)))
+    v = torch.zeros_like(model.rest_points)
+    v[:, 1] = -1.0
+    return Scene("drop on a floor", model, v, 0.1, {"young": 1e5, "poisson": 0.3})
+
+
+def pile(**barrier: Any) -> Scene:
+    """Three boxes that fall on each other and on a floor, with friction."""
+    rng, box = np.random.default_rng(1), mesh.box(3, 0.1, split="kuhn")
+    shifts = [(float(x), 0.005 + 0.105 * n, float(z)) for n, (x, z) in enumerate(rng.uniform(-0.01, 0.01, (3, 2)))]
+    pairs = dv.PairBarrier(**{"kappa": 1e4, "dhat": DHAT, "self_contact": False} | barrier)
+    energies = (ELASTIC, pairs, dv.Friction(0.4), dv.FloorBarrier(kappa=1e4, dhat=DHAT))
+    model = dv.Model(mesh.join([box.translate(shift) for shift in shifts]), energies=energies)
+    return Scene("pile of three boxes", model, torch.zeros_like(model.rest_points), 0.15, {"mu": 1e5, "lam": 2e5})
+
+
+def gripper(n: int = 3, plates: tuple[int, int, int] = (2, 3, 3), **barrier: Any) -> Scene:
+    """A cube between two plates that close in 0.05 s and lift it with the speed that they have reached, by friction.
+
+    Args:
+        n, plates: Vertices along the edges of the cube and of the plates.
+    """
+    size, thick = 0.05, 0.02
+    cube, plate = mesh.box(n, size, split="kuhn"), mesh.box(plates, (thick, 0.06, 0.06), split="kuhn")
+    sides = [plate.translate((x, y, -0.005)) for x, y in ((-thick - DHAT, -0.0052), (size + DHAT, -0.0049))]
+    body = mesh.join([cube, *sides])
+    x = torch.tensor(body.points)
+    outer = (x[:, 0] < -thick - 0.5 * DHAT) | (x[:, 0] > size + thick + 0.5 * DHAT)
+    outer[: cube.num_vertices] = False
+    pairs = dv.PairBarrier(**{"kappa": 1e4, "dhat": DHAT, "self_contact": False} | barrier)
+    model = dv.Model(body, pinned=outer, energies=(ELASTIC, pairs, dv.Friction(0.8)))
+    inward = torch.where(outer, torch.where(x[:, 0] < 0, 1.0, -1.0), 0.0)
+
+    def clamps(t: float) -> Tensor:
+        out = x.clone()
+        out[:, 0] += 1.5e-3 * min(1.0, t / 0.05) * inward
+        out[:, 1] += torch.where(outer, 0.3 * max(0.0, t - 0.05), 0.0)
+        return out
+
+    return Scene("gripper", model, torch.zeros_like(x), 0.15, {"mu": 1e5, "lam": 2e5, "prescribed": clamps})
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "soft": lambda: cantilever(1e4),
+    "stiff": lambda: cantilever(1e8, speed=5.0),
+    "cloth": cloth,
+    "contrast": lambda: cantilever(1e5, contrast=1e6, name="contrast 1e6"),
+    "incompressible": lambda: cantilever(1e5, poisson=0.4999, name="nu = 0.4999"),
+    "twist": twist,
+    "drop": drop,
+    "pile": pile,
+    "gripper": gripper,
+}
 
 LONGEST = 1 / 30  # [s], the first step
 ERRORS = (0.1, 0.01, 0.001)
@@ -47,126 +161,92 @@ FULL, QUICK = Effort(0.5, 40.0, 40.0, 3e-4), Effort(0.05, 1.0, 1.0, 2e-2)
 
 @dataclass(frozen=True)
 class Way:
-    """Settings but for the step, and numbers of sweeps; `changes` are arguments of Model.replace."""
+    """A solver but for its step, and numbers of sweeps."""
 
     name: str
-    settings: dv.Settings
+    solver: dv.VBD
     sweeps: tuple[int, ...]
-    changes: tuple[tuple[str, Any], ...] = ()
+    dtype: torch.dtype | None = None
+    checkpoint_every: Any = "auto"
     elastic: bool = True  # whether it is for scenes without contact
     contact: bool = True  # and with it
     gradient_only: bool = False  # what changes no motion
 
 
-def _plain(**options: Any) -> dv.Settings:
-    return dv.Settings(1.0, 1, **options)
+def _vbd(**options: Any) -> dv.VBD:
+    return dv.VBD(1.0, 1, **options)
 
 
-COARSE: dict[str, Any] = {"relaxation": 1.5, "coarse": "auto"}
+COARSE: dict[str, Any] = {"relaxation": 1.5, "subspace": "coarse"}
 SDIRK2, BDF2 = dv.SDIRK2(), dv.BDF2()
 WAYS = [
-    Way("implicit Euler", _plain(), (5, 20, 80)),
-    Way("implicit Euler, relaxation 1.6", _plain(relaxation=1.6), (20, 80), contact=False),
-    Way("implicit Euler, start at y", _plain(), (20,), (("start", "predictor"),)),
-    Way("implicit Euler, start at x + h v", _plain(), (20,), (("start", "inertia"),)),
-    Way("implicit Euler, coarse", _plain(**COARSE), (2, 8)),
-    Way("implicit Euler, block of the paper", _plain(block="paper"), (20,)),
-    Way("SDIRK2", _plain(integrator=SDIRK2), (5, 20, 80)),
-    Way("SDIRK2, relaxation 1.6", _plain(integrator=SDIRK2, relaxation=1.6), (20, 80), contact=False),
-    Way("SDIRK2, coarse", _plain(integrator=SDIRK2, **COARSE), (2, 8)),
-    Way("SDIRK2, coarse, float32", _plain(integrator=SDIRK2, dtype=torch.float32, **COARSE), (8,), contact=False),
-    Way("SDIRK2, float32", _plain(integrator=SDIRK2, dtype=torch.float32), (20,), elastic=False),
-    Way("BDF2", _plain(integrator=BDF2), (20,)),
-    Way("BDF2, coarse", _plain(integrator=BDF2, **COARSE), (2, 8)),
-    Way("SDIRK2, full tape", _plain(integrator=SDIRK2, tape="full"), (20,), gradient_only=True),
-    Way("SDIRK2, compact tape", _plain(integrator=SDIRK2, tape="compact"), (20,), gradient_only=True),
-    Way("SDIRK2, recomputed tape", _plain(integrator=SDIRK2, tape="recompute"), (20,), gradient_only=True),
-    Way("SDIRK2, a checkpoint every 8 steps", _plain(integrator=SDIRK2, checkpoint_every=8), (20,),
-        gradient_only=True),
+    Way("implicit Euler", _vbd(), (5, 20, 80)),
+    Way("implicit Euler, relaxation 1.6", _vbd(relaxation=1.6), (20, 80), contact=False),
+    Way("implicit Euler, start at y", _vbd(start="predictor"), (20,)),
+    Way("implicit Euler, start at x + h v", _vbd(start="inertia"), (20,)),
+    Way("implicit Euler, coarse", _vbd(**COARSE), (2, 8)),
+    Way("implicit Euler, block of the paper", _vbd(block="paper"), (20,)),
+    Way("SDIRK2", _vbd(integrator=SDIRK2), (5, 20, 80)),
+    Way("SDIRK2, relaxation 1.6", _vbd(integrator=SDIRK2, relaxation=1.6), (20, 80), contact=False),
+    Way("SDIRK2, coarse", _vbd(integrator=SDIRK2, **COARSE), (2, 8)),
+    Way("SDIRK2, coarse, float32", _vbd(integrator=SDIRK2, **COARSE), (8,), torch.float32, contact=False),
+    Way("SDIRK2, float32", _vbd(integrator=SDIRK2), (20,), torch.float32, elastic=False),
+    Way("BDF2", _vbd(integrator=BDF2), (20,)),
+    Way("BDF2, coarse", _vbd(integrator=BDF2, **COARSE), (2, 8)),
+    *(Way(f"SDIRK2, {name} tape", _vbd(integrator=SDIRK2, tape=tape), (20,), gradient_only=True)
+      for name, tape in (("full", "full"), ("compact", "compact"), ("recomputed", "recompute"))),
+    Way("SDIRK2, a checkpoint every 8 steps", _vbd(integrator=SDIRK2), (20,), checkpoint_every=8, gradient_only=True),
 ]  # fmt: skip
-BARRIERS: list[tuple[str, dict[str, Any]]] = [
-    ("1 detection", {"detections": 1}),
-    ("4 detections", {"detections": 4}),
-    ("dhat / 2", {"dhat": 1e-3}),
-    ("dhat x 2", {"dhat": 4e-3}),
-    ("kappa / 10", {"kappa": 1e3}),
-    ("kappa x 10", {"kappa": 1e5}),
-]
+# ways that differ in the backward alone
+ASIDE = {way.name for way in WAYS if way.gradient_only}
 
 
-# ways that are no others for the motion of the scene: they differ in the backward, or move in another scene
-ASIDE = {f"SDIRK2, {label}" for label, _ in BARRIERS} | {way.name for way in WAYS if way.gradient_only}
+Distance = Callable[[Tensor], float]  # of frames [FRAMES, V, 3] to the reference of the scene
 
 
 class Front:
     """Runs of one scene, held against its reference."""
 
     def __init__(self, scene: Scene, effort: Effort, device: str) -> None:
-        self.effort, self.device = effort, device
-        model = scene.model.to(device)
-        self.scene = replace(scene, model=model, v=scene.v.to(device), given=converted(scene.given, device=device))
+        self.effort = effort
+        self.scene = replace(scene, model=scene.model.to(device))
+        self.runs = Runs(self.scene, gradient=True)
         self.truth, self.unsure = self.reference()
 
-    def pilots(self, gradient: bool, model: dv.Model | None = None) -> Pilots:
-        scene = self.scene
-        model = scene.model if model is None else model
-        v, given = converted(scene.v, dtype=model.dtype), converted(scene.given, dtype=model.dtype)
-        return pilots_of(dv.rollout, model, model.rest_points, v, scene.duration, None, gradient, given)
+    def first_steps(self) -> int:
+        return FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST))
 
-    def reference(self) -> tuple[Pilot, tuple[float, float]]:
+    def reference(self) -> tuple[Run, tuple[float, float]]:
         """The last of ever finer runs, and how far its motion and its gradient may be off."""
-        runs = self.pilots(gradient=True)
-        own = start_of(runs)
-        settings = replace(own, sweeps=20 if own.coarse else 80)
-        steps, last, off = FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST)), None, (math.inf, math.inf)
+        solver = _vbd(integrator=SDIRK2) if self.scene.touches else _vbd(integrator=SDIRK2, **COARSE)
+        solver = replace(solver, sweeps=80 if self.scene.touches else 20)
+        steps, last, off = self.first_steps(), None, (math.inf, math.inf)
         while True:
-            now = runs.run(settings, steps)
+            now = self.runs.run(solver, steps)
             if last is not None and now.x is not None:
-                off = self.errors(now, last)
+                off = self.runs.apart(now, last)
             last = now if now.x is not None else last
-            if max(off) < 0.3 * self.effort.finest or runs.spent + 2 * now.seconds > self.effort.reference:
+            if max(off) < 0.3 * self.effort.finest or self.runs.spent + 2 * now.seconds > self.effort.reference:
                 break
             steps *= 2
         if last is None:
-            raise RuntimeError(f"{self.scene.name}: no reference: {now.failure}")
+            raise RuntimeError(f"{self.scene.name}: no reference")
         return last, off
-
-    def errors(self, truth: Pilot, run: Pilot) -> tuple[float, float]:
-        """Of motion and gradient."""
-        if run.x is None or truth.x is None:
-            return math.inf, math.inf
-        runs = self._runs
-        motion = runs.apart(run.x.to(truth.x), truth.x)
-        apart = [float((a.to(b) - b).norm() / b.norm().clamp(min=1e-300))
-                 for a, b in zip(run.gradient, truth.gradient, strict=False)]  # fmt: skip
-        return motion, max(apart, default=math.inf)
 
     def distance(self, frames: torch.Tensor) -> float:
         """Of frames [FRAMES, V, 3] to the reference."""
         assert self.truth.x is not None
-        return self._runs.apart(torch.cat([self.truth.x[:1], frames.to(self.truth.x)]), self.truth.x)
-
-    @property
-    def _runs(self) -> Pilots:
-        return Pilots(dv.rollout, self.scene.model, self.scene.model.rest_points, self.scene.v, self.scene.duration,
-                      self.scene.given)  # fmt: skip
+        x = torch.cat([self.truth.x[:1], frames.to(self.truth.x)])
+        return self.runs.apart(Run(FRAMES, x, 0.0), self.truth)[0]
 
     def way(self, way: Way) -> list[Row]:
-        model = self.scene.model
-        if way.changes:
-            model = model.replace(**dict(way.changes))
-        if way.settings.dtype is not None:
-            model = model.to(dtype=way.settings.dtype)
-        forward, both = self.pilots(False, model), self.pilots(True, model)
-        # not timed: the first checkpointed backward of a process loads torch's compiler, for seconds
-        both.run(replace(way.settings, sweeps=1), 4 * FRAMES)
+        forward, both = (Runs(self.scene, gradient, way.dtype) for gradient in (False, True))
         out = []
         for sweeps in way.sweeps:
-            settings = replace(way.settings, sweeps=sweeps)
-            steps = FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST))
+            solver, steps = replace(way.solver, sweeps=sweeps), self.first_steps()
             while True:
-                run, back = forward.run(settings, steps), both.run(settings, steps)
-                motion, gradient = self.errors(self.truth, back if back.gradient else run)
+                run, back = (runs.run(solver, steps, way.checkpoint_every) for runs in (forward, both))
+                motion, gradient = self.runs.apart(back if back.gradient else run, self.truth)
                 out.append({"way": way.name, "sweeps": sweeps, "steps": steps, "ms": 1e3 * run.seconds,
                             "error": motion, "both_ms": 1e3 * back.seconds, "gradient_error": gradient})  # fmt: skip
                 slow = max(run.seconds, 0.3 * back.seconds) if run.x is not None else 0.0
@@ -177,16 +257,11 @@ class Front:
 
     def advised(self) -> list[Row]:
         """What dv.advise says, run against the same reference."""
-        runs, out, s = self.pilots(False), [], self.scene
+        runs, out = Runs(self.scene), []
         for error in ERRORS:
-            told = dv.advise(s.model, s.model.rest_points, s.v, duration=s.duration, error=error,
-                             patience=self.effort.patience, **s.given)  # fmt: skip
-            assert told.predicted is not None
-            reached = told.predicted.reached
-            run = runs.run(told, told.steps(s.duration))
-            out.append({"asked": error, "settings": str(replace(told, predicted=None)), "reached": reached,
-                        "ms": 1e3 * run.seconds, "error": self.errors(self.truth, run)[0],
-                        "spent": told.predicted.spent, "why": "" if reached else told.predicted.why})  # fmt: skip
+            solver, row = advised(self.scene, error, False, self.effort.patience)
+            run = runs.run(solver, solver.steps(self.scene.duration))
+            out.append(row | {"ms": 1e3 * run.seconds, "error": runs.apart(run, self.truth)[0]})
         return out
 
 
@@ -200,16 +275,12 @@ def measured(name: str, quick: bool, device: str) -> Row:
         model = front.scene.model
         rows = []
         for way in WAYS[:1] if quick else WAYS:
-            if not (way.contact if model.touches or model.floor is not None else way.elastic):
+            if not (way.contact if front.scene.touches else way.elastic):
                 continue
             try:
                 rows += front.way(way)
             except (ValueError, NotImplementedError) as error:  # what this scene does not support
                 rows.append({"way": way.name, "why": str(error)[:160]})
-        for label, options in [] if quick else BARRIERS:
-            if (make := {"pile": pile, "gripper": gripper}.get(name)) is not None:
-                changed = (("energies", make(**options).model.energies),)
-                rows += front.way(Way(f"SDIRK2, {label}", _plain(integrator=SDIRK2), (20,), changed))
         others = peers(front.scene, front.distance, quick) if name in ("soft", "stiff") and device == "cpu" else []
         advised = front.advised()
     print(f"{name}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
@@ -219,17 +290,15 @@ def measured(name: str, quick: bool, device: str) -> Row:
 
 
 def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | None = None) -> dict[str, Any]:
-    chosen = list(SCENES) if only is None else [name.strip() for name in only.split(",")]
-    if unknown := [name for name in chosen if name not in SCENES]:
-        raise ValueError(f"only: expected scenes among {', '.join(SCENES)}, got {', '.join(unknown)}")
+    """Scenes side by side; each is written as it ends, as `common.by_group` does one after another."""
     environment = common.environment(device)
-    path = None if out is None else out / f"tradeoff{common.device_suffix(device)}.json"
-    results = common.earlier(path, quick, environment["device"])
+    suffix = common.device_suffix(device)
+    results = common.earlier(None if out is None else out / f"tradeoff{suffix}.json", quick, environment["device"])
     at_once = device == "cpu" and not quick
-    for name, group in common.side_by_side(measured, chosen, quick, device, at_once=at_once):
+    for name, group in common.side_by_side(measured, common.chosen(only, SCENES), quick, device, at_once=at_once):
         results[name] = group | common.stamp(environment)
         if out is not None:
-            common.write("tradeoff", results, out, quick=quick, device=device, suffix=common.device_suffix(device))
+            common.write("tradeoff", results, out, quick=quick, device=device, suffix=suffix)
     return {name: results[name] for name in SCENES if name in results}
 
 
@@ -252,56 +321,6 @@ def _said(row: Row | None, time: str = "ms") -> str:
     return "-" if row is None else f"{row['way']}, K = {row['sweeps']}, {row['steps']} steps: {digits(row[time])} ms"
 
 
-def others_of(rows: list[Row]) -> list[list[Any]]:
-    """A line for each other solver."""
-    out = []
-    for name in dict.fromkeys(row["solver"] for row in rows):
-        own = [row for row in rows if row["solver"] == name]
-        cells = [best(own, e) for e in ERRORS]
-        least = min(
-            (row for row in own if isinstance(row.get("error"), float)), key=lambda r: r["error"], default=own[0]
-        )
-        out.append([name, *(None if c is None else c["ms"] for c in cells), least.get("error"), least.get("ms"),
-                    least["note"]])  # fmt: skip
-    return out
-
-
-def markdown(results: dict[str, Any]) -> str:
-    """The fastest way to each error, what the default does, and what is advised."""
-    text, header = [], ("error", "fastest motion", "implicit Euler alone", "fastest gradient", "advised")
-    for group in results.values():
-        rows = [r for r in group["rows"] if "steps" in r]
-        own = [r for r in rows if r["way"] not in ASIDE]
-        euler = [r for r in own if r["way"] == "implicit Euler"]
-        table = []
-        for error in ERRORS:
-            told = next((a for a in group["advised"] if a["asked"] == error), None)
-            said = "-" if told is None else f"{told['settings']}: {digits(told['ms'])} ms, error {told['error']:.2g}"
-            if told is not None and not told["reached"]:
-                said = f"cannot be had: {told['why']}"
-            table.append((error, _said(best(own, error)), _said(best(euler, error)),
-                          _said(best(own, error, "gradient_error", "both_ms"), "both_ms"), said))  # fmt: skip
-        unsure = f"{group['unsure']:.1g} (gradient {group['gradient_unsure']:.1g})" if isinstance(
-            group["unsure"], float) else "unknown"  # fmt: skip
-        text.append(f"## {group['scene']}, {group['vertices']} vertices, {group['duration']:.3g} s\n\n"
-                    f"The reference may be off by {unsure}.\n\n{markdown_table(header, table)}")  # fmt: skip
-        ways = []
-        for name in dict.fromkeys(r["way"] for r in rows):
-            of_way = [r for r in rows if r["way"] == name and isinstance(r["error"], float)]
-            if not of_way:
-                continue
-            cells = [best(of_way, e) for e in ERRORS]
-            least = min(of_way, key=lambda r: r["error"])
-            ways.append([name, *(None if c is None else c["ms"] for c in cells), least["error"], least["ms"],
-                         least["both_ms"]])  # fmt: skip
-        text.append(markdown_table(("way", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms",
-                                    "with backward"), ways))  # fmt: skip
-        if group["peers"]:
-            text.append(markdown_table(("solver", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms", "note"),
-                                       others_of(group["peers"])))  # fmt: skip
-    return "\n".join(text) + "\n" + common.of_several_runs(results)
-
-
 def summary(results: dict[str, Any], error: float = 0.01) -> str:
     """A line for each scene: the fastest way to an error of the motion, implicit Euler alone, what dv.advise says."""
     table = []
@@ -317,4 +336,134 @@ def summary(results: dict[str, Any], error: float = 0.01) -> str:
                       else "cannot be had"))  # fmt: skip
     header = ("scene", "vertices, duration", "the fastest way", "implicit Euler alone",
               f"`dv.advise` for {100 * error:g} %: its true error")  # fmt: skip
-    return markdown_table(header, table) + "\n" + common.of_several_runs(results)
+    return markdown_table(header, table)
+
+
+# --- other solvers of the same law ------------------------------------------------------------------------------------
+
+
+def peers(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
+    return [*converged(scene, distance, 1 if quick else 5), *newton(scene, distance, quick)]
+
+
+def converged(scene: Scene, distance: Distance, rungs: int) -> list[Row]:
+    """dv.solve: each step of implicit Euler swept until its residual is 1e-4."""
+    rows = []
+    for rung in range(rungs):
+        x, v, frames, steps, began = scene.model.rest_points, scene.v, [], FRAMES * 2**rung, time.perf_counter()
+        for n in range(1, steps + 1):
+            with torch.no_grad():
+                found = dv.solve(scene.model, x, v, dv.VBD(scene.duration / steps, 1), tolerance=1e-4, max_sweeps=5000,
+                                 on_failure="warn", **scene.given)  # fmt: skip
+            x, v = found.x, found.v
+            frames += [x] if n % (steps // FRAMES) == 0 else []
+        rows.append({"solver": "dv.solve", "iterations": "to 1e-4", "steps": steps, "note": "implicit Euler",
+                     "ms": 1e3 * (time.perf_counter() - began), "error": distance(torch.stack(frames))})  # fmt: skip
+    return rows
+
+
+def newton(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
+    """Newton's SolverVBD on the same mesh and moduli, forward, in float32 on the CPU, where it is installed."""
+    try:
+        warp, engine = importlib.import_module("warp"), importlib.import_module("newton")
+    except ImportError as error:
+        return [{"solver": "Newton SolverVBD", "note": f"not available ({error})"}]
+    model, rows = newton_model(engine, scene), []
+    for count in (2,) if quick else (5, 20, 80):
+        solver = engine.solvers.SolverVBD(model, iterations=count)
+        for rung in range(-1, 1 if quick else 6):  # the first compiles
+            steps, states, seen = FRAMES * 2 ** max(rung, 0), [model.state(), model.state()], []
+            states[0].particle_qd.assign(scene.v.numpy().astype(np.float32))
+            warp.synchronize_device("cpu")
+            start = time.perf_counter()
+            for n in range(1, steps + 1):
+                solver.step(states[0], states[1], model.control(), None, scene.duration / steps)
+                states.reverse()
+                if n % (steps // FRAMES) == 0:
+                    seen.append(states[0].particle_q.numpy().copy())  # on the CPU it is a view
+            seconds = time.perf_counter() - start
+            if rung >= 0:
+                rows.append({"solver": f"Newton {engine.__version__} SolverVBD", "iterations": count, "steps": steps,
+                             "ms": 1e3 * seconds, "error": distance(torch.from_numpy(np.stack(seen).astype(float))),
+                             "note": "implicit Euler in float32"})  # fmt: skip
+    return rows
+
+
+def newton_model(engine: Any, scene: Scene) -> Any:
+    """Newton's model of a scene with one mu and lam, without surface triangles, which would only cost memory."""
+    mesh, pinned = scene.model.mesh, scene.model.pinned.numpy()
+    material = float(scene.given["mu"]), float(scene.given["lam"]), 0.0
+    shape = (mesh.points[mesh.tets[:, 1:]] - mesh.points[mesh.tets[:, :1]]).swapaxes(1, 2)  # columns are edges
+    mass = np.where(pinned, 0.0, scene.model.mass.numpy())
+    builder = engine.ModelBuilder(gravity=(0.0, -9.81, 0.0))
+    builder.add_particles(pos=list(mesh.points), vel=[(0.0, 0.0, 0.0)] * len(mass), mass=mass.tolist(),
+                          flags=np.where(pinned, 0, int(engine.ParticleFlags.ACTIVE)).tolist())  # fmt: skip
+    builder.tet_indices.extend(map(tuple, mesh.tets.tolist()))
+    builder.tet_poses.extend(np.linalg.inv(shape).tolist())
+    builder.tet_activations.extend([0.0] * len(mesh.tets))
+    builder.tet_materials.extend([material] * len(mesh.tets))
+    builder.color()
+    return builder.finalize(device="cpu")
+
+
+# --- tables and picture -----------------------------------------------------------------------------------------------
+
+
+def least_of(rows: list[Row]) -> Row:
+    """Of rows of one way or solver, that of the least error."""
+    return min((r for r in rows if isinstance(r.get("error"), float)), key=lambda r: r["error"], default={})
+
+
+def time_to(error: float) -> Any:
+    return lambda rows: (best(rows, error) or {}).get("ms")
+
+
+TIMES: dict[str, Any] = {
+    **{f"ms to {error:g}": time_to(error) for error in ERRORS},
+    "least error": lambda rows: least_of(rows).get("error"),
+    "in ms": lambda rows: least_of(rows).get("ms"),
+}
+TABLES = (
+    Table("{}: the ways", "*/rows",
+          {**TIMES, "with backward": lambda rows: least_of(rows).get("both_ms")}, by="way"),
+    Table("{}: what dv.advise says", "*/advised", ("asked", "settings", "reached", "ms", "error", "spent", "why")),
+    Table("{}: other solvers", "*/peers", {**TIMES, "note": lambda rows: rows[0]["note"]}, by="solver"),
+)  # fmt: skip
+
+
+def draw(results: dict[str, Any], path: Path) -> None:
+    """Points of the common ways, the front of all, and what dv.advise says."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    drawn = {"implicit Euler": ("o", "C1"), "implicit Euler, coarse": ("s", "C3"), "SDIRK2": ("^", "C0"),
+             "SDIRK2, coarse": ("D", "C2"), "BDF2, coarse": ("v", "C4")}  # fmt: skip
+    groups = list(results.values())
+    columns = min(3, len(groups))
+    figure.set_size_inches(10, 3.0 * -(-len(groups) // columns))
+    all_axes = figure.subplots(-(-len(groups) // columns), columns, squeeze=False).ravel()
+    for ax, group in zip(all_axes, groups, strict=False):
+        rows = [r for r in group["rows"] if isinstance(r.get("error"), float) and isinstance(r["ms"], float)]
+        rows = [r for r in rows if r["way"] not in ASIDE]
+        for name, (marker, color) in drawn.items():
+            shown = [r for r in rows if r["way"] == name]
+            ax.loglog([r["ms"] for r in shown], [r["error"] for r in shown], marker, color=color, markersize=3,
+                      alpha=0.7, label=name)  # fmt: skip
+        front = front_of(rows)
+        ax.loglog([r["ms"] for r in front], [r["error"] for r in front], "k-", linewidth=0.8, label="front of all")
+        told = [a for a in group["advised"] if a["reached"] and isinstance(a["error"], float)]
+        ax.loglog([a["ms"] for a in told], [a["error"] for a in told], "*", color="k", label="dv.advise")
+        if isinstance(group["unsure"], float):
+            ax.axhline(group["unsure"], color="0.6", linestyle=":", label="the reference's own error")
+        ax.set_title(group["scene"], fontsize="small")
+        ax.set(ylim=(1e-5, 3), xlabel="ms of a rollout")
+        ax.xaxis.set_minor_formatter("")
+        ax.set_xlabel("ms of a rollout", fontsize="small")
+        ax.grid(alpha=0.3)
+    for ax in all_axes[len(groups) :]:
+        ax.axis("off")
+    all_axes[0].set_ylabel("error over motion")
+    figure.legend(*all_axes[0].get_legend_handles_labels(), fontsize="x-small", loc="outside lower center", ncols=4)
+    drawn_as = io.BytesIO()
+    figure.savefig(drawn_as, dpi=100)
+    common.keep_picture(drawn_as, path)

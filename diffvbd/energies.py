@@ -63,7 +63,7 @@ class StableNeoHookean:
 
 
 class VertexEnergy:
-    """An energy of one vertex at a time. Subclasses are dataclasses; see docs/extending.md."""
+    """An energy of one vertex at a time. Subclasses are dataclasses; docs/guides/extend.md has the steps."""
 
     name: ClassVar[str]
     bit: ClassVar[int]  # in a scene's mask; follows from the position in VERTEX_ENERGIES

@@ -3,11 +3,20 @@
 import json
 import os
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
 
-import diffvbd
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import diffvbd  # noqa: E402
+from bench import tables  # noqa: E402
+
+# Tables of all measurements, which are not committed: docs/results.md links to these pages.
+RESULTS = tables.write_pages(ROOT / "docs" / "results")
 
 project = "diffvbd"
 author = copyright = "diffvbd authors"
@@ -83,8 +92,12 @@ CONTENTS = """
 def adapt(app: object, docname: str, source: list[str]) -> None:
     """What pages that also have to read well on GitHub leave to the site."""
     text = source[0]
-    if docname in ("results/index", "reference/index"):
+    if docname == "reference/index":
         text += CONTENTS
+    if docname == "results":
+        text += "\nTables: " + ", ".join(f"[{name}](results/{name}.md)" for name in RESULTS) + ".\n"
+    if docname.startswith("results/"):
+        text = f"---\norphan: true\n---\n\n{text}"
     if docname == "tutorials/index":
         text = re.sub(r"^\| (\[.*?\]\((.*?\.ipynb)\))", r"| \1 ({download}`notebook <\2>`)", text, flags=re.MULTILINE)
     elif docname.startswith("tutorials/"):

@@ -6,8 +6,6 @@ import os
 from collections.abc import Generator, Iterator
 from typing import Any
 
-from diffvbd.ops.regimes import regime
-
 # Idle OpenMP threads must sleep, not spin, on a shared machine; read when torch is loaded, so it comes first.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -70,9 +68,9 @@ def pytest_pyfunc_call() -> Generator[None, Any, Any]:
 def growth_is_measured_where_asked(request: pytest.FixtureRequest) -> Iterator[None]:
     """Whether vibrations grow takes up to 24 steps of each new scene, and there are thousands: tests of it ask for it
     by MEASURES_GROWTH."""
-    from diffvbd.step.stability import growth
+    from diffvbd.step.stability import proven
 
-    with contextlib.nullcontext() if getattr(request.module, "MEASURES_GROWTH", False) else growth.proven():
+    with contextlib.nullcontext() if getattr(request.module, "MEASURES_GROWTH", False) else proven():
         yield
 
 
@@ -96,6 +94,7 @@ def device(request: pytest.FixtureRequest) -> str:
 def one_regime(device: str) -> Iterator[None]:
     """For comparisons to the bit between calls of different size, whose regimes may differ: all in the one that runs
     any scene. They must also be so small that a warp works on each vertex (regimes.MANY_LANES_VERTICES)."""
+    from diffvbd.testing import regime
 
     with regime("color") if device == "cuda" else contextlib.nullcontext():
         yield

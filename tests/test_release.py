@@ -76,5 +76,5 @@ def test_an_sdist_has_what_builds_it(tmp_path: Path) -> None:
     assert "Description-Content-Type: text/markdown\n" in described
     # README.md, whose links are text: a package index has no other file of the sources
     assert "](docs/install.md)" in text("README.md") and "![" in text("README.md")
-    assert "| **Start** | install · first gradient" in described and "\nheight.backward()" in described
+    assert "* Identify materials from measured motion." in described and "\nheight.backward()" in described
     assert "](" not in described

@@ -1,12 +1,12 @@
-// THE lists of what the operators of a step read: their schemas, their parameters and the structs that carry them
-// follow from these; twins are the NamedTuples in diffvbd/ops/fields.py. ADJOINT: what is differentiated, in the order
-// of what a backward returns.
+// Lists of what the operators of a step read: their parameters and the structs that carry them follow from these, and
+// so do the NamedTuples in diffvbd/ops/fields.py. ADJOINT: what is differentiated, in the order of what a backward
+// returns.
 #pragma once
-
-#include <torch/csrc/stable/tensor.h>
 
 #include <tuple>
 #include <utility>
+
+#include "operator.h"
 
 // clang-format off
 // The predictor and the start; the body; data of the energies; contact, all empty without it: colliders, stiffness,
@@ -58,20 +58,16 @@
   INDEX(other_order) INDEX(other_ptr) INDEX(other_tets) INDEX(other_tet_ptr)
 // clang-format on
 
-// The parameters of an operator's function, each with a comma; and a struct of them.
-#define DIFFVBD_PARAMETER(name) const torch::stable::Tensor &name,
+// The parameters of an operator, each with a comma; and a struct of them.
+#define DIFFVBD_PARAMETER(name) In name,
 #define DIFFVBD_ITEM(name) name,
+#define DIFFVBD_NONE(name)
 #define DIFFVBD_PARAMETERS(LIST) DIFFVBD_##LIST##_FIELDS(DIFFVBD_PARAMETER, DIFFVBD_PARAMETER)
 #define DIFFVBD_ITEMS(LIST) DIFFVBD_##LIST##_FIELDS(DIFFVBD_ITEM, DIFFVBD_ITEM)
-// Their part of a schema, and that of what is returned.
-#define DIFFVBD_ARGUMENT(name) "Tensor " #name ", "
-#define DIFFVBD_NONE(name)
-#define DIFFVBD_ARGUMENTS(LIST) DIFFVBD_##LIST##_FIELDS(DIFFVBD_ARGUMENT, DIFFVBD_ARGUMENT)
-#define DIFFVBD_RETURNS(LIST) DIFFVBD_##LIST##_FIELDS(DIFFVBD_ARGUMENT, DIFFVBD_NONE)
 
 namespace diffvbd {
 
-#define DIFFVBD_TENSOR(name) torch::stable::Tensor name;
+#define DIFFVBD_TENSOR(name) Tensor name;
 #define DIFFVBD_TUPLE(name) std::make_tuple(name),
 
 // A list by the names of its fields, and the adjoints of one: empty where not wanted.
@@ -93,8 +89,6 @@ DIFFVBD_STRUCT(BeginFields, BEGIN)
 DIFFVBD_STRUCT(CoarseFields, COARSE)
 DIFFVBD_BARS(SweepBars, SWEEP)
 DIFFVBD_BARS(StepBars, STEP)
-using SweepAdjoints = decltype(std::declval<SweepBars>().tensors());
-using FusedAdjoints = decltype(std::declval<StepBars>().tensors());
 
 #undef DIFFVBD_TENSOR
 #undef DIFFVBD_TUPLE

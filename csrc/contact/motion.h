@@ -10,7 +10,7 @@ namespace diffvbd::contact {
 
 using rigid::Vector;
 
-constexpr double kLeastInertia = 1e-9;  // over its trace, added: a body collapsed to a line has none across it
+constexpr double kInertiaFloor = 1e-9;  // over its trace, added: a body collapsed to a line has none across it
 
 template <class T>
 struct MotionInputs {
@@ -71,7 +71,7 @@ DIFFVBD_FN double length(const Vector& a) { return square_root(square(a)); }
 template <class T>
 DIFFVBD_FN constexpr double least_inertia() {
   constexpr double eps = std::numeric_limits<T>::epsilon();
-  return eps < kLeastInertia ? kLeastInertia : eps;
+  return eps < kInertiaFloor ? kInertiaFloor : eps;
 }
 
 template <class T, class Team>

@@ -73,8 +73,8 @@ struct ReverseBegin {
 }  // namespace
 
 template <class T>
-cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const Choice<T>& of_corrected,
-                  const BodyGroups& other_groups, const Choice<T>& of_others, T* x_start, T* y, double* workspace,
+cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const StartChoice<T>& of_corrected,
+                  const BodyGroups& other_groups, const StartChoice<T>& of_others, T* x_start, T* y, double* workspace,
                   cudaStream_t stream) {
   if (in.bodies.scenes * in.bodies.vertices == 0) return cudaSuccess;
   if (in.some_alone) {
@@ -108,10 +108,10 @@ cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups,
   return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, coasted, y}, workspace, stream);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                      \
-  template cudaError_t begin<T>(const start::Inputs<T>&, const BodyGroups&, const Choice<T>&, const BodyGroups&,    \
-                                const Choice<T>&, T*, T*, double*, cudaStream_t);                                   \
-  template cudaError_t begin_backward<T>(const start::Inputs<T>&, const BodyGroups&, const start::Adjoints<T>&, T*, \
+#define DIFFVBD_INSTANTIATE(T)                                                                                        \
+  template cudaError_t begin<T>(const start::Inputs<T>&, const BodyGroups&, const StartChoice<T>&, const BodyGroups&, \
+                                const StartChoice<T>&, T*, T*, double*, cudaStream_t);                                \
+  template cudaError_t begin_backward<T>(const start::Inputs<T>&, const BodyGroups&, const start::Adjoints<T>&, T*,   \
                                          T*, double*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -10,15 +10,15 @@ namespace diffvbd::cuda {
 
 // Bodies whose start is chosen, null for none; their second state; and what receives whether they take it.
 template <class T>
-struct Choice {
+struct StartChoice {
   const start::Candidates<T>* two;
   T* second;
   uint8_t* taken;
 };
 
 template <class T>
-cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const Choice<T>& of_corrected,
-                  const BodyGroups& other_groups, const Choice<T>& of_others, T* x_start, T* y, double* workspace,
+cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const StartChoice<T>& of_corrected,
+                  const BodyGroups& other_groups, const StartChoice<T>& of_others, T* x_start, T* y, double* workspace,
                   cudaStream_t stream);
 template <class T>
 cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups, const start::Adjoints<T>& a,

@@ -14,7 +14,7 @@ struct Anchor {
 
   template <class T>
   static const char* invalid(const T* a) {
-    return a[0] >= 0 ? nullptr : "anchor.stiffness: expected >= 0 N/m";
+    return a[0] >= 0 ? nullptr : "anchor_stiffness: expected >= 0 N/m";
   }
 
   template <class R>

@@ -22,9 +22,9 @@ struct FloorBarrier {
   // what is wrong with the data of one plane, or null
   template <class T>
   static const char* invalid(const T* a) {
-    if (!(a[4] >= 0)) return "floor_barrier.kappa: expected >= 0 N/m";
-    if (!(a[5] > 0)) return "floor_barrier.dhat: expected > 0 m";
-    if (!(a[6] >= 0)) return "floor_barrier.damping: expected >= 0 N s/m";
+    if (!(a[4] >= 0)) return "floor_kappa: expected >= 0 N/m";
+    if (!(a[5] > 0)) return "floor_dhat: expected > 0 m";
+    if (!(a[6] >= 0)) return "floor_damping: expected >= 0 N s/m";
     return nullptr;
   }
 

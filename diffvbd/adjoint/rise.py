@@ -10,9 +10,8 @@ from torch import Tensor
 from .. import ops
 from ..model.moving import MovingBodies
 from ..model.system import System
-from ..ops.rise import potential_rise
-
-ROUNDINGS = 8  # ulps of the terms by which a sum may rise all the same; twin of kRounding in csrc/coarse/length.h
+from ..ops.fields import ROUNDINGS
+from ..ops.sweep import potential_rise
 
 
 class RiseParts(NamedTuple):

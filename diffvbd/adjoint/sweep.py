@@ -1,18 +1,16 @@
 """The sweeps of a step as autograd functions: forward, and the same sweeps transposed as its backward."""
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
-from ..ops import distinct, no_second_derivative, no_transforms, of_inputs, one_by_one, ready_signature
+from ..ops import distinct, no_transforms
 from ..ops.regimes import BLOCK, FEW_LANES, THREAD
 from ..tuples import replaced
 
@@ -56,116 +54,67 @@ _FIELDS = len(ops.SweepFields._fields)
 _STEP_FIELDS = len(ops.StepFields._fields)
 
 
-def _adjoints(bars: dict[str, Tensor], fields: ops.SweepFields | ops.StepFields, needs: tuple[bool, ...]
-              ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Of the fields that need one, each in its field's shape."""
-    wanted = [(bars[name], t) for name, t, need in zip(fields._fields, fields, needs, strict=True)
-              if need and t is not None]  # fmt: skip
-    # of no scenes there is nothing to add up
-    return tuple(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t) for bar, t in wanted)
-
-
 def _wants(names: Sequence[str], fields: Sequence[str], needs: Sequence[bool]) -> dict[str, bool]:
     needed = dict(zip(fields, needs, strict=True))
     return {name: needed[name] for name in names}
 
 
-class _Sweep(Function):
-    """K sweeps of block updates and, as its backward, the same sweeps transposed in reverse order."""
-
-    @staticmethod
-    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev, kappa,
-                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room, corners_prev,
-                coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
-                plan, settings, tape_policy, debug_step, checked):  # fmt: skip
-        # torch.compile counts these arguments: *args would get the context as well
-        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
-                                 collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, center, room, corners_prev, coarse_factor, coarse_mass,
-                                 coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
-        return ops.sweep(fields, packed_rest, plan, settings, tape_policy, debug_step, checked)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        *tensors, ctx.settings, ctx.tape_policy, _, _ = inputs
-        ctx.save_for_backward(*tensors, *output[:2], output[3], output[2])
-        ctx.mark_non_differentiable(*output[1:])
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        if grads[0] is None:
-            return (None,) * (_FIELDS + 6)
-        needs = ctx.needs_input_grad[:_FIELDS]
-        out = _SweepBackward.apply(grads[0], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        return of_inputs(out, needs, 6)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int | None, ...]]:
-        fields = ops.SweepFields(*args[:_FIELDS])
-        _plain(fields)
-        scenes = _scenes(fields, in_dims)
-        folded: list[Any] = [_folded(t, d, info.batch_size, scenes) for t, d in zip(fields, in_dims, strict=False)]
-        full = (info.batch_size * scenes, *folded[0].shape[1:])
-        folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
-        packed_rest, plan, settings, *others = args[_FIELDS:]
-        x, tape, cut, none = _Sweep.apply(*folded, packed_rest, plan, _scenes_first(settings), *others)
-        return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes)), cut, none), (0, 0, None, None)
+def _run(*args: Any) -> tuple[Tensor, ...]:
+    return ops.sweep(ops.SweepFields(*args[:_FIELDS]), *args[_FIELDS:])
 
 
-class _SweepBackward(Function):
-    @staticmethod
-    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev,
-                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
-                corners_prev, coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
-                plan, x, tape, corrections, cut, settings, tape_policy, needs):  # fmt: skip
-        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
-                                 collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, center, room, corners_prev, coarse_factor, coarse_mass,
-                                 coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
-        wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
-        with backward_memory(x, settings, tape_policy):
-            bars = ops.sweep_backward(x_bar, x, tape, corrections, cut, fields, packed_rest, plan, settings,
-                                      tape_policy, wants)  # fmt: skip
-        return _adjoints(bars, fields, needs)
+def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
+    """The same sweeps transposed in reverse order."""
+    fields, (packed_rest, plan, x, tape, corrections, cut) = ops.SweepFields(*saved[:_FIELDS]), saved[_FIELDS:]
+    settings, tape_policy, x_bar = *rest[:2], bars[0]
+    assert x_bar is not None
+    wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
+    with backward_memory(x, settings, tape_policy):
+        out = ops.sweep_backward(x_bar, x, tape, corrections, cut, fields, packed_rest, plan, settings, tape_policy,
+                                 wants)  # fmt: skip
+    return [out.get(name) for name in fields._fields]
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        pass
 
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
-        no_second_derivative()
+def _vmap(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int | None, ...]]:
+    fields = ops.SweepFields(*args[:_FIELDS])
+    _plain(fields)
+    scenes = _scenes(fields, in_dims)
+    folded: list[Any] = [_folded(t, d, info.batch_size, scenes) for t, d in zip(fields, in_dims, strict=False)]
+    full = (info.batch_size * scenes, *folded[0].shape[1:])
+    folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
+    packed_rest, plan, settings, *others = args[_FIELDS:]
+    x, tape, cut, none = apply(*folded, packed_rest, plan, _scenes_first(settings), *others)
+    return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes)), cut, none), (0, 0, None, None)
 
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        x_bar, *saved, settings, tape_policy, needs = args
-        if settings.launch[:1] == (THREAD,):  # its tape has scenes last: run again, with one that does not
-            settings, tape_policy, saved[-3] = _scenes_first(settings), ops.NO_TAPE, x_bar.new_empty((0,))
-        fields = ops.SweepFields(*saved[:_FIELDS])
-        _plain(fields)
-        scenes, size = _scenes((x_bar, *fields), in_dims), info.batch_size
-        folded: list[Any] = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
-        packed_rest, plan, x, tape, corrections, cut = saved[_FIELDS:]
-        x, tape = (
-            t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
-            for t in (_folded(t, d, size, scenes) for t, d in zip((x, tape), in_dims[_FIELDS + 3 :], strict=False))
-        )
-        full = (size * scenes, *x_bar.shape[-2:])
-        # shared inputs get a gradient for each member of the batch: give every differentiated one its own scenes
-        spread: list[Any] = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
-                  for t, need in zip(folded, needs, strict=True)]  # fmt: skip
-        spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
-        out = _SweepBackward.apply(_folded(x_bar, in_dims[0], size, scenes).expand(full), *spread, packed_rest, plan, x,
-                                   tape, corrections, cut, settings, tape_policy, needs)  # fmt: skip
-        out = out if isinstance(out, tuple) else (out,)
-        needed = [(t, d) for t, d, need in zip(fields, in_dims[1:], needs, strict=False) if t is not None and need]
-        shapes = [t.shape[0] if d is None else t.movedim(d, 0).shape[1] for t, d in needed]
-        result = tuple(
-            o.unflatten(0, (size, scenes)) if n == scenes else _member_sum(o.unflatten(0, (size, scenes)))
-            for o, n in zip(out, shapes, strict=True)
-        )
-        return result, (0,) * len(result)
+
+def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    x_bar, *saved, (settings, tape_policy, *others), needs = args
+    if settings.launch[:1] == (THREAD,):  # its tape has scenes last: run again, with one that does not
+        settings, tape_policy, saved[-3] = _scenes_first(settings), ops.NO_TAPE, x_bar.new_empty((0,))
+    fields = ops.SweepFields(*saved[:_FIELDS])
+    _plain(fields)
+    scenes, size = _scenes((x_bar, *fields), in_dims), info.batch_size
+    folded: list[Any] = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
+    packed_rest, plan, x, tape, corrections, cut = saved[_FIELDS:]
+    x, tape = (
+        t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
+        for t in (_folded(t, d, size, scenes) for t, d in zip((x, tape), in_dims[_FIELDS + 3 :], strict=False))
+    )
+    full = (size * scenes, *x_bar.shape[-2:])
+    # shared inputs get a gradient for each member of the batch: give every differentiated one its own scenes
+    spread: list[Any] = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
+              for t, need in zip(folded, needs, strict=True)]  # fmt: skip
+    spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
+    out = apply(_folded(x_bar, in_dims[0], size, scenes).expand(full), *spread, packed_rest, plan, x, tape, corrections,
+                cut, (settings, tape_policy, *others), needs)  # fmt: skip
+    out = out if isinstance(out, tuple) else (out,)
+    needed = [(t, d) for t, d, need in zip(fields, in_dims[1:], needs, strict=False) if t is not None and need]
+    shapes = [t.shape[0] if d is None else t.movedim(d, 0).shape[1] for t, d in needed]
+    result = tuple(
+        o.unflatten(0, (size, scenes)) if n == scenes else _member_sum(o.unflatten(0, (size, scenes)))
+        for o, n in zip(out, shapes, strict=True)
+    )
+    return result, (0,) * len(result)
 
 
 def _plain(fields: ops.SweepFields) -> None:
@@ -194,6 +143,14 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
     return max(sizes)
 
 
+# Fields, packed_rest, plan; settings, tape_policy, debug_step, checked.
+_sweep = ops.Differentiable(
+    _run, _reverse, arguments=_FIELDS + 6, inputs=_FIELDS, tensors=_FIELDS + 2,
+    saved=lambda inputs, made: (*inputs[: _FIELDS + 2], made[0], made[1], made[3], made[2]),
+    vmap=_vmap, vmap_reverse=_vmap_reverse, batched=True,
+)  # fmt: skip
+
+
 def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *, tape_policy: int,
           debug_step: int = -1, checked: bool = True) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Positions after the sweeps [B, V, 3]; with contact the exponents of limits, uint8 [B, K, V], of contact/limit.h;
@@ -205,65 +162,35 @@ def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: 
         packed_rest: The Model's own rest shape [1, slots, 4, lanes], where fields have none.
         tape_policy: What is kept for the backward; ops.NO_TAPE runs the step again there.
     """
-    x, _, cut, corrections = _Sweep.apply(*distinct(*fields), packed_rest, plan, settings, tape_policy, debug_step,
+    x, _, cut, corrections = _sweep(*distinct(*fields), packed_rest, plan, settings, tape_policy, debug_step,
                                           checked)  # fmt: skip
     return x, cut, corrections
 
 
-class _FusedStep(Function):
-    """A whole step on CUDA: predictor, sweeps, velocity. Not for torch.func, which has the parts."""
-
-    @staticmethod
-    def forward(x, v, acceleration, prescribed, mu, lam, mass, rest, packed_rest, plan, settings, tape_policy):
-        fields = ops.StepFields(x, v, acceleration, prescribed, mu, lam, mass, rest)
-        return ops.fused_step(fields, packed_rest, plan, settings, tape_policy)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
-        *tensors, ctx.settings, ctx.tape_policy = inputs
-        ctx.save_for_backward(*tensors, output[0], output[2])
-        ctx.mark_non_differentiable(output[2])
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        if grads[0] is None and grads[1] is None:
-            return (None,) * (_STEP_FIELDS + 4)
-        needs = ctx.needs_input_grad[:_STEP_FIELDS]
-        out = _FusedBackward.apply(*grads[:2], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        return of_inputs(out, needs, 4)
+def _run_fused(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
+    return ops.fused_step(ops.StepFields(*args[:_STEP_FIELDS]), *args[_STEP_FIELDS:])
 
 
-class _FusedBackward(Function):
-    @staticmethod
-    def forward(x_bar, v_bar, x, v, acceleration, prescribed, mu, lam, mass, rest, packed_rest, plan, x_end, tape,
-                settings, tape_policy, needs):  # fmt: skip
-        fields = ops.StepFields(x, v, acceleration, prescribed, mu, lam, mass, rest)
-        wants = _wants(ops.STEP_ADJOINTS, fields._fields, needs)
-        with backward_memory(x, settings, tape_policy):
-            bars = ops.fused_step_backward(x_bar, v_bar, x_end, tape, fields, packed_rest, plan, settings, tape_policy,
-                                           wants)  # fmt: skip
-        return _adjoints(bars, fields, needs)
+def _reverse_fused(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
+                   ) -> list[Any]:  # fmt: skip
+    fields, (packed_rest, plan, x_end, tape) = ops.StepFields(*saved[:_STEP_FIELDS]), saved[_STEP_FIELDS:]
+    settings, tape_policy = rest
+    wants = _wants(ops.STEP_ADJOINTS, fields._fields, needs)
+    with backward_memory(fields.x, settings, tape_policy):
+        out = ops.fused_step_backward(*bars, x_end, tape, fields, packed_rest, plan, settings, tape_policy, wants)
+    return [out[name] for name in fields._fields]
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        pass
 
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
-        no_second_derivative()
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        """Several adjoints of one step, one after another (the forward is no fused step under vmap)."""
-        return one_by_one(_FusedBackward, info.batch_size, in_dims, args)
+# A whole step on CUDA: predictor, sweeps, velocity. Not for torch.func, which has the parts.
+# Fields, packed_rest, plan; settings, tape_policy.
+_fused_step = ops.Differentiable(
+    _run_fused, _reverse_fused, arguments=_STEP_FIELDS + 4, inputs=_STEP_FIELDS, outputs=2, tensors=_STEP_FIELDS + 2,
+    saved=lambda inputs, made: (*inputs[: _STEP_FIELDS + 2], made[0], made[2]), batched=True,
+)  # fmt: skip
 
 
 def fused_step(fields: ops.StepFields, packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *,
                tape_policy: int) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Positions and velocities [B, V, 3] after a step on CUDA whose only energy is that of the tets; as sweep()."""
-    x, v, _ = _FusedStep.apply(*distinct(*fields), packed_rest, plan, settings, tape_policy)
+    x, v, _ = _fused_step(*distinct(*fields), packed_rest, plan, settings, tape_policy)
     return x, v
-
-
-ready_signature(_Sweep, _SweepBackward, _FusedStep, _FusedBackward)

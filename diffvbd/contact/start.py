@@ -1,7 +1,6 @@
 """Where a part of a step with contact starts: translations of islands, what the floor lets through, how far all may go
 at once."""
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -10,91 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import ops
-from ..ops import Backward, Direct, not_batched
-from ..ops import contact_part as ops_part
-from ..ops import contact_start as ops_contact_start
-from ..ops.contact_part import ASKS, PartBodies, Whole
-from ..ops.detect import segment_sum
-from .above_floor import above_floor, of_planes
+from ..ops import contact as ops_contact
+from ..ops.contact import Decided, PartBodies, Whole
+from ..ops.fields import ASKS
 from .surface import ContactSurface
-
-
-class _Translation(Direct):
-    """Translation of each body's island [B, bodies, 3]."""
-
-    @staticmethod
-    def forward(move: Tensor, mass: Tensor, x: Tensor, planes: Tensor, origin: Tensor, index: tuple) -> Tensor:
-        return ops_contact_start.translation(move, mass, x, origin, planes, *index)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        *tensors, ctx.index = inputs
-        ctx.save_for_backward(*tensors)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        not_batched(grads[0])
-        move, mass, x, planes, origin = ctx.saved_tensors
-        out = _TranslationBackward.apply(grads[0].contiguous(), move, mass, x, origin, planes, ctx.index)
-        return (*(ops.sum_to(bar, t.shape) for bar, t in zip(out, (move, mass, x, planes), strict=True)), None, None)
-
-
-class _TranslationBackward(Backward):
-    @staticmethod
-    def forward(u_bar, move, mass, x, origin, planes, index):
-        move_bar, mass_bar, x_bar, planes_bar = ops_contact_start.translation_backward(
-            u_bar, move, mass, x, origin, planes, *index
-        )
-        return move_bar, mass_bar, x_bar, planes_bar if planes.numel() else planes.clone()
-
-
-class Decided(NamedTuple):
-    """What is decided, not differentiated."""
-
-    frames: Tensor  # [B, bodies]
-    shares: tuple[Tensor, Tensor]  # [B, V]
-    stopped: Tensor  # [B, bodies] bool
-    origin: Tensor  # [B, V, 3] [m], or empty
-    bodies: PartBodies
-
-
-class _Start(Direct):
-    """Where the part starts [B, V, 3], of shares that have been decided, and who is short [B, V]."""
-
-    @staticmethod
-    def forward(x: Tensor, move: Tensor, fall: Tensor, u: Tensor, left: Tensor, planes: Tensor, decided: Decided
-                ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        at = Whole(x, move, u, left, decided.frames, planes, decided.origin, decided.bodies)
-        return ops_part.start(at, fall, *decided.shares, decided.stopped)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
-        ctx.mark_non_differentiable(output[1])
-        ctx.set_materialize_grads(False)
-        *tensors, ctx.decided = inputs
-        ctx.save_for_backward(*tensors)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-        bar, saved = grads[0], ctx.saved_tensors
-        if bar is None:
-            return (None,) * 7
-        not_batched(bar)
-        planes = saved[5]
-        wants_planes = ctx.needs_input_grad[5] and planes.numel() > 0
-        *out, own = _StartBackward.apply(bar.contiguous(), *saved, ctx.decided, wants_planes)
-        return *out, of_planes(own, planes, wants_planes), None
-
-
-class _StartBackward(Backward):
-    @staticmethod
-    def forward(bar, x, move, fall, u, left, planes, decided, wants_planes):
-        at = Whole(x, move, u, left, decided.frames, planes, decided.origin, decided.bodies)
-        x, move, fall, u, left, planes = ops_part.start_backward(
-            bar, at, fall, *decided.shares, wants_planes=wants_planes
-        )
-        return x, move, fall, segment_sum(u, decided.bodies.order, decided.bodies.ptr), left, planes
 
 
 class PartStart(NamedTuple):
@@ -136,9 +54,9 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     order, ptr = surface.body_order, surface.body_ptr
     x, move, fall, rigid = (t.contiguous() for t in (x, move, fall, rigid))
     was, now = was.detach(), now.detach()
-    u = _Translation.apply(move, mass.contiguous(), x, floor, origin,
-                           (surface.held, surface.body, order, ptr, detection.island, detection.lowest))  # fmt: skip
-    left, stopped = above_floor(x, u, rigid, floor, origin, surface.held, order, ptr)
+    u = ops_contact.island_translation(move, mass.contiguous(), x, floor, origin, surface.held, surface.body, order,
+                                       ptr, detection.island, detection.lowest)  # fmt: skip
+    left, stopped = ops_contact.ways_above_floor(x, u, rigid, floor, origin, surface.held, order, ptr)
     bodies = PartBodies(surface.held, surface.held_bodies, surface.body, order, ptr)
     listed = detection.listed
     listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
@@ -147,7 +65,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
 
     def advance(at: Tensor, way: Tensor, by: Tensor, center: Tensor, **options: Any) -> Tensor:
         """Shares of a way; colliders and what is prescribed go in the first."""
-        share, hindered = ops_contact_start.advance(at, way, by, center, origin, now if stuck else was, now,
+        share, hindered = ops_contact.advance(at, way, by, center, origin, now if stuck else was, now,
                                                     surface.held, surface.body, room, listed, **options)  # fmt: skip
         stuck.append(hindered)
         return share
@@ -157,26 +75,26 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
 
     with torch.no_grad():
         # bodies first, each as a whole
-        limit, ways, center, room, own_rooms = ops_part.frames(
+        limit, ways, center, room, own_rooms = ops_contact.frames(
             x, move, u, rigid, left, stretch, detection.room, own_room, bodies
         )
         frames, still = limit * advance(x, ways, u, x, whole=True), torch.zeros_like(u)
         whole = Whole(x, move, u, left, frames, floor, origin, bodies)
         # then vertices toward their wishes
-        base, target, way, state = ops_part.bends(whole, limit, stopped, own_room)
+        base, target, way, state = ops_contact.bends(whole, limit, stopped, own_room)
         own = (base, own_rooms) if own_pairs else ()
         if own_pairs and any_asks(state):
-            way, state = ops_part.hold(way, state, raises(base, target))
+            way, state = ops_contact.hold(way, state, raises(base, target))
         share = advance(base, way, still, center, own=own)
-        to, state = ops_part.held_up(base, way, share, state, bodies)
+        to, state = ops_contact.held_up(base, way, share, state, bodies)
         if any_asks(state):
-            way, state = ops_part.hold(way, state, raises(base, to))
+            way, state = ops_contact.hold(way, state, raises(base, to))
             if any_asks(state):
                 stuck.pop()  # once more, with those at rest: what let the others pass may have been their motion
                 share = advance(base, way, still, center, own=own)
         # then all by their fall
-        share, at, way = ops_part.falls(whole, fall, share, state)
+        share, at, way = ops_contact.falls(whole, fall, share, state)
         shares = share, advance(at, way, still, center, own=own) if falls else torch.ones_like(share)
     decided = Decided(frames, shares, stopped, origin, bodies)
-    start, short = _Start.apply(x, move, fall, u, left, floor, decided)
+    start, short = ops_contact.part_start(x, move, fall, u, left, floor, decided)
     return PartStart(start, center, room, own, frames, short, sum(stuck[1:], stuck[0]), shares)

@@ -50,7 +50,7 @@ NEGLIGIBLE = 1e-5  # error over the mean edge, below which it is none: a body at
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of :func:`diagnose`. Numbers are the worst over scenes; None where an argument was not given.
+    """Result of :func:`diffvbd.diagnose`. Numbers are the worst over scenes; None where an argument was not given.
 
     Attributes:
         messages: What crosses a limit, one sentence each; empty when nothing does.
@@ -136,7 +136,7 @@ def diagnose(
         warn: Also emit each message as a UserWarning.
 
     Returns:
-        A :class:`Diagnosis`; print it for a table.
+        A :class:`diffvbd.results.Diagnosis`; print it for a table.
 
     Raises:
         ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without a solver.
@@ -250,7 +250,7 @@ def _block_ratio(model: Model, gradients: Tensor, volume: Tensor, mu: Tensor, la
 def _balance(
     model: Model, x: Tensor, previous: tuple[Tensor, Tensor], solver: VBD, inputs: Given
 ) -> tuple[float, Tensor, Tensor | None]:
-    """``unbalanced``, ``residuals`` and ``friction_residuals`` of a :class:`Diagnosis`."""
+    """``unbalanced``, ``residuals`` and ``friction_residuals`` of a :class:`diffvbd.results.Diagnosis`."""
     given = widen(model, x, solver, inputs)
     double, prepared = given.model, given.prepared
     norm, lead = of_bodies(double), x.shape[:-2]

@@ -299,8 +299,8 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
         inputs: As in :func:`diffvbd.step`; moduli and rest_points are read.
 
     Returns:
-        A :class:`Stress` of x's dtype, differentiable by autograd in every tensor; the derivative of a von Mises stress
-        of zero is zero. Where a tet has no volume (J = 0) its stress is not finite.
+        A :class:`diffvbd.results.Stress` of x's dtype, differentiable by autograd in every tensor. The
+        derivative of a von Mises stress of zero is zero. Where a tet has no volume (J = 0) its stress is not finite.
 
     Raises:
         ValueError, TypeError: As :func:`diffvbd.step`; also for a Model without StableNeoHookean.

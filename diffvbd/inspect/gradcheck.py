@@ -15,7 +15,7 @@ from ..checks import check_bool, check_count, check_number, check_positive, fail
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """Result of :func:`check_gradients`: one row (name, |gradient|, adjoint, difference, error) for each argument."""
+    """Result of :func:`diffvbd.check_gradients`: a row (name, |gradient|, adjoint, difference, error) an argument."""
 
     rows: list[tuple[str, float, float, float, float]]
     tolerance: float
@@ -55,7 +55,7 @@ def check_gradients(
         verbose: Print the table.
 
     Returns:
-        A :class:`GradientCheck`; ``ok`` says whether every argument agrees within the tolerance.
+        A :class:`diffvbd.results.GradientCheck`; ``ok`` says whether every argument agrees within the tolerance.
 
     Raises:
         ValueError: If an argument is not float64, or the loss is not a scalar or has no graph.

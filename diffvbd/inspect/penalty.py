@@ -13,7 +13,7 @@ from .. import ops
 from ..checks import check_count, check_dense, check_positive, check_tensor, fail
 from ..lasting import lasting_tensors
 from ..model.model import Model
-from ..ops.neighbors import neighbor_pairs, unread
+from ..ops.contact import neighbor_pairs, unread
 from ..scopes import looks_at
 
 PAIRS_PER_BODY = 16  # room for pairs where max_pairs is not given; equal balls in contact have 6 (12 neighbors each)

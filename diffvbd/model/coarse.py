@@ -18,8 +18,8 @@ from torch import Tensor
 
 from .. import ops
 from ..checks import check_count, fail, is_word
-from ..ops.coarse_arrays import PACK as LANES
-from ..ops.coarse_arrays import ROW, lengths
+from ..ops.coarse import PACK as LANES
+from ..ops.coarse import ROW, lengths
 from ..tuples import replaced
 from .bodies import connected
 

@@ -123,8 +123,8 @@ class Model:
 
     @property
     def may_correct(self) -> bool:
-        """Whether bodies can have a rigid correction of their own: pairs and friction have another, and tets without
-        stiffness are no body."""
+        """Whether bodies can have a rigid correction of their own. Pairs and friction have another one, and tets
+        without stiffness are no body."""
         return not self.touches and any(isinstance(e, StableNeoHookean) for e in self.energies)
 
     @property

@@ -1,10 +1,25 @@
-"""The compiled operators: the only room that names torch.ops.
+"""The compiled operators: the only package that names torch.ops.
 
-Raw operators are private and functional: `raw.NAME`, with shapes for torch.compile beside each. Those that are
-differentiable are autograd.Functions in the form that also serves torch.func and torch.compile, in the rooms that use
-them; the fixed-order sums, which everybody uses, are here.
+Raw operators are private and functional: `raw.NAME`, with shapes for torch.compile in shapes.py. Those that are
+differentiable are rows of autograd.Differentiable or autograd.Linear.
 """
 
+from . import coarse as _coarse  # noqa: F401  (registers what CUDA runs)
+from . import shapes as _shapes  # noqa: F401  (registers what torch.compile asks)
+from .autograd import (
+    Differentiable,
+    Linear,
+    distinct,
+    fold_scenes,
+    folded,
+    is_batched,
+    no_second_derivative,
+    no_transforms,
+    not_batched,
+    of_inputs,
+    one_by_one,
+    sum_to,
+)
 from .fields import (
     COMPACT_TAPE,
     FULL_TAPE,
@@ -12,6 +27,7 @@ from .fields import (
     NO_TAPE,
     PLAN_HEADER,
     REST_SCALARS,
+    STARTS,
     STEP_ADJOINTS,
     SWEEP_ADJOINTS,
     TET_READS_X_PREV,
@@ -32,48 +48,33 @@ from .fields import (
     tape_rows,
     tape_shape,
 )
-from .functions import (
-    Backward,
-    Direct,
-    distinct,
-    fold_scenes,
-    is_batched,
-    no_second_derivative,
-    no_transforms,
-    not_batched,
-    of_inputs,
-    one_by_one,
-    raw_backward,
-    ready_signature,
-)
 from .load import has_cuda, raw, require_cuda
-from .mesh import PAIR_REST, build_plan, pack_rest, plan_order
-from .sums import broadcast, star_sum, sum_to, tet_gather
-from .sweep import fused_step, fused_step_backward, sweep, sweep_backward
+from .sums import broadcast, star_sum, tet_gather
+from .sweep import build_plan, fused_step, fused_step_backward, pack_rest, plan_order, sweep, sweep_backward
 
 __all__ = [
-    "Backward",
-    "Direct",
-    "COMPACT_TAPE",
-    "FULL_TAPE",
-    "LANES",
-    "NO_TAPE",
-    "PAIR_REST",
-    "PLAN_HEADER",
-    "REST_SCALARS",
-    "TET_READS_X_PREV",
-    "STEP_ADJOINTS",
-    "SWEEP_ADJOINTS",
-    "THREAD",
-    "TOUCHING_ADJOINTS",
     "BeginFields",
+    "COMPACT_TAPE",
     "CoarseFields",
     "CoarseSizes",
+    "Differentiable",
+    "FULL_TAPE",
+    "LANES",
+    "Linear",
+    "NO_TAPE",
+    "PLAN_HEADER",
+    "REST_SCALARS",
     "RigidFields",
+    "STARTS",
+    "STEP_ADJOINTS",
+    "SWEEP_ADJOINTS",
     "StepFields",
     "StepNumbers",
     "SweepFields",
     "SweepSettings",
+    "TET_READS_X_PREV",
+    "THREAD",
+    "TOUCHING_ADJOINTS",
     "TouchingFields",
     "as_list",
     "broadcast",
@@ -81,6 +82,7 @@ __all__ = [
     "corrections_of",
     "distinct",
     "fold_scenes",
+    "folded",
     "fused_step",
     "fused_step_backward",
     "has_cuda",
@@ -94,8 +96,6 @@ __all__ = [
     "plan_order",
     "plan_sizes",
     "raw",
-    "raw_backward",
-    "ready_signature",
     "require_cuda",
     "star_sum",
     "sum_to",

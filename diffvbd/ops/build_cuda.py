@@ -42,7 +42,7 @@ def extension() -> Any:
     os.environ["TORCH_CUDA_ARCH_LIST"] = architectures()  # without a device torch itself would not know any
     return CUDAExtension(
         "diffvbd._C_cuda",
-        [*sorted(glob("csrc/bind/cuda/*.cpp")), *sorted(glob("csrc/cuda/*.cu"))],
+        [*sorted(glob("csrc/bind/*.cpp")), *sorted(glob("csrc/cuda/*.cu"))],
         define_macros=[("TORCH_TARGET_VERSION", "0x020b000000000000"), ("USE_CUDA", None)],
         extra_compile_args={"cxx": CXX_FLAGS, "nvcc": NVCC_FLAGS},
         extra_link_args=["-s"],

@@ -1,20 +1,44 @@
-"""What the operators take besides tensors: sizes, settings and policies, with their twins in C++."""
+"""What the operators take: lists of tensors, sizes, settings and policies; and the constants of C++ that Python needs
+as well (csrc/bind/constants.cpp)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from ..mask import FILTERS, KEEPS_POSITIONS
+from .load import raw
+
+_C: dict[str, Any] = {a.name: a.default_value for a in raw.constants.default._schema.arguments}
+LANES = {"cpu": _C["cpu_lanes"], "cuda": _C["cuda_lanes"]}  # vertices of a block of the plan
+PLAN_HEADER, ROW, REST_SCALARS, TET_READS_X_PREV = (
+    _C[name] for name in ("plan_header", "row", "rest_scalars", "tet_reads_x_prev")
+)
+REST_ROW = {"cpu": _C["pair_rest"], "cuda": -(-_C["pair_rest"] // 4) * 4}  # of what a vertex sees; whole loads on CUDA
+LAG_SCALARS, PLANE_SCALARS = _C["lag_scalars"], _C["plane_scalars"]
+PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS, CROSSING_ROW = (
+    _C[name] for name in ("pair_row", "pair_constants", "near_row", "near_values", "counts", "crossing_row")
+)
+UNKNOWNS, FEW, MOST_COUPLED, GROUP_MEMORY = (
+    _C[name] for name in ("unknowns", "few", "most_coupled", "group_memory")
+)  # of bodies that touch
+ASKS = _C["asks"]  # state of a vertex that rests unless the potential of its body lets it go
+STARTS = {"inertia": _C["start_inertia"], "predictor": _C["start_predictor"], "auto": _C["start_lower"]}
+START_LOWER = STARTS["auto"]
+CORRECTED, TILE, NO_MOVE, FRACTIONS, WORKSPACE_BUDGET, ROUNDINGS, DECREASE, RESTING_MOTION = (
+    _C[name] for name in ("corrected", "tile", "no_move", "fractions", "workspace_budget", "roundings", "decrease",
+                          "resting_motion")
+)  # fmt: skip
+# What a reverse differentiates, in the order of what it returns.
+SWEEP_ADJOINTS, STEP_ADJOINTS, TOUCHING_ADJOINTS = (
+    tuple(_C[name].split()) for name in ("sweep_adjoints", "step_adjoints", "touching_adjoints")
+)
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
-REST_SCALARS = 7  # k01 k02 k03 k12 k13 k23 c6 of a tet
-TET_READS_X_PREV = False  # twin of TetLayout::reads_x_prev in csrc/energies/tet.h
-LANES = {"cpu": 8, "cuda": 32}  # vertices of a block of the plan; twins of kLanes and kSlice in csrc/core/views.h
 THREAD = 1  # the regime whose tape has scenes last; twin of kThread in csrc/cuda/step.h
-PLAN_HEADER = 11  # twin of kPlanHeader in csrc/core/plan_views.h
+WAYS = ("bends", "driven", "apart", "stretched", "falls")  # of vertices of a body, as Way in csrc/contact/motion.h
 
 
 class SweepFields(NamedTuple):
@@ -57,11 +81,6 @@ class SweepFields(NamedTuple):
     coarse_rest: Tensor | None = None  # [1 | B, blocks, 7, lanes]
 
 
-# What the reverse differentiates: the fields that are ADJOINT in csrc/bind/fields.h.
-SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "collider", "collider_prev",
-                   "kappa", "lag", "floor_lag", "corners_prev", "coarse_factor")  # fmt: skip
-
-
 class StepFields(NamedTuple):
     """What a whole step in one operator reads (CUDA), in the order of DIFFVBD_STEP_FIELDS; all are differentiable."""
 
@@ -73,9 +92,6 @@ class StepFields(NamedTuple):
     lam: Tensor
     mass: Tensor
     rest: Tensor | None
-
-
-STEP_ADJOINTS = StepFields._fields
 
 
 class RigidFields(NamedTuple):
@@ -122,20 +138,6 @@ class TouchingFields(NamedTuple):
     floor_lag: Tensor
     center: Tensor
     room: Tensor
-
-
-TOUCHING_ADJOINTS = (
-    "x",
-    "x_prev",
-    "y",
-    "mass",
-    "energy_data",
-    "collider",
-    "collider_prev",
-    "kappa",
-    "lag",
-    "floor_lag",
-)
 
 
 class CoarseFields(NamedTuple):
@@ -218,7 +220,7 @@ class CoarseSizes(NamedTuple):
 
 
 class SweepSettings(NamedTuple):
-    """What a sweep executes besides its tensors, in the order of csrc/bind/schema.cpp."""
+    """What a sweep executes besides its tensors, in the order of DIFFVBD_SETTINGS in csrc/bind/sweep.cpp."""
 
     sizes: tuple[int, ...]  # active vertices, tets, slots of the plan; more on CUDA, see plan_sizes
     energies: int  # mask
@@ -230,7 +232,7 @@ class SweepSettings(NamedTuple):
 
 
 def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
-    """What the host must know of a plan that is still on the CPU; the order is that of csrc/bind/cuda/sweep.h."""
+    """What the host must know of a plan that is still on the CPU; its order is that of plan_of() in bind/plan.h."""
     header = plan[:PLAN_HEADER].tolist()
     vertices, tets, active, colors, blocks, slots, *rest = header
     if device == "cpu":
@@ -271,3 +273,8 @@ def tape_shape(x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, laun
     """Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape."""
     shape = [sweeps, tape_rows(policy, energies), sizes[0]]
     return [*shape, x.shape[0]] if tuple(launch[:1]) == (THREAD,) else [x.shape[0], *shape]
+
+
+def most_grouped(bodies: int) -> int:
+    """Bodies at most of a group of those that touch."""
+    return min(max(GROUP_MEMORY // max(bodies, 1), 1), MOST_COUPLED, bodies)

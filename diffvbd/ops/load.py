@@ -136,7 +136,7 @@ def _jit_folder() -> Path:
 def _sources() -> Path:
     """csrc: inside an installed package, beside the package in a checkout."""
     for path in (_FOLDER / "csrc", _FOLDER.parent / "csrc"):
-        if (path / "bind" / "schema.cpp").exists():
+        if (path / "bind").exists():
             return path
     raise RuntimeError(f"diffvbd: DIFFVBD_JIT=1 finds no sources beside {_FOLDER}: run `{_COMMAND}`")
 

@@ -1,38 +1,18 @@
-"""Sums and gathers over tets, stars and rows as autograd functions, each in an order that depends on shapes alone."""
+"""Sums over stars, segments and indices, with the same bits on every run and device."""
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
-from .functions import raw_backward, ready_signature, shapes_of
-from .load import raw
+from .autograd import Linear, sum_to
+from .load import direct, raw
 
-
-@shapes_of("tet_gather")
-def _(values, tets):
-    return values.new_empty((values.shape[0], tets.shape[0], 4, values.shape[2]))
-
-
-@shapes_of("star_sum")
-def _(values, star_ptr, star, positive):
-    return values.new_empty((values.shape[0], star_ptr.shape[0] - 1, values.shape[3]))
-
-
-@shapes_of("row_sum")
-def _(values):
-    return values.new_empty((values.shape[0],))
-
-
-for _name in ("tet_gather", "star_sum", "row_sum"):
-    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
+Order = tuple[Tensor, Tensor, Tensor]  # of rows by segment: order, ptr (int32) and the segment of each row
 
 
 @contextlib.contextmanager
@@ -49,55 +29,9 @@ def one_thread(like: Tensor) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-class _RowSum(Function):
-    """[rows, columns] -> [rows], summed in an order that depends on nothing but the shape."""
-
-    @staticmethod
-    def forward(values: Tensor) -> Tensor:
-        return raw.row_sum(values.contiguous())
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.columns = inputs[0].shape[1]
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        return grads[0][:, None].expand(-1, ctx.columns)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, values: Tensor) -> tuple[Tensor, int]:
-        values = values.movedim(in_dims[0], 0)
-        return _RowSum.apply(values.flatten(0, 1)).unflatten(0, values.shape[:2]), 0
-
-
-def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
-    """Sums the dimensions in which ``shape`` has 1 (same number of dimensions), in a fixed order."""
-    reduced = [d for d, n in enumerate(shape) if n == 1 and tensor.shape[d] != 1]
-    if not reduced:
-        return tensor
-    kept = [d for d in range(tensor.dim()) if d not in reduced]
-    rows, columns = (math.prod([tensor.shape[d] for d in dims]) for dims in (kept, reduced))
-    return _RowSum.apply(tensor.permute(*kept, *reduced).reshape(rows, columns)).reshape(shape)
-
-
-class _Broadcast(Function):
-    """expand() to a shape of as many dimensions, with a fixed-order sum in the backward."""
-
-    @staticmethod
-    def forward(tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
-        return tensor.expand(shape).contiguous()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.shape = tuple(inputs[0].shape)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        return sum_to(grads[0], ctx.shape), None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, tensor: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, int]:
-        return _Broadcast.apply(tensor.movedim(in_dims[0], 0), (info.batch_size, *shape)), 0
+_broadcast = Linear(lambda tensor, shape: tensor.expand(shape).contiguous(),
+                    lambda bar, shape, _: sum_to(bar, shape), 2,
+                    lambda info, tensor, shape: _broadcast(tensor, (info.batch_size, *shape)))  # fmt: skip
 
 
 def broadcast(tensor: Tensor, shape: Sequence[int]) -> Tensor:
@@ -107,50 +41,25 @@ def broadcast(tensor: Tensor, shape: Sequence[int]) -> Tensor:
         return tensor
     if not tensor.requires_grad:
         return tensor.expand(shape)
-    return _Broadcast.apply(tensor.reshape((1,) * (len(shape) - tensor.dim()) + tuple(tensor.shape)), shape)
+    return _broadcast(tensor.reshape((1,) * (len(shape) - tensor.dim()) + tuple(tensor.shape)), shape)
 
 
-class _TetGather(Function):
-    @staticmethod
-    def forward(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
-        return raw.tet_gather(values.contiguous(), tets)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.mesh = inputs[1:]
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        return _StarSum.apply(grads[0], *ctx.mesh, False), None, None, None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, values: Tensor, *mesh: Tensor) -> tuple[Tensor, int]:
-        values = values.movedim(in_dims[0], 0)
-        return _TetGather.apply(values.flatten(0, 1), *mesh).unflatten(0, values.shape[:2]), 0
+def _folded(function: Linear, values: Tensor, *mesh: Any) -> Tensor:
+    return function(values.flatten(0, 1), *mesh).unflatten(0, values.shape[:2])
 
 
-class _StarSum(Function):
-    @staticmethod
-    def forward(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, positive: bool) -> Tensor:
-        return raw.star_sum(values.contiguous(), star_ptr, star, positive)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.mesh = inputs[1:4]
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        return _TetGather.apply(grads[0], *ctx.mesh), None, None, None, None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, values: Tensor, *mesh: Any) -> tuple[Tensor, int]:
-        values = values.movedim(in_dims[0], 0)
-        return _StarSum.apply(values.flatten(0, 1), *mesh).unflatten(0, values.shape[:2]), 0
+_tet_gather = Linear(lambda values, tets, star_ptr, star: raw.tet_gather(values.contiguous(), tets),
+                     lambda bar, _, *mesh: _star_sum(bar, *mesh, False), 4,
+                     lambda info, *args: _folded(_tet_gather, *args))  # fmt: skip
+_star_sum = Linear(lambda values, tets, star_ptr, star, positive: raw.star_sum(values.contiguous(), star_ptr, star,
+                                                                               positive),
+                   lambda bar, _, tets, star_ptr, star, positive: _tet_gather(bar, tets, star_ptr, star), 5,
+                   lambda info, *args: _folded(_star_sum, *args))  # fmt: skip
 
 
 def tet_gather(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
     """Vertex values [B, V, C] -> values of the tets' corners [B, T, 4, C]; its adjoint is star_sum."""
-    return _TetGather.apply(values, tets, star_ptr, star)
+    return _tet_gather(values, tets, star_ptr, star)
 
 
 def star_sum(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, *, positive: bool = False) -> Tensor:
@@ -158,7 +67,52 @@ def star_sum(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, *, po
 
     With ``positive`` the values are masses: one that is not finite and > 0 raises ValueError.
     """
-    return _StarSum.apply(values, tets, star_ptr, star, positive)
+    return _star_sum(values, tets, star_ptr, star, positive)
 
 
-ready_signature(_RowSum, _Broadcast, _TetGather, _StarSum)
+def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
+    """[B, V, C] -> [B, S, C]: sums of ``values[:, order[ptr[s] : ptr[s + 1]]]``, in an order that shapes alone decide.
+
+    Args:
+        values: [B, V, C], float64 or float32.
+        order, ptr: Rows of ``values``, segment by segment, and the first of each segment [S + 1].
+
+    Raises:
+        ValueError: A tensor with the wrong shape, dtype or device.
+    """
+    return direct.segment_sum(values, order, ptr)
+
+
+def _add_by(values: Tensor, index: Tensor, count: int) -> Tensor:
+    if not values.is_cuda:  # there they are added one after another
+        return values.new_zeros((count, values.shape[1])).index_add_(0, index, values)
+    ordered, order = torch.sort(index, stable=True)
+    ptr = torch.searchsorted(ordered, torch.arange(count + 1, device=index.device))
+    return segment_sum(values.contiguous()[None], order.to(torch.int32), ptr.to(torch.int32))[0]
+
+
+_sum_by = Linear(_add_by, lambda bar, _, index, count: bar[index], 3)
+
+
+def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """Rows of ``values`` [n, ...] added up by ``index`` [n], [count, ...]; differentiable in the values."""
+    if values.numel() == 0 or count == 0:
+        return values.new_zeros((count, *values.shape[1:]))
+    return _sum_by(values.reshape(values.shape[0], -1), index, count).reshape(count, *values.shape[1:])
+
+
+_sum_segments = Linear(lambda values, order, ptr, index: segment_sum(values.contiguous(), order, ptr),
+                       lambda bar, _, order, ptr, index: bar[:, index], 4)  # fmt: skip
+_of_segments = Linear(lambda values, order, ptr, index: values.index_select(1, index),
+                      lambda bar, _, order, ptr, index: sum_segments(bar, order, ptr, index), 4)  # fmt: skip
+
+
+def sum_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
+    """Sums of rows of ``values`` [B, V, n] by ``index`` [V], whose order is known: order, ptr int32. Differentiable in
+    the values; [B, segments, n]."""
+    return _sum_segments(values, order, ptr, index)
+
+
+def of_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
+    """``values`` [B, segments, n] of the segment of each row, [B, V, n]; arguments and order of sums as above."""
+    return _of_segments(values, order, ptr, index)

@@ -1,34 +1,42 @@
-"""The compiled operators of sweeps, and of whole steps on CUDA: calls, and shapes without execution."""
+"""The compiled operators of sweeps, of whole steps on CUDA, of plans, and of the rise of potentials."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import torch
 from torch import Tensor
 
-from ..mask import CONTACT
 from ..tuples import replaced
 from .fields import (
     FULL_TAPE,
     NO_TAPE,
-    REST_SCALARS,
+    PLAN_HEADER,
     STEP_ADJOINTS,
     SWEEP_ADJOINTS,
-    TET_READS_X_PREV,
     StepFields,
     SweepFields,
     SweepSettings,
     as_list,
-    corrections_shape,
-    tape_shape,
 )
-from .functions import raw_backward, shapes_of
 from .load import raw
-from .mesh import pack_rest
 
-LAG_SCALARS = 9  # twin of kLagScalars in csrc/contact/pairs.h
+
+def build_plan(
+    points: Tensor, tets: Tensor, active: Tensor, lanes: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h; lanes: of :data:`LANES`."""
+    return raw.build_plan(points, tets, active, lanes)
+
+
+def plan_order(plan: Tensor, lanes: int) -> Tensor:
+    """The vertex at each position of the sweep order [blocks lanes], -1: none; see csrc/core/plan_views.h."""
+    colors, blocks = plan[3:5].tolist()
+    return plan.narrow(0, PLAN_HEADER + colors + 1 + 4 * (blocks + 1), blocks * lanes).cpu()
+
+
+def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
+    """Rest scalars of the tets [B, T, 7] -> as their vertices see them [B, slots, 4, lanes]. Not differentiable."""
+    return raw.pack_rest(rest.contiguous(), plan, sizes)
 
 
 def listed(fields: SweepFields | StepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings
@@ -82,61 +90,18 @@ def fused_step_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, t
     return dict(zip(STEP_ADJOINTS, bars, strict=True))
 
 
-_FIELDS, _STEP_FIELDS = len(SweepFields._fields), len(StepFields._fields)
+def potential_rise(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor, rest: Tensor, index: Sequence[Tensor],
+                   data_count: Sequence[int], time_step: float) -> Tensor:  # fmt: skip
+    """By how much the potential of each body rises from x to ``to`` [kg m^2, times h^2], and the sum of the sizes of
+    its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may.
 
-
-@shapes_of("sweep")
-def _(*arguments):
-    f: Any = SweepFields(*arguments[:_FIELDS])
-    _, sizes, energies, _, _, sweeps, launch, coarse, tape_policy, *_ = arguments[_FIELDS:]
-    x, scenes = f.x_start, f.x_start.shape[0] if energies & CONTACT else 0
-    tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
-    done = corrections_shape(x, coarse, sweeps, energies) if f.coarse_plan.numel() else (0,)
-    cut = (scenes, sweeps, x.shape[1])
-    return torch.empty_like(x), tape, x.new_empty(cut, dtype=torch.uint8), x.new_empty(done)
-
-
-def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
-    """Empty adjoints of mu, lam, mass, rest. CUDA sums the material that a scene shares."""
-    shares = f.mu.is_cuda and f.mu.shape[-1] == 1 and f.lam.shape[-1] == 1 and not TET_READS_X_PREV
-    b, v = x.shape[:2]
-    materials = (b, 1 if shares else num_tets)
-    shapes = (materials, materials, (b, v), (b, num_tets, REST_SCALARS))
-    return [x.new_empty(shape if flag else (0,)) for shape, flag in zip(shapes, (wants[0], *wants), strict=True)]
-
-
-@shapes_of("sweep_backward")
-def _(*arguments):
-    f: Any = SweepFields(*arguments[:_FIELDS])
-    _, x, _, _, _, _, sizes, energies, *_, wants = arguments[_FIELDS:]
-    b, v = x.shape[:2]
-    own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
-    own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
-    last = (x.new_empty(f.corners_prev.shape if wants[0] else (0,)),
-            x.new_empty(f.coarse_factor.shape if wants[4] else (0,)))  # fmt: skip
-    if not energies & CONTACT:
-        return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own) - len(last))), *last)
-    colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
-    planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)
-    shapes = [(b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
-              (b, v, planes, 4)]  # fmt: skip
-    return (*own, *(x.new_empty(shape) for shape in shapes), *last)
-
-
-@shapes_of("fused_step")
-def _(*arguments):
-    x, (_, sizes, energies, _, _, sweeps, launch, _, tape_policy) = arguments[0], arguments[_STEP_FIELDS:]
-    tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
-    return torch.empty_like(x), torch.empty_like(x), tape
-
-
-@shapes_of("fused_step_backward")
-def _(*arguments):
-    f = StepFields(*arguments[:_STEP_FIELDS])
-    _, _, _, _, _, sizes, *_, wants = arguments[_STEP_FIELDS:]
-    state = [f.x.new_empty(f.x.shape if flag else (0,)) for flag in wants[:4]]
-    return (*state, *_body_adjoints(f.x, f, sizes[1], wants[4:]))
-
-
-for _name in ("sweep", "sweep_backward", "fused_step", "fused_step_backward"):
-    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
+    Args:
+        fields: Of the step; where its sweeps start does not enter.
+        x, to: Positions [m], [B, V, 3].
+        material, rest: [1 | B, blocks, 2 | 7, 8], of the tets by body.
+        index: order, ptr, of the OtherBodies (of no meaning here), corner and block_ptr of MovingBodies, int32.
+    """
+    absent = x.new_empty((0,))
+    origin = absent if fields.origin is None else fields.origin
+    return raw.potential_rise(x, to, fields.x_prev, fields.y, fields.mass, fields.energy_data, origin, material, rest,
+                              *index, list(data_count), time_step)  # fmt: skip

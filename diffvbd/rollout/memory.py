@@ -37,7 +37,7 @@ def memory(
 ) -> dict[str, int]:
     """Bytes that a differentiated rollout keeps and works with (default arguments otherwise, no force). The lists of
     contact are not counted: about 0.2 KB for each pair, step and detection, and 1 KB in the backward of one step. Nor
-    are the sweeps that a step takes beyond its K where pairs hold bodies up (docs/contact.md).
+    are the sweeps that a step takes beyond its K where pairs truncate motions (docs/contact.md).
 
     Args:
         model, solver: As in rollout.
@@ -46,18 +46,14 @@ def memory(
         material, rest: Whether material and rest-shape gradients are wanted (they take scratch in the backward).
 
     Returns:
-        A dict of bytes:
-            model: index data and rest scalars of the Model;
-            tape: of one step, scenes x sweeps x active vertices x 72 (full), 24 (compact) or 0 bytes in float64
-                (104 and 32 with a floor);
-            step: what one step keeps for its backward beside the state it starts from, tape included;
-            kept: the largest amount kept at once: all steps without checkpoints; states plus the steps of one segment
-                with checkpoints every n; states plus one step with BinomialCheckpoints. The state of the random number
-                generator, 5 kB, is kept with every checkpoint (with BinomialCheckpoints: with every step). ``rest``
-                adds the graph of the rest metric, once (297 B per tet), for rest_points that the scenes share.
-                BinomialCheckpoints with frames saved: an upper estimate;
-            scratch: of one backward step, in scenes that run side by side on as many threads;
-            total: kept + scratch.
+        A dict of bytes. ``"model"``: index data and rest scalars of the Model. ``"tape"``: of one step, scenes x sweeps
+        x active vertices x 72 (full), 24 (compact) or 0 bytes in float64 (104 and 32 with a floor). ``"step"``: what
+        one step keeps for its backward with the state it starts from, tape included. ``"kept"``: the largest amount
+        kept at once: all steps without checkpoints; states plus the steps of one segment with checkpoints every n;
+        states plus one step with BinomialCheckpoints, there an upper estimate if frames are saved. It counts the state
+        of the random number generator (5 kB) with every checkpoint. ``rest`` adds the graph of the rest metric, once
+        (297 B per tet), for rest_points that the scenes share. ``"scratch"``: of one backward step, in scenes that run
+        side by side on as many threads. ``"total"``: kept + scratch.
 
     Raises:
         ValueError, TypeError: For what rollout would refuse; it names the argument.

@@ -33,8 +33,8 @@ HELPS = {"K": "more sweeps", "2 K": "more sweeps", "h": "smaller steps", "h/2": 
 
 @dataclass(frozen=True)
 class GradientTest:
-    """How far the gradient with respect to a parameter is from what it should be, see :func:`refine`: shares of the
-    gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
+    """Error of the gradient with respect to a parameter, see :func:`diffvbd.refine`: shares of the gradient, or of the
+    largest slope of the loss within a tenth of the parameter, if that is larger [-].
 
     Attributes:
         finer: From that of each finer run, by name.
@@ -48,7 +48,7 @@ class GradientTest:
 
 @dataclass(frozen=True)
 class Refinement:
-    """A loss as it was optimised and as finer settings see it, see :func:`refine`. As text: one line.
+    """A loss as it was optimised and as finer settings see it, see :func:`diffvbd.refine`. As text: one line.
 
     Attributes:
         loss: With the settings that the loss has.

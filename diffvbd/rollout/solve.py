@@ -42,7 +42,7 @@ LOGGER = logging.getLogger("diffvbd")
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of :func:`solve`.
+    """Result of :func:`diffvbd.solve`.
 
     Attributes:
         x, v: Positions [m] and velocities [m/s] after the step, shape [..., V, 3].
@@ -97,7 +97,7 @@ def solve(
         progress: Log each look at the residual (logger "diffvbd", level INFO).
 
     Returns:
-        A :class:`Solution`.
+        A :class:`diffvbd.results.Solution`.
 
     Raises:
         ValueError, TypeError: As :func:`diffvbd.step`.
@@ -135,7 +135,7 @@ class _Converging:
     """Solves that are swept until they have converged.
 
     Attributes:
-        count, residual, converged: As in :class:`Solution`, of all solves so far.
+        count, residual, converged: As in :class:`diffvbd.results.Solution`, of all solves so far.
     """
 
     def __init__(self, adjoint: Adjoint, tolerance: float, max_sweeps: int, check_every: int, on_failure: str,
@@ -193,7 +193,7 @@ class _Sweeping:
     Attributes:
         end: Where the step ends after the sweeps so far, shape [B, V, 3].
         count: Sweeps so far.
-        residual, converged: As in :class:`Solution`.
+        residual, converged: As in :class:`diffvbd.results.Solution`.
     """
 
     def __init__(

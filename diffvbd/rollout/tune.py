@@ -979,7 +979,7 @@ class Share:
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """The error of a rollout by cause, see :func:`error_budget`. As text: a table.
+    """The error of a rollout by cause, see :func:`diffvbd.error_budget`. As text: a table.
 
     Attributes:
         solver: Whose error it is.

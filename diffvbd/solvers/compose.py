@@ -182,7 +182,7 @@ def compose(updates: Iterable[BlockUpdate]) -> Solver:
     Raises:
         TypeError, ValueError: For what is no :class:`BlockUpdate` or has unusable rows.
 
-    Source: paper, Theorem 1; docs/solvers.md.
+    Source: paper, Theorem 1.
     """
     return Solver(updates)
 

@@ -4,23 +4,21 @@ What depends on material, masses and rest shape alone is made once for all steps
 bodies once a step. The corrections themselves belong to the sweeps (csrc/cpu/coarse.h).
 """
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
-from typing import Any, NamedTuple, NoReturn
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
 from ..mask import VERTEX_ENERGIES
 from ..model.material import shape_gradients
 from ..model.system import System
-from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
-from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
+from ..ops import distinct
 from ..tuples import replaced
-from .coarse_sums import coarse_mass, coarse_stiffness
+from .coarse_sums import NO_VMAP, coarse_mass, coarse_stiffness
 
 _TENSORS = 3  # differentiable fields
 _FIELDS = len(ops.CoarseFields._fields)
@@ -65,52 +63,15 @@ def _shapes_of(model: System) -> tuple[Tensor, Tensor]:
     return shape_gradients(model._rest_points[model._topology[0]][None])
 
 
-class _Matrix(Function):
-    """The matrices, or their Cholesky factors. What comes back for these is the adjoint of the matrices themselves: no
-    other operator reads a factor, and the matrices need not be kept."""
-
-    @staticmethod
-    def forward(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, factored):
-        return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, factored)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:_FIELDS])
-        ctx.sizes, ctx.time_step, _ = inputs[_FIELDS:]
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-        if grads[0] is None:
-            return (None,) * (_FIELDS + 3)
-        needs = ctx.needs_input_grad[:_TENSORS]
-        out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.sizes, ctx.time_step, needs)
-        return of_inputs(out, needs, _FIELDS + 3 - _TENSORS)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> NoReturn:
-        raise NotImplementedError("diffvbd: torch.func.vmap of coarse corrections is not supported")
+def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Sequence[Tensor]:
+    sizes, time_step, _ = rest
+    return ops.raw.coarse_matrix_backward(*saved, bars[0], sizes, time_step)
 
 
-class _MatrixBackward(Function):
-    @staticmethod
-    def forward(bar, x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, needs):
-        fields = (x_prev, stiffness, mass, plan, moments, volume)
-        bars = ops.raw.coarse_matrix_backward(*fields, bar.contiguous(), sizes, time_step)
-        return tuple(ops.sum_to(b, t.shape) for b, t, need in zip(bars, fields, needs, strict=False) if need)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
-        no_second_derivative()
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        """Several adjoints, one after another."""
-        return one_by_one(_MatrixBackward, info.batch_size, in_dims, args)
+# The matrices, or their Cholesky factors. What comes back for these is the adjoint of the matrices themselves: no other
+# operator reads a factor, and the matrices need not be kept. Fields; sizes, time_step, factored.
+_matrix = ops.Differentiable(ops.raw.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS, tensors=_FIELDS,
+                             vmap=NO_VMAP, batched=True)  # fmt: skip
 
 
 def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
@@ -124,13 +85,10 @@ def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields,
 def matrix_of(model: System, parts: CoarseParts, x_prev: Tensor, time_step: float, factored: bool) -> Tensor:
     """The matrices of a step from x_prev, or their factors; see SweepFields.coarse_factor."""
     plan, tensors = model._coarse_plan, distinct(x_prev, parts.stiffness.contiguous(), parts.mass)
-    return _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step, factored)
+    return _matrix(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step, factored)
 
 
 def lengths_of(model: System, corrections: Tensor) -> Tensor:
     """Of what an operator has recorded, the length of each body's corrections [B, corrections, bodies]."""
     geometry = model.coarse_geometry
     return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()
-
-
-ops.ready_signature(_Matrix, _MatrixBackward)

@@ -19,8 +19,7 @@ from .. import ops
 from ..adjoint.contact_lag import sum_at_corners
 from ..adjoint.potential import IncrementalPotential
 from ..model.system import System
-from ..ops.segments import Order, of_segments, sum_by, sum_segments
-from ..ops.sums import one_thread
+from ..ops.sums import Order, of_segments, one_thread, sum_by, sum_segments
 from ..tuples import replaced
 from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
 from .trials import Trials
@@ -278,6 +277,3 @@ class _Elastic(Function):
         bars = [None if bar is None else ops.sum_to(-bar, shape)
                 for bar, shape in zip((bars[3], bars[4], bars[6]), ctx.shapes, strict=True)]  # fmt: skip
         return potential.elastic_product(w) if needs[0] else None, *bars, None, None, None
-
-
-ops.ready_signature(_Back, _Product, _Elastic)

@@ -23,8 +23,8 @@ from ..model.inputs import parameter_of
 from ..model.system import System
 from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
-from ..ops import contact_start as ops_start
-from ..ops.motion import RoomsOfBodies
+from ..ops import contact as ops_start
+from ..ops.contact import RoomsOfBodies
 from ..scopes import checking, is_captured, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import matrix_of

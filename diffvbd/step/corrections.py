@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from .. import ops
-from ..ops.contact_rigid import Moved, left_alone, most_grouped
+from ..ops.contact import Moved, left_alone
+from ..ops.fields import most_grouped
 from ..scopes import is_captured
 from .rigid_contact import Corrected, More, Which, bodies_of, correct, once
 

@@ -39,8 +39,8 @@ STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a s
 
 
 class History(NamedTuple):
-    """What :class:`BDF2` knows of the step before a state: by how much it moved every vertex [m], the velocity before
-    it [m/s], both [..., V, 3], whether it is smooth, bool [..., V]: False where contact made a body take implicit
+    """The step before a state, for :class:`diffvbd.BDF2`: by how much it moved every vertex [m], the velocity before it
+    [m/s], both [..., V, 3], whether it is smooth, bool [..., V]: False where contact made a body take implicit
     Euler; and its time step [s].
     """
 

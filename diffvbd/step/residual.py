@@ -17,7 +17,7 @@ from ..model.material import shape_gradients
 from ..model.model import Model
 from ..model.moving import moving_vertices
 from ..model.system import System
-from ..ops.detect import segment_sum
+from ..ops.sums import segment_sum
 from ..said import page
 from ..tuples import replaced
 from .arguments import Prepared, acceleration_of, collider_state

@@ -8,7 +8,6 @@ a body. It is what few sweeps do worst: they see neighbours, not the body. The s
 is decided, not differentiated. docs/method.md, section 18.
 """
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -20,8 +19,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.contact_lag import sum_of_scenes
 from ..model.system import System
-from ..ops import Backward, Direct, no_transforms, of_inputs
-from ..ops import contact_rigid as ops_rigid
+from ..ops import contact as ops_rigid
 from ..tuples import replaced
 from .rigid_terms import Scenes
 
@@ -37,7 +35,7 @@ class Corrected(NamedTuple):
 
 
 class Which(NamedTuple):
-    """Which bodies a correction is to move, as of ops.contact_rigid.rigid_system."""
+    """Which bodies a correction is to move, as of ops.contact.rigid_system."""
 
     moving: Tensor | None = None  # bool [B, bodies]; None: all
     alone: bool = False
@@ -58,7 +56,7 @@ def correct(model: System, fields: ops.TouchingFields, time_step: float, frictio
     ``more`` says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
     kept = torch.is_grad_enabled() and any(t.requires_grad for t in fields)
-    x, back, *rest = _Correct.apply(*fields, model, time_step, friction_eps, more, kept)
+    x, back, *rest = _correct(*fields, model, time_step, friction_eps, more, kept)
     shares = _made(fields.x, rest).share if kept else rest
     return Corrected(x, [share.to(x.dtype) for share in shares], back)
 
@@ -85,65 +83,38 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return order.to(torch.int32), ptr.to(torch.int32), free, model._pinned, model.body.to(torch.int32)
 
 
-class _Correct(Direct):
-    @staticmethod
-    def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev, kappa,
-                pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
-                model, time_step, friction_eps, more, kept):  # fmt: skip
-        fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
-                                    collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
-                                    lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
-        options, made, count, back = (model._data_count, time_step, friction_eps), [], 0, x
-        which: Which | None = Which()
-        while which is not None:
-            if count and kept:
-                made.append(fields.x)
-            centers, motion, factor, groups = ops_rigid.rigid_system(fields, *options, which.moving, which.alone)
-            end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
-            made.extend([motion, end.share, factor, groups] if kept else [end.share])
-            back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
-            count, fields = count + 1, replaced(fields, x=end.x)
-            which = more(count, end, groups)
-        return fields.x, back, *made
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        ctx.save_for_backward(*inputs[:_FIELDS], *output[2:])
-        ctx.options = inputs[_FIELDS:-2]
-        ctx.mark_non_differentiable(*output[1:])
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-        if grads[0] is None:
-            return (None,) * (_FIELDS + 5)
-        ops.not_batched(grads[0])
-        needs = ctx.needs_input_grad[:_FIELDS]
-        saved = ctx.saved_tensors
-        made = _made(saved[0], saved[_FIELDS:])
-        out = _CorrectBackward.apply(grads[0], *saved[:_FIELDS], made, *ctx.options, needs)
-        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 5)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> Any:
-        no_transforms()
+def _run(*args: Any) -> tuple[Tensor, ...]:
+    fields, (model, time_step, friction_eps, more, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
+    options, made, count, back = (model._data_count, time_step, friction_eps), [], 0, fields.x
+    which: Which | None = Which()
+    while which is not None:
+        if count and kept:
+            made.append(fields.x)
+        centers, motion, factor, groups = ops_rigid.rigid_system(fields, *options, which.moving, which.alone)
+        end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
+        made.extend([motion, end.share, factor, groups] if kept else [end.share])
+        back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
+        count, fields = count + 1, replaced(fields, x=end.x)
+        which = more(count, end, groups)
+    return fields.x, back, *made
 
 
-class _CorrectBackward(Backward):
-    @staticmethod
-    def forward(x_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev,
-                kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center,
-                room, made, model, time_step, friction_eps, needs):  # fmt: skip
-        # torch.compile counts these arguments: *args would get the context as well
-        fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
-                                    collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
-                                    lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
-        s = Scenes(model, fields, time_step, friction_eps or 1.0)  # which loads that are zero do not read
-        return _adjoints(s, x_bar, made, needs)
+def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
+    model, time_step, friction_eps = rest
+    s = Scenes(model, ops.TouchingFields(*saved[:_FIELDS]), time_step,
+               friction_eps or 1.0)  # which loads that are zero do not read  # fmt: skip
+    return _adjoints(s, bars[0], _made(saved[0], saved[_FIELDS:]), needs)
 
 
-def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> tuple[Tensor, ...]:
-    """Of the fields that need one. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
+# Fields; model, time_step, friction_eps, more, kept.
+_correct = ops.Differentiable(
+    _run, _reverse, arguments=_FIELDS + 5, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
+    rest=lambda inputs: inputs[_FIELDS:-2],
+)  # fmt: skip
+
+
+def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> list[Tensor | None]:
+    """Of the fields. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
     of d: a sum over vertices and pairs."""
     f = s.fields
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
@@ -152,9 +123,4 @@ def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bo
     by_kappa = own.pop("by_kappa")
     if wants["kappa"]:
         own["kappa"] = -sum_of_scenes(by_kappa, s.listed, f.x.shape[0])
-    bars = []
-    for name, t in zip(f._fields, f, strict=True):
-        if wants[name]:
-            bar = own.get(name, t[:0])
-            bars.append(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t))
-    return tuple(bars)
+    return [own.get(name) for name in f._fields]

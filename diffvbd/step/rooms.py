@@ -8,8 +8,7 @@ from torch import Tensor
 from ..contact.barrier import PairBarrier
 from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
-from ..ops.motion import RoomsOfBodies, contact_rooms
-from ..ops.sweep_rooms import sweep_rooms
+from ..ops.contact import RoomsOfBodies, contact_rooms, sweep_rooms
 from .motion import Motion
 
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to

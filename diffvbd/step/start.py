@@ -8,95 +8,66 @@ and step, the one of lower incremental potential: y where a body is soft or flie
 docs/method.md, sections 6, 14.
 """
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
 from ..model.bodies import Bodies, OtherBodies
-from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
-from ..ops import rigid as ops_rigid
-from ..ops.begin import STARTS
+from ..ops import STARTS, distinct
+from ..ops.contact import join_data
 from ..safeguards import FILTER_ETA
 from ..tuples import replaced
-from .rigid import folded, needed
 
 _TENSORS = 6  # differentiable fields: x, v, acceleration, prescribed, mass, energy_data
 _SCENES = 10  # and origin, mu, lam, rest: what has a scene dimension
 _FIELDS = len(ops.BeginFields._fields)
 
 
-class _Begin(Function):
-    @staticmethod
-    def forward(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned, order, ptr, spread,
-                tets, tet_ptr, other, other_order, other_ptr, other_tets, other_tet_ptr, groups, other_groups,
-                options):  # fmt: skip
-        # torch.compile counts these arguments: *args would get the context as well
-        fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
-                                 order, ptr, spread, tets, tet_ptr, other, other_order, other_ptr, other_tets,
-                                 other_tet_ptr)  # fmt: skip
-        return ops.raw.begin(*ops.as_list(fields, x), groups, other_groups, *options)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
-        read = replaced(ops.BeginFields(*inputs[:_FIELDS]), mu=None, lam=None, rest=None)  # by the backward
-        ctx.save_for_backward(*output[2:], *read)
-        ctx.options = (inputs[_FIELDS], *inputs[-1][:-1])  # `parts` shows in what was decided
-        ctx.mark_non_differentiable(*output[2:])
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        needs = ctx.needs_input_grad[:_TENSORS]
-        out = _BeginBackward.apply(*grads[:2], *ctx.saved_tensors, ctx.options, needs)
-        return of_inputs(out, needs, len(ctx.needs_input_grad) - _TENSORS)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        tensors, _ = folded(info.batch_size, args[:_SCENES], in_dims, 2)
-        out = _Begin.apply(*tensors, *args[_SCENES:])
-        shapes = [(info.batch_size, t.shape[0] // info.batch_size) for t in out]  # decisions may have no scene
-        return tuple(t.unflatten(0, shape) for t, shape in zip(out, shapes, strict=True)), (0,) * len(out)
+def _run(*args: Any) -> tuple[Tensor, ...]:
+    groups, other_groups, options = args[_FIELDS:]
+    return ops.raw.begin(*ops.as_list(ops.BeginFields(*args[:_FIELDS]), args[0]), groups, other_groups, *options)
 
 
-class _BeginBackward(Function):
-    @staticmethod
-    def forward(x_start_bar, y_bar, falls, alone, x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam,
-                rest, pinned, order, ptr, spread, tets, tet_ptr, other, other_order, other_ptr, other_tets,
-                other_tet_ptr, options, needs):  # fmt: skip
-        fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
-                                 order, ptr, spread, tets, tet_ptr, other, other_order, other_ptr, other_tets,
-                                 other_tet_ptr)  # fmt: skip
-        wants = (needs[2], needs[3], needs[5])
-        *bars, shared, own, planes = ops.raw.begin_backward(
-            *ops.as_list(fields, x), x_start_bar.contiguous(), y_bar.contiguous(), falls, alone, *options, wants
-        )
-        data_out = energy_data
-        if needs[5]:
-            data_out = ops_rigid.join_data(shared, own, options[1])
-            if planes.numel():  # the first energy's data
-                of_planes = ops.sum_to(planes, (planes.shape[0], 1, planes.shape[2]))[:, 0]
-                count = planes.shape[2]
-                first, others_out = data_out.narrow(1, 0, count), data_out.narrow(1, count, data_out.shape[1] - count)
-                data_out = torch.cat([first + of_planes, others_out], 1)
-        return needed((*bars, data_out), fields, needs)
+def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
+    fields, (falls, alone), (groups, options) = ops.BeginFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
+    x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
+    wants = (needs[2], needs[3], needs[5])
+    *out, shared, own, planes = ops.raw.begin_backward(
+        *ops.as_list(fields, fields.x), x_start_bar, y_bar, falls, alone, groups, *options[:-1], wants
+    )
+    data_out = None
+    if needs[5]:
+        data_out = join_data(shared, own, options[0])
+        if planes.numel():  # the first energy's data
+            of_planes = ops.sum_to(planes, (planes.shape[0], 1, planes.shape[2]))[:, 0]
+            count = planes.shape[2]
+            first, others_out = data_out.narrow(1, 0, count), data_out.narrow(1, count, data_out.shape[1] - count)
+            data_out = torch.cat([first + of_planes, others_out], 1)
+    return [*out, data_out]
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        pass
 
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Any:
-        no_second_derivative()
+def _vmap(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    tensors, _ = ops.folded(info.batch_size, args[:_SCENES], in_dims, 2)
+    out = apply(*tensors, *args[_SCENES:])
+    shapes = [(info.batch_size, t.shape[0] // info.batch_size) for t in out]  # decisions may have no scene
+    return tuple(t.unflatten(0, shape) for t, shape in zip(out, shapes, strict=True)), (0,) * len(out)
 
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        """Several adjoints, one after another."""
-        return one_by_one(_BeginBackward, info.batch_size, in_dims, args)
+
+def _saved(inputs: tuple, made: tuple) -> tuple:
+    read = replaced(ops.BeginFields(*inputs[:_FIELDS]), mu=None, lam=None, rest=None)  # by the reverse
+    return *read, *made[2:]
+
+
+# Fields; groups, other_groups, (data_count, time_step, filter_eta, chord, start, filters, parts).
+_begin = ops.Differentiable(
+    _run, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS, outputs=2, saved=_saved,
+    rest=lambda inputs: (inputs[_FIELDS], inputs[-1]), vmap=_vmap, batched=True,
+)  # fmt: skip
 
 
 def begin(
@@ -123,8 +94,5 @@ def begin(
     *listed, groups = bodies
     *listed_others, other_groups = others
     options = (data_count, time_step, FILTER_ETA, chord, STARTS[start], filters)
-    x_start, y, *_ = _Begin.apply(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
+    x_start, y, *_ = _begin(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
     return x_start, y
-
-
-ops.ready_signature(_Begin, _BeginBackward)

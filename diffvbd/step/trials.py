@@ -16,8 +16,8 @@ from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs
 from ..adjoint.rise import ROUNDINGS, RiseParts, rise_of_bodies
-from ..ops import contact_start as ops_start
-from ..ops.segments import sum_by
+from ..ops import contact as ops_start
+from ..ops.sums import sum_by
 from .pair_values import barrier_values, floor_friction_values, lagged_values
 from .rigid_terms import Scenes, corners_of
 

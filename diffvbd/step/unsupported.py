@@ -1,60 +1,13 @@
 """What contact at the start of a step leaves of the acceleration of each body."""
 
-# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from torch import Tensor
 
-from .. import ops
 from ..model.system import System
-from ..ops import Backward, Direct, not_batched
-from ..ops import unsupported as ops_unsupported
-
-
-class _Unsupported(Direct):
-    """The lift that is left [B, V, 3]. constants: held_bodies, body_order, body_ptr and the time step."""
-
-    @staticmethod
-    def forward(x: Tensor, lift: Tensor, force: Tensor, mass: Tensor, planes: Tensor, origin: Tensor,
-                constants: tuple) -> Tensor:  # fmt: skip
-        return ops_unsupported.unsupported(x, origin, lift, force, mass, planes, *constants)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        *tensors, ctx.constants = inputs
-        ctx.save_for_backward(*tensors)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        not_batched(grads[0])
-        wants_planes = ctx.needs_input_grad[4]
-        x_bar, lift_bar, force_bar, mass_bar, planes_bar = _UnsupportedBackward.apply(
-            grads[0].contiguous(), *ctx.saved_tensors, ctx.constants, wants_planes
-        )
-        return (
-            x_bar if x_bar.numel() else None,
-            lift_bar,
-            force_bar,
-            mass_bar,
-            planes_bar if wants_planes else None,
-            None,
-            None,
-        )
-
-
-class _UnsupportedBackward(Backward):
-    @staticmethod
-    def forward(bar, x, lift, force, mass, planes, origin, constants, wants_planes):
-        x_bar, lift_bar, force_bar, mass_bar, planes_bar = ops_unsupported.unsupported_backward(
-            bar, x, origin, lift, force, mass, planes, *constants, wants_planes=wants_planes
-        )
-        lift_bar, mass_bar = ops.sum_to(lift_bar, lift.shape), ops.sum_to(mass_bar, mass.shape)
-        if wants_planes:
-            planes_bar = ops.sum_to(planes_bar, (planes.shape[0], 1, planes_bar.shape[2])).reshape(planes.shape)
-        return x_bar, lift_bar, force_bar, mass_bar, planes_bar
+from ..ops.contact import lift_left
 
 
 def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
@@ -74,7 +27,7 @@ def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Te
     constants = (surface.held_bodies, surface.body_order, surface.body_ptr, time_step)
     at = x.detach() if floor_data is None else x  # without a floor only forces know where vertices are
     given = (t.contiguous() for t in (at, lift, push, mass, planes))
-    return _Unsupported.apply(*given, origin, constants)
+    return lift_left(*given, origin, *constants)
 
 
 def rests(model: System, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:

@@ -1,5 +1,6 @@
 """Shared parts of tests and benchmarks: scenes, evaluation against the reference, and one table of tolerances."""
 
+from ..ops.regimes import regime
 from .scenes import (
     CASES,
     KINDS,
@@ -38,6 +39,7 @@ __all__ = [
     "generator",
     "on_device",
     "reference_result",
+    "regime",
     "relative_error",
     "scenes",
     "sensitivity",

@@ -11,7 +11,7 @@ from helpers.results import TAPES
 from torch import Tensor
 
 import diffvbd as dv
-from bench import limits_adjoint as limits
+from bench import limits
 from diffvbd import testing
 from diffvbd.testing import evaluate, many_digits, tolerance
 

@@ -69,10 +69,8 @@ def test_a_correction_is_the_same_with_gradients_and_without() -> None:
     model, given = stack(coarse="auto")
     x = model.rest_points
     with torch.no_grad():
-        # TODO62: the solver of this call
-        alone = dv.step(model, x, torch.zeros_like(x), **given, sweeps=7)[0]
-    # TODO62: the solver of this call
-    assert torch.equal(dv.step(model, x, torch.zeros_like(x), **given, sweeps=7)[0], alone)
+        alone = dv.step(model, x, torch.zeros_like(x), **given, solver=scene.solver(7))[0]
+    assert torch.equal(dv.step(model, x, torch.zeros_like(x), **given, solver=scene.solver(7))[0], alone)
 
 
 @pytest.mark.parametrize("build", [pressed, stack])
@@ -80,10 +78,8 @@ def test_nearer_in_as_many_sweeps(build: Any) -> None:
     plain, given = build()
     x = plain.rest_points
     v = torch.zeros_like(x)
-    # TODO62: the solver of this call
-    goal = dv.step(plain, x, v, **given, sweeps=4000)[0]
-    # TODO62: the solver of this call
-    errors = [float((dv.step(m, x, v, **given, sweeps=16)[0] - goal).norm() / (goal - x).norm())
+    goal = dv.step(plain, x, v, **given, solver=scene.solver(4000))[0]
+    errors = [float((dv.step(m, x, v, **given, solver=scene.solver(16))[0] - goal).norm() / (goal - x).norm())
               for m in (plain, build(coarse="auto")[0])]  # fmt: skip
     assert errors[1] < errors[0] / 10, errors
 
@@ -97,8 +93,7 @@ def test_gradients_of_the_rest_shape() -> None:
     way = torch.linspace(-1, 1, x.numel(), dtype=x.dtype).reshape(x.shape).sin()
 
     def end(size: Any) -> Tensor:
-        # TODO62: the solver of this call
-        return (way * dv.step(model, x, v, rest_points=x + size * way, **given, sweeps=7)[0]).sum()
+        return (way * dv.step(model, x, v, rest_points=x + size * way, **given, solver=scene.solver(7))[0]).sum()
 
     with dv.record("subspace") as lengths:
         size = torch.zeros((), dtype=x.dtype, requires_grad=True)
@@ -116,8 +111,7 @@ def test_float32_is_near_float64() -> None:
     for dtype in (torch.float64, torch.float32):
         own = model.to(dtype=dtype)
         x = own.rest_points
-        # TODO62: the solver of this call
-        ends.append(dv.step(own, x, torch.zeros_like(x), **given, sweeps=11)[0])
+        ends.append(dv.step(own, x, torch.zeros_like(x), **given, solver=scene.solver(11))[0])
     assert ends[1].dtype == torch.float32 and relative_error(*ends[::-1]) <= tolerance("float32_forward")
 
 
@@ -153,8 +147,7 @@ def test_checkpoints_and_threads_change_no_bit() -> None:
         for every, count in ((None, 1), (2, 2)):
             torch.set_num_threads(count)
             v = torch.zeros_like(x).requires_grad_()
-            # TODO62: the solver of this call
-            run = dv.rollout(model, x, v, steps=3, save="last", checkpoint_every=every, **given, sweeps=8)
+            run = dv.rollout(model, x, v, steps=3, save="last", checkpoint_every=every, **given, solver=scene.solver(8))
             found.append((run.x[-1].detach(), torch.autograd.grad(run.x[-1].square().sum(), v)[0]))
     finally:
         torch.set_num_threads(threads)

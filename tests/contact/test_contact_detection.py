@@ -22,7 +22,7 @@ from helpers.detection_scenes import (
 )
 
 import diffvbd as dv
-from diffvbd.ops import detect as ops_contact
+from diffvbd.ops import contact as ops_contact
 from diffvbd.testing import generator, tolerance
 
 

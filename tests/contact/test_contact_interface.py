@@ -118,8 +118,7 @@ def test_no_scenes_no_pairs_no_sweeps() -> None:
     assert dv.contact.status(held).pairs == 0
     before = x.clone()
     apart = two_boxes(things=[ball()], dhat=1e-3)
-    # TODO62: the solver of this call
-    end, _ = dv.step(apart, x, 0 * x, **(STEP | {"solver": dataclasses.replace(STEP["solver"], sweeps=0)}))
+    end, _ = dv.step(apart, x, 0 * x, **(STEP | {"solver": dataclasses.replace(STEP["solver"], solver=scene.solver(0))}))
     assert relative_error(end - x, (0 * x).index_fill(1, torch.tensor([1]), -9.81e-4)) <= tolerance("property_subset")
     assert torch.equal(x, before)
 
@@ -254,8 +253,7 @@ def test_contact_that_meets_nothing_changes_nothing(detections: int) -> None:
     model = dv.Model(plain.mesh, energies=(dv.StableNeoHookean(), barrier), pinned=[0])
     x, v = plain.rest_points, contact_scenes.noise("alone", shape=(27, 3), size=0.3)
     for sweeps in (0, 1, 5):
-        # TODO62: the solver of this call
-        for a, b in zip(dv.step(model, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], sweeps=sweeps)})),
+        for a, b in zip(dv.step(model, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], solver=scene.solver(sweeps))})),
                         dv.step(plain, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"],
                                                                                       sweeps=sweeps)})), strict=True):  # fmt: skip
             assert relative_error(a, b) <= tolerance("forward" if a.abs().max() < 1 else "invariance")

@@ -12,7 +12,7 @@ from helpers.two_boxes import STEP
 
 import diffvbd as dv
 from diffvbd import colliders
-from diffvbd.ops import detect as ops_contact
+from diffvbd.ops import contact as ops_contact
 from diffvbd.reference import intersections
 from diffvbd.testing.scenes import generator
 

@@ -9,26 +9,25 @@ import pytest
 import torch
 
 import diffvbd as dv
-from bench import contact_motion_piles as piles
-from bench import contact_motion_scenes as scenes
+from bench import contact_motion
 from diffvbd.mesh import box, join
 from diffvbd.testing import relative_error, tolerance
 
 
 @pytest.mark.parametrize("surface", ["Plane", "FloorBarrier"])
 def test_a_block_at_ten_meters_a_second_stops_where_coulombs_law_says(surface: str) -> None:
-    row = scenes.slide(surface=surface, sweeps=5)
+    row = contact_motion.slide(surface=surface, sweeps=5)
     assert row["value"] == pytest.approx(row["reference"], rel=tolerance("contact_motion"))
 
 
 def test_the_derivative_of_a_travel_survives_sliding() -> None:
-    gradient, newton = scenes.slide_gradient(surface="Plane", speed=3.0)
+    gradient, newton = contact_motion.slide_gradient(surface="Plane", speed=3.0)
     assert gradient["value"] == pytest.approx(gradient["reference"], rel=tolerance("contact_motion"))
     assert newton["met"]
 
 
 def test_a_body_spins_next_to_another_as_alone() -> None:
-    row = scenes.spin()
+    row = contact_motion.spin()
     assert row["value"] == pytest.approx(row["reference"], rel=tolerance("contact_motion"))
 
 
@@ -71,7 +70,7 @@ def test_a_soft_body_that_stands_does_not_creep() -> None:
 
 def test_a_block_on_a_soft_block_does_not_sink() -> None:
     """Which long steps let fall a part of every step's fall, where sweeps had too little room to take it back."""
-    row = piles.rest("box", sweeps=5)
+    row = contact_motion.rest("box", sweeps=5)
     assert row["crossings"] == 0 and row["cut"] == 0.0
     assert abs(row["value"] - row["reference"]) <= tolerance("dented_rest")
 

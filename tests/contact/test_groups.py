@@ -12,8 +12,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import mesh, ops
-from diffvbd.ops import contact_rigid
-from diffvbd.ops.contact_rigid import FEW, MOST_COUPLED
+from diffvbd.ops import contact as contact_rigid
+from diffvbd.ops.fields import FEW, MOST_COUPLED
 from diffvbd.step.rigid_terms import Scenes
 from diffvbd.testing import relative_error, tolerance
 

@@ -1,4 +1,4 @@
-"""Claim: an energy added as docs/extending.md says works, and leaves contact working.
+"""Claim: an energy added as docs/guides/extend.md says works, and leaves contact working.
 
 The docs' own example, Anchor, is added once more under another name, in a copy of the sources, which is then built.
 """
@@ -61,7 +61,7 @@ def class_of(path: Path, name: str) -> str:
 
 
 def add_an_energy(root: Path) -> None:
-    """The four places of docs/extending.md."""
+    """The four places of docs/guides/extend.md."""
     energies = root / "csrc" / "energies"
     header = (energies / "anchor_h").read_text(encoding="utf-8")
     (energies / "tether.h").write_text(renamed(header), encoding="utf-8")

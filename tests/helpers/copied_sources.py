@@ -1,4 +1,4 @@
-"""A copy of the sources that a test changes, builds by the command of docs/extending.md, and runs."""
+"""A copy of the sources that a test changes, builds by the command of docs/guides/extend.md, and runs."""
 
 import os
 import re
@@ -25,7 +25,7 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 def build(root: Path) -> None:
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guides" / "extend.md").read_text(encoding="utf-8")
     (command,) = re.findall(r"^(DIFFVBD_QUICK=1) python (setup.py .*)$", page, re.MULTILINE)
     line = f"{command[0]} {shlex.quote(sys.executable)} {command[1]}"
     done = subprocess.run(line, shell=True, cwd=root, capture_output=True, text=True)

@@ -185,8 +185,7 @@ def grip() -> tuple[dv.Model, dict[str, Any], torch.Tensor, torch.Tensor]:
 
 def test_friction_that_has_not_converged_is_named() -> None:
     model, options, x, v = grip()
-    # TODO62: the solver of this call
-    few, _ = dv.step(model, x, v, **options, sweeps=1)
+    few, _ = dv.step(model, x, v, **options, solver=scene.solver(1))
     few[:8, 1] -= 1e-3  # it slips
     with pytest.warns(UserWarning) as warned:
         bad = dv.diagnose(model, few, previous=(x, v), **options)
@@ -208,8 +207,7 @@ def test_friction_that_has_not_converged_is_named() -> None:
 def test_bodies_without_contact_have_residuals_too() -> None:
     model = dv.Model(join([box(2, 0.2), box(2, 0.2).translate((1.0, 0, 0))]), pinned=[0, 1, 8, 9])
     x = model.rest_points
-    # TODO62: the solver of this call
-    end, _ = dv.step(model, x, 0 * x, **SOFT, sweeps=2)
+    end, _ = dv.step(model, x, 0 * x, **SOFT, solver=scene.solver(2))
     told = dv.diagnose(model, end, previous=(x, 0 * x), warn=False, **SOFT)
     assert told.residuals.shape == (2,) and (told.residuals > 0).all() and told.friction_residuals is None
 
@@ -227,7 +225,6 @@ def test_the_estimate_of_an_error_raises_with_contact() -> None:
     model = two_boxes()
     x = model.rest_points
     with pytest.raises(NotImplementedError, match="sweeps: the error of a step with contact"):
-        # TODO62: the solver of this call
-        dv.diagnose(model, x, previous=(x, 0 * x), warn=False, **SOFT, sweeps=5)
+        dv.diagnose(model, x, previous=(x, 0 * x), warn=False, **SOFT, solver=scene.solver(5))
     with pytest.raises(ValueError, match="colliders: expected a Model with colliders"):
         dv.diagnose(model, x, previous=(x, 0 * x), colliders=x[:1], warn=False, **SOFT)

@@ -206,8 +206,7 @@ def test_diagnose_names_the_worst_body() -> None:
     assert result.errors is not None and result.relative_error == float(result.errors.relative[:, 0].max())
     assert "error over motion, worst body" in str(result)
     good = two_bodies(**COARSE)
-    # TODO62: the solver of this call
-    result = dv.diagnose(good, end, previous=(x, torch.zeros_like(x)), warn=False, **{**given}, sweeps=17)
+    result = dv.diagnose(good, end, previous=(x, torch.zeros_like(x)), warn=False, **{**given}, solver=scene.solver(17))
     assert not any("would converge" in m for m in result.messages)
     assert result.relative_error is not None and result.relative_error < 0.01
 

@@ -9,7 +9,7 @@ import torch
 from helpers.grouped import grouped
 from torch import Tensor
 
-from diffvbd.ops import motion as ops_motion
+from diffvbd.ops import contact as ops_motion
 from diffvbd.testing import generator, tolerance
 
 SIZES = [[4, 300, 20], [8] * 7, [6000, 5], []]

@@ -10,7 +10,7 @@ import torch
 from helpers.detection_scenes import Scene, Surface, capsule, plane, solid, sphere
 
 import diffvbd as dv
-from diffvbd.ops import detect as ops_contact
+from diffvbd.ops import contact as ops_contact
 from diffvbd.testing import generator, tolerance
 
 ROOM, DHAT = 0.01, 0.02

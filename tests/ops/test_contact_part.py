@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from diffvbd.contact.above_floor import above_floor
-from diffvbd.ops import contact_part as ops_part
-from diffvbd.ops.contact_part import ASKS, PartBodies, Whole
+from diffvbd.ops import contact as ops_part
+from diffvbd.ops.contact import PartBodies, Whole
+from diffvbd.ops.fields import ASKS
 from diffvbd.testing import generator, relative_error, tolerance
 
 SHORT, BENT, DEEP_BENT = 0.99, 0.1, 0.5

@@ -20,7 +20,7 @@ from diffvbd.ops import build_cuda
 from diffvbd.ops import load as native
 
 KERNELS = sorted(CSRC.glob("cuda/*.cu"))
-BINDINGS = sorted(CSRC.glob("bind/cuda/*.cpp"))
+BINDINGS = sorted(CSRC.glob("bind/*.cpp"))
 ARCHITECTURES = ("80", "90", "100", "120")
 LIMIT = 120  # [s] for what takes one on an idle machine: a hang, not slowness
 BUILT = "lib/diffvbd/_C_cuda.abi3.so"  # where setuptools leaves the object
@@ -167,7 +167,7 @@ def test_an_object_that_does_not_load_is_reported_when_needed(tmp_path: Path, mo
 FAKE = f"""
 import os, pathlib, sys, time
 here = pathlib.Path(os.environ["FAKE"])
-assert pathlib.Path("csrc/bind/schema.cpp").exists()
+assert pathlib.Path("csrc/bind/operator.h").exists()
 with open(here / "runs", "a") as runs:
     print(os.getpid(), file=runs)
 mode = (here / "mode").read_text()
@@ -190,7 +190,7 @@ class Fake:
     def __init__(self, folder: Path) -> None:
         self.folder, self.package, self.cache = folder, folder / "package", folder / "cache"
         (self.package / "csrc" / "cuda").mkdir(parents=True)
-        for path, text in ((("csrc", "bind", "schema.cpp"), "// nothing"), (("ops", "build_cuda.py"), FAKE)):
+        for path, text in ((("csrc", "bind", "operator.h"), "// nothing"), (("ops", "build_cuda.py"), FAKE)):
             self.package.joinpath(*path).parent.mkdir()
             self.package.joinpath(*path).write_text(text)
         self.mode("build")

@@ -29,8 +29,7 @@ def test_a_checkpoint_runs_again_as_it_ran(first: str | None, second: str | None
     mu = torch.linspace(1e4, 2e4, 4, dtype=torch.float64, device="cuda").requires_grad_()
 
     def loss() -> Tensor:
-        # TODO62: the solver of this call
-        return dv.rollout(model, x, v, steps=4, mu=dv.per_step(mu), checkpoint_every=2, **OPTIONS, sweeps=3).x[-1].sum()  # type: ignore[arg-type]
+        return dv.rollout(model, x, v, steps=4, mu=dv.per_step(mu), checkpoint_every=2, **OPTIONS, solver=scene.solver(3)).x[-1].sum()  # type: ignore[arg-type]
 
     (expected,) = torch.autograd.grad(loss(), mu)
     with forced(first):
@@ -45,8 +44,7 @@ def test_jacobians_in_every_regime(regime: str) -> None:
     model, x, v = small(2)
 
     def end(mu: Tensor) -> Tensor:
-        # TODO62: the solver of this call
-        return dv.step(model, x, v, mu=mu, **OPTIONS, sweeps=3)[0].sum((1, 2))  # type: ignore[arg-type]
+        return dv.step(model, x, v, mu=mu, **OPTIONS, solver=scene.solver(3))[0].sum((1, 2))  # type: ignore[arg-type]
 
     mu = torch.tensor([[1e4], [3e4]], dtype=torch.float64, device="cuda")
     rows = []
@@ -63,8 +61,7 @@ def test_jacobians_in_every_regime(regime: str) -> None:
 def test_several_adjoints_of_one_step(start: str) -> None:
     model, x, v = small(2, start)
     leaf = x.clone().requires_grad_()
-    # TODO62: the solver of this call
-    end, _ = dv.step(model, leaf, v, mu=1e4, **OPTIONS, sweeps=3)  # type: ignore[arg-type]
+    end, _ = dv.step(model, leaf, v, mu=1e4, **OPTIONS, solver=scene.solver(3))  # type: ignore[arg-type]
     weights = torch.randn((3, *end.shape), dtype=torch.float64, device="cuda")
 
     def one(w: Tensor) -> Tensor:
@@ -87,8 +84,7 @@ def test_no_tets(regime: str, vertices: int, shape: tuple[int, ...]) -> None:
     mu = torch.full(shape, 1e4, dtype=torch.float64, device="cuda").requires_grad_()
     torch.full((1 << 20,), float("nan"), dtype=torch.float64, device="cuda")  # what memory is reused does not matter
     with forced(regime):
-        # TODO62: the solver of this call
-        end, speed = dv.step(model, x, torch.ones_like(x), mu=mu, **OPTIONS, sweeps=2)  # type: ignore[arg-type]
+        end, speed = dv.step(model, x, torch.ones_like(x), mu=mu, **OPTIONS, solver=scene.solver(2))  # type: ignore[arg-type]
         gradients = torch.autograd.grad(end.sum() + speed.sum(), (x, mu), allow_unused=True)
     torch.cuda.synchronize()
     assert torch.equal(end, x) and not speed.any()

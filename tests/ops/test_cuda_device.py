@@ -85,8 +85,7 @@ def test_a_bad_value_outside_debug_checks_comes_out_as_nan(name: str, regime: st
         shape = (3, *value.shape) if value.dim() == 0 or value.shape[0] != 3 else value.shape
         bad = value.expand(shape).clone()
         bad[1] = NAN
-        # TODO62: the solver of this call
-        x, _ = dv.step(model, **{**inputs, **given(name, bad, inputs)}, sweeps=2)
+        x, _ = dv.step(model, **{**inputs, **given(name, bad, inputs)}, solver=scene.solver(2))
         assert not torch.isfinite(x[1]).all()
         assert torch.isfinite(x[[0, 2]]).all()
         again = dv.step(model, solver=scene.solver(2), **inputs)
@@ -110,8 +109,7 @@ def test_work_is_queued_on_the_current_stream(regime: str) -> None:
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device="cuda")
 
     def run(leaves: list[Tensor]) -> list[Tensor]:
-        # TODO62: the solver of this call
-        end, v = dv.step(model, **dict(zip(names, leaves, strict=True)), **rest, sweeps=3)
+        end, v = dv.step(model, **dict(zip(names, leaves, strict=True)), **rest, solver=scene.solver(3))
         return [end.detach(), *torch.autograd.grad((weights * (end + 0.01 * v)).sum(), leaves)]
 
     with forced(regime):
@@ -189,8 +187,7 @@ def test_memory_prediction(cells: int, lead: tuple[int, ...], tape: str) -> None
     leaves = {k: t.clone().requires_grad_() if isinstance(t, Tensor) else t for k, t in inputs.items()}
 
     def run() -> None:
-        # TODO62: the solver of this call
-        end, _ = dv.step(model, **leaves, sweeps=sweeps, adjoint=dv.ReverseSweep(tape))  # type: ignore[arg-type]
+        end, _ = dv.step(model, **leaves, solver=scene.solver(sweeps), adjoint=dv.ReverseSweep(tape))  # type: ignore[arg-type]
         torch.autograd.grad(end.sum(), [t for t in leaves.values() if isinstance(t, Tensor)])
 
     run()

@@ -111,8 +111,7 @@ def test_a_captured_step_reads_what_its_arguments_hold_now(regime: str) -> None:
     out: dict[str, Tensor] = {}
 
     def run() -> None:
-        # TODO62: the solver of this call
-        out["x"], out["v"] = dv.step(model, x, v, **options, sweeps=4)
+        out["x"], out["v"] = dv.step(model, x, v, **options, solver=scene.solver(4))
 
     with forced(regime), torch.no_grad():
         graph = captured(run, 1)
@@ -121,8 +120,7 @@ def test_a_captured_step_reads_what_its_arguments_hold_now(regime: str) -> None:
             x.copy_(given[0])
             v.copy_(given[1])
             graph.replay()
-            # TODO62: the solver of this call
-            expected = dv.step(model, *given, **options, sweeps=4)
+            expected = dv.step(model, *given, **options, solver=scene.solver(4))
             assert torch.equal(out["x"], expected[0]) and torch.equal(out["v"], expected[1])
 
 
@@ -151,8 +149,7 @@ def test_a_step_and_its_backward_do_not_synchronise(case: str, tape: str, regime
     scene = build_scene(case)
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")
     with forced(regime):
-        # TODO62: the solver of this call
-        once = loss_and_gradients(lambda **o: dv.step(model, **o, sweeps=3, adjoint=dv.ReverseSweep(tape)), inputs)
+        once = loss_and_gradients(lambda **o: dv.step(model, **o, solver=scene.solver(3), adjoint=dv.ReverseSweep(tape)), inputs)
         expected = once()  # kernels are loaded on first use
         with no_synchronisation():
             actual = once()
@@ -170,19 +167,15 @@ def test_numbers_and_defaults_do_not_synchronise() -> None:
         there = model.to(dtype=dtype)
         start = {name: t.to(dtype) for name, t in state.items()}
         for options in (numbers, plain):
-            # TODO62: the solver of this call
-            dv.step(there, **start, **options, sweeps=2)
+            dv.step(there, **start, **options, solver=scene.solver(2))
             with no_synchronisation():
-                # TODO62: the solver of this call
-                dv.step(there, **start, **options, sweeps=2)
+                dv.step(there, **start, **options, solver=scene.solver(2))
     options = {"steps": 4, "force": dv.per_step(inputs["force"].expand(4, -1, -1)), **numbers}
     options["mu"] = lambda k, x, v: inputs["mu"]
     for schedule in (None, 2):
-        # TODO62: the solver of this call
-        dv.rollout(model, **state, checkpoint_every=schedule, **options, sweeps=2)
+        dv.rollout(model, **state, checkpoint_every=schedule, **options, solver=scene.solver(2))
         with no_synchronisation():
-            # TODO62: the solver of this call
-            dv.rollout(model, **state, checkpoint_every=schedule, **options, sweeps=2)
+            dv.rollout(model, **state, checkpoint_every=schedule, **options, solver=scene.solver(2))
 
 
 @pytest.mark.parametrize("schedule", (None, 3, dv.BinomialCheckpoints(2)), ids=("all", "segments", "binomial"))
@@ -191,8 +184,7 @@ def test_a_rollout_and_its_backward_do_not_synchronise(schedule: Any) -> None:
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        # TODO62: the solver of this call
-        end = dv.rollout(model, steps=7, save="last", checkpoint_every=schedule, **options, sweeps=2)
+        end = dv.rollout(model, steps=7, save="last", checkpoint_every=schedule, **options, solver=scene.solver(2))
         return end.x[-1], end.v[-1]
 
     once = loss_and_gradients(run, inputs)
@@ -231,13 +223,10 @@ def test_deterministic_algorithms(case: str, tape: str, regime: str | None, requ
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")
     adjoint = dv.ReverseSweep(tape)
     with forced(regime):
-        # TODO62: the solver of this call
-        expected = evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, sweeps=3), inputs)
+        expected = evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, solver=scene.solver(3)), inputs)
         request.getfixturevalue("deterministic")
-        # TODO62: the solver of this call
-        actual = evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, sweeps=3), inputs)
-        # TODO62: the solver of this call
-        rebuilt = evaluate(lambda **o: dv.step(scene.model("cuda"), adjoint=adjoint, **o, sweeps=3), inputs)
+        actual = evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, solver=scene.solver(3)), inputs)
+        rebuilt = evaluate(lambda **o: dv.step(scene.model("cuda"), adjoint=adjoint, **o, solver=scene.solver(3)), inputs)
     for name, value in expected.items():
         assert torch.equal(actual[name], value), name
         assert torch.equal(rebuilt[name], value), name

@@ -246,8 +246,7 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
     def run(i: Any) -> tuple[Tensor, ...]:
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
         options = {**dict(zip(names, leaves, strict=True)), **shared}
-        # TODO62: the solver of this call
-        x, v = dv.step(model, **options, sweeps=3, adjoint=dv.ReverseSweep(tape))
+        x, v = dv.step(model, **options, solver=scene.solver(3), adjoint=dv.ReverseSweep(tape))
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     batches = [range(130), range(20, 130), range(60, 101), range(62, 66), *(range(i, i + 1) for i in (0, 31, 64, 129))]
@@ -320,8 +319,7 @@ def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: 
     """A step of an inference run equals the step of a training run to the bit, whatever the tape."""
     model, inputs = large_inputs(cells, *lead)
     inputs.pop("rest_points")
-    # TODO62: the solver of this call
-    bare = dv.step(model, **inputs, sweeps=3)
+    bare = dv.step(model, **inputs, solver=scene.solver(3))
     for tape in TAPES:
         taped = evaluated(model, inputs, 3, tape)
         assert torch.equal(taped["x"], bare[0]) and torch.equal(taped["v"], bare[1]), tape
@@ -330,10 +328,8 @@ def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: 
 def test_a_regime_that_cannot_run_a_scene_raises() -> None:
     model, inputs = large_inputs(10)
     with forced("thread"), pytest.raises(ValueError, match="regime"):
-        # TODO62: the solver of this call
-        dv.step(model, **inputs, sweeps=1)
-    # TODO62: the solver of this call
-    dv.step(model, **inputs, sweeps=1)  # outside, the choice is free again
+        dv.step(model, **inputs, solver=scene.solver(1))
+    dv.step(model, **inputs, solver=scene.solver(1))  # outside, the choice is free again
 
 
 @pytest.mark.parametrize("name", ("warp", "", "Thread", 3))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffvbd import ops
-from diffvbd.ops.neighbors import neighbor_pairs
+from diffvbd.ops.contact import neighbor_pairs
 
 DTYPES = [torch.float64, torch.float32]
 

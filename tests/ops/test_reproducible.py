@@ -80,8 +80,7 @@ def test_batch_equals_single_scenes(device: str, one_regime: None, kind: str, th
     def run(i: Any) -> tuple[Tensor, ...]:
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
         given = {k: inputs[k] for k in ("gravity", "density", "rest_points", "time_step", "parameters")}
-        # TODO62: the solver of this call
-        x, v = dv.step(model, **dict(zip(names, leaves, strict=True)), **given, sweeps=3)
+        x, v = dv.step(model, **dict(zip(names, leaves, strict=True)), **given, solver=scene.solver(3))
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     singles = [run(i) for i in range(3)]

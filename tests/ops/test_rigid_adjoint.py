@@ -12,8 +12,8 @@ import diffvbd as dv
 from diffvbd import mesh, ops
 from diffvbd.adjoint.contact_lag import of_scene
 from diffvbd.ops import broadcast
-from diffvbd.ops import contact_rigid as ops_rigid
-from diffvbd.ops.segments import Order, of_segments, sum_segments
+from diffvbd.ops import contact as ops_rigid
+from diffvbd.ops.sums import Order, of_segments, sum_segments
 from diffvbd.reference.rigid_contact import LEAST_INERTIA
 from diffvbd.step.rigid_terms import Scenes, vertex_blocks, vertex_gradient
 from diffvbd.testing import relative_error, tolerance

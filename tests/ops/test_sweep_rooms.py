@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.ops import sweep_rooms
+from diffvbd.ops import contact as sweep_rooms
 from diffvbd.testing import generator, tolerance
 
 MORE, LEAST = 1.5, 0.02

@@ -1,21 +1,20 @@
 """Claim: a rollout, or a step of a loop, that ends with what is no number or too far away says so, each time, and what
 is at fault; so does one whose sweeps leave its motion wrong, and one that bends tets too thin for it."""
 
-import dataclasses
 import warnings
 from typing import Any
 
 import pytest
 import torch
-from diffvbd.step.held_up import SEVERAL
 from helpers.two_boxes import two_boxes
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
 from diffvbd.mesh import box
-from diffvbd.rollout import energy_check
-from diffvbd.step.arguments import prepare
+from diffvbd.model.system import system_of
+from diffvbd.rollout import checks
+from diffvbd.step.arguments import material_of, prepare
 from diffvbd.step.contact_cycles import CUT
 from diffvbd.step.residual import cut_share
 from diffvbd.step.stability import FAR
@@ -114,22 +113,22 @@ def test_a_flight_is_not_lost() -> None:
 
 def swinging(sweeps: int, **options: Any) -> tuple[Tensor, list[str]]:
     mesh = dv.mesh.beam(6, 3, 3, size=(0.4, 0.05, 0.05))
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, **options)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
     x, frames = model.rest_points, []
-    said = messages(lambda: frames.append(dv.rollout(model, x, 0 * x, dv.VBD(0.005, sweeps), steps=60, young=1e6,
-                                                     poisson=0.3).x))  # fmt: skip
+    solver = dv.VBD(0.005, sweeps, **options)
+    said = messages(lambda: frames.append(dv.rollout(model, x, 0 * x, solver, steps=60, young=1e6, poisson=0.3).x))
     return frames[0], said
 
 
 def test_motion_that_sweeps_leave_wrong_is_warned_of_and_what_is_right_is_not() -> None:
-    coarse: dict[str, Any] = {"coarse": "auto", "relaxation": 1.5}
+    coarse: dict[str, Any] = {"subspace": "coarse", "relaxation": 1.5}
     right, said = swinging(100, **coarse)
     assert said == []
     for sweeps, options, wrong in ((10, {}, True), (300, {"relaxation": 1.5}, False), (20, coarse, False)):
         motion, said = swinging(sweeps, **options)
         error = float((motion - right).norm() / (right - right[0]).norm())
         assert (error > 0.05) == wrong == any("the motion may be off by" in text for text in said)
-        assert all('coarse="auto"' in text for text in said)
+        assert all('subspace="coarse"' in text for text in said)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -138,8 +137,7 @@ def test_what_rests_or_has_no_sweeps_to_judge_is_not_doubted(dtype: torch.dtype)
         dv.mesh.box(3, 0.2), dtype=dtype, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.004, kappa=1e4))
     )
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    many: dict[str, Any] = SOFT | {"solver": dataclasses.replace(SOFT["solver"], sweeps=100)}
-    # TODO62: the solver of this call
+    many: dict[str, Any] = SOFT | {"solver": dv.VBD(0.01, 100)}
     end = dv.rollout(model, x, v, steps=60, save="last", **many, checks=dv.Checks(energy=False))
     for frames in (10, 40):
         assert messages(lambda n=frames: dv.rollout(model, end.x[-1], end.v[-1], steps=n, **SOFT)) == []
@@ -171,27 +169,27 @@ def said_of_energy(run: Any, of: str = "gained") -> list[str]:
 # --- energy -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("chunk", [3, energy_check.LEAST_CHUNK])  # tets that are looked at together
+@pytest.mark.parametrize("chunk", [3, checks.LEAST_CHUNK])  # tets that are looked at together
 def test_energy_is_that_of_the_reference(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
-    monkeypatch.setattr(energy_check, "LEAST_CHUNK", chunk)
+    monkeypatch.setattr(checks, "LEAST_CHUNK", chunk)
     model, x, v = bent_bar()
     x = x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
     mu, lam = (torch.linspace(1e4, k, model.num_tets, dtype=x.dtype) for k in (2e4, 5e4))
-    given = {"mu": mu, "lam": lam, "rest_points": None, "density": None, "solver": dv.VBD(1.0, 1)}
-    prepared = prepare(model, (), **given, parameters=None)
+    system = system_of(model, dv.VBD(1.0, 1))
+    prepared = prepare(system, (), material_of(mu=mu, lam=lam), time_step=1.0, sweeps=1)
     expected = reference.incremental_potential(model, x, x, mu, lam, 1.0)
     expected = expected + 0.5 * (model.mass[:, None] * v.square()).sum()
-    found = energy_check.mechanical_energy(model, prepared, x, v)
+    found = checks.mechanical_energy(system, prepared, x, v)
     assert found.shape == (1,) and expected > 0
     assert abs(found - expected) <= tolerance("energy_gain") * expected
-    many = energy_check.mechanical_energy(model, prepared, x.expand(3, -1, -1), v.expand(3, -1, -1))
+    many = checks.mechanical_energy(system, prepared, x.expand(3, -1, -1), v.expand(3, -1, -1))
     assert torch.allclose(many, found, rtol=tolerance("energy_gain"))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
     model, x, v = bent_bar(dtype=dtype)
-    with pytest.warns(UserWarning, match=r'has gained .* coarse="auto"') as found:
+    with pytest.warns(UserWarning, match=r'has gained .* subspace="coarse"') as found:
         dv.rollout(model, x, v, steps=10, **STIFF)
     assert {w.filename for w in found} == {__file__}
     for asked in (None, True):
@@ -206,8 +204,8 @@ def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
 
 
 def test_what_helps_helps() -> None:
-    model, x, v = bent_bar(coarse="auto", relaxation=1.5)
-    # TODO62: the solver of this call
+    model, x, v = bent_bar()
+    solver = dv.VBD(0.01, 100, subspace="coarse", relaxation=1.5)
     assert (
         said_of_energy(
             lambda: dv.rollout(
@@ -215,7 +213,7 @@ def test_what_helps_helps() -> None:
                 x,
                 v,
                 steps=10,
-                **STIFF | {"solver": dataclasses.replace(STIFF["solver"], sweeps=100)},
+                **STIFF | {"solver": solver},
                 checks=dv.Checks(energy=True),
             )
         )
@@ -226,7 +224,11 @@ def test_what_helps_helps() -> None:
 def test_nothing_is_said_of_a_scene_that_gains_none_or_is_driven() -> None:
     model, x, v = bent_bar()
     assert said_of_energy(lambda: dv.rollout(model, x, v, steps=20, **SOFT, checks=dv.Checks(energy=True))) == []
-    kinds: list[dict[str, Any]] = [{"force": 0 * x}, {"gravity": lambda k, x, v: 0 * x}, {"check_energy": False}]
+    kinds: list[dict[str, Any]] = [
+        {"force": 0 * x},
+        {"gravity": lambda k, x, v: 0 * x},
+        {"checks": dv.Checks(energy=False)},
+    ]
     for driven in kinds:
         assert said_of_energy(lambda d=driven: dv.rollout(model, x, v, steps=20, **STIFF, **d)) == []
     assert said_of_energy(lambda: dv.rollout(model, x, v, steps=9, **STIFF)) == []  # too short to be looked at unasked
@@ -236,11 +238,11 @@ def test_rest_and_fall_are_no_gain_in_single_precision_or_far_away() -> None:
     for dtype, distance in ((torch.float32, 1.0), (torch.float32, 1e3), (torch.float64, 1e5)):
         model, x, v = bent_bar(dtype=dtype)
         given = {**SOFT, "mu": 1e7, "lam": 1e7}
-        # TODO62: the solver of this call
-        end = lambda m=model, x=x + distance, v=0 * v, g=given: dv.rollout(
-            m, x, v, steps=10, **g, checks=dv.Checks(energy=True)
-        )  # noqa: E731
-        assert said_of_energy(end) == []
+
+        def run(model: dv.Model = model, x: Tensor = x + distance, v: Tensor = 0 * v, given: Any = given) -> Any:
+            return dv.rollout(model, x, v, steps=10, **given, checks=dv.Checks(energy=True))
+
+        assert said_of_energy(run) == []
 
 
 @pytest.mark.parametrize("schedule", [None, 3, dv.BinomialCheckpoints(2)])
@@ -258,7 +260,7 @@ def test_gradients_are_those_without_a_look(schedule: Any) -> None:
 
 def test_a_wrong_argument_is_named() -> None:
     model, x, v = bent_bar()
-    with pytest.raises(TypeError, match="check_energy: expected a bool or None, got int"):
+    with pytest.raises(TypeError, match="energy: expected a bool or None, got int"):
         dv.rollout(model, x, v, steps=1, **SOFT, checks=dv.Checks(energy=1))  # pyright: ignore[reportArgumentType]
 
 
@@ -286,11 +288,11 @@ def sliding(**friction: float) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
 
 def test_motion_that_pairs_held_up_is_warned_of() -> None:
     model, x, v = thrown()
-    with pytest.warns(UserWarning, match=r"pair_barrier: pairs held up .* larger reach") as found:
+    with pytest.warns(UserWarning, match=r"contact: pairs held up .* larger reach") as found:
         dv.rollout(model, x, v, steps=1, **FAST, checks=dv.Checks(contact=True))
     assert found[0].filename == __file__
     assert sum("pairs held up" in str(w.message) for w in found) == 1
-    assert cut_share(model) > CUT
+    assert cut_share(system_of(model, FAST["solver"])) > CUT
 
 
 def test_friction_that_has_not_converged_is_warned_of() -> None:
@@ -325,29 +327,8 @@ def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
 
 def test_bad_input() -> None:
     model, x, v = thrown()
-    with pytest.raises(TypeError, match="check_contact: expected a bool or None, got str"):
+    with pytest.raises(TypeError, match="contact: expected a bool or None, got str"):
         dv.rollout(model, x, v, steps=1, **FAST, checks=dv.Checks(contact="yes"))  # pyright: ignore[reportArgumentType]
-
-
-def test_steps_made_one_by_one_are_warned_of_once_pairs_have_held_up_several() -> None:
-    """Prescribed motion of 6 mm a step, where a body may go 2 mm beside another."""
-    lower, upper = box(2, 0.1), box(2, 0.1).translate((0.0, 0.103, 0.0))
-    barrier = dv.PairBarrier(kappa=1e3, dhat=2e-3, detections=1, reach=6e-3)
-    mesh = dv.mesh.join([lower, upper])
-    held = torch.from_numpy(mesh.points[:, 1] < 0.05)
-    model = dv.Model(mesh, pinned=held, energies=(dv.StableNeoHookean(), barrier))
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    shares, said = [], []
-    for k in range(SEVERAL + 6):
-        goal = torch.where(held[:, None], model.rest_points + torch.tensor([0.0, 6e-3 * (k + 1), 0.0]), torch.nan)
-        after: list[tuple[torch.Tensor, torch.Tensor]] = []
-        said.append(messages(lambda: after.append(dv.step(model, x, v, prescribed=goal, **FAST))))  # noqa: B023
-        x, v = after[0]
-        shares.append(float(cut_share(model)) > CUT)
-    assert sum(shares) >= SEVERAL
-    late = next(k for k in range(len(shares)) if k + 1 >= SEVERAL and all(shares[k + 1 - SEVERAL : k + 1]))  # first
-    assert [bool(texts) for texts in said] == [k == late for k in range(len(said))]
-    assert f"more than 1 % in each of the last {SEVERAL}" in said[late][0] and "larger reach" in said[late][0]
 
 
 # --- bodies that start inside out -------------------------------------------------------------------------------------
@@ -393,7 +374,8 @@ def test_some_inverted_tets_are_no_mistake() -> None:
 def test_nothing_is_said_where_nobody_asks() -> None:
     model, x = two_cubes()
     other = mirrored(model, x, 0)
-    assert said(model, other, check_start=False) == []
+    assert said(model, other, checks=dv.Checks(start=False)) == []
     with pytest.warns(UserWarning, match="no StableNeoHookean"):
         loose, x = two_cubes(energies=())
-    assert said(loose, mirrored(loose, x, 0)) == []
+    x = mirrored(loose, x, 0)
+    assert messages(lambda: dv.rollout(loose, x, 0 * x, GIVEN["solver"], steps=1)) == []

@@ -1,14 +1,12 @@
 """The budget of an error names the cause that is largest."""
 
-import dataclasses
-
 import pytest
 import torch
 from helpers.tilted_box import SOFT, tilted_box
 
 import diffvbd as dv
 from diffvbd import mesh
-from diffvbd.rollout import budget as budgets
+from diffvbd.rollout import tune
 from diffvbd.testing.tolerances import tolerance
 
 
@@ -38,14 +36,11 @@ def test_few_sweeps_are_the_cause() -> None:
 
 def test_converged_steps_on_a_floor_are_held_against_converged_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """Corrections may leave such steps far from converged however many sweeps they have: no reference, then."""
-    scene = {"duration": 0.016, **SOFT, "solver": dv.VBD(2e-3, 50)}
-    budget = dv.error_budget(*tilted_box(), **scene)
+    scene = {"duration": 0.016, **SOFT}
+    budget = dv.error_budget(*tilted_box(), dv.VBD(2e-3, 50), **scene)
     assert shares(budget)["sweeps"].motion < tolerance("closed_form") and budget.reached
-    monkeypatch.setattr(budgets, "MOST_SWEEPS", 1)
-    # TODO62: the solver of this call
-    none = dv.error_budget(
-        *tilted_box(), **scene | {"young": 1e9, "solver": dataclasses.replace(scene["solver"], sweeps=0)}
-    )
+    monkeypatch.setattr(tune, "MOST_SWEEPS", 1)
+    none = dv.error_budget(*tilted_box(), dv.VBD(2e-3, 0), **scene | {"young": 1e9})
     assert not none.reached and "no reference could be reached: " in str(none)
     assert "of its forces unbalanced" in shares(none)["sweeps"].note
 
@@ -94,20 +89,18 @@ def test_contact_and_friction() -> None:
 @pytest.mark.parametrize(
     ("given", "error", "text"),
     [
-        ({"part": 0.0}, ValueError, "part: expected"),
-        ({"part": 1.5}, ValueError, "part: expected"),
-        ({"time_step": -1.0}, ValueError, "time_step: expected"),
-        ({"time_step": 1.0}, ValueError, "time_step: expected at most the duration"),
-        ({"integrator": 0}, TypeError, "integrator: expected ImplicitEuler"),
+        ({"fraction": 0.0}, ValueError, "fraction: expected"),
+        ({"fraction": 1.5}, ValueError, "fraction: expected"),
+        ({"solver": dv.VBD(1.0, 3)}, ValueError, "solver: expected a time step of at most the duration"),
+        ({"solver": None}, TypeError, "solver: expected"),
         ({"quantity": 3}, TypeError, "quantity: expected a function of x and v, got int"),
         ({"gradient": 1}, TypeError, "gradient: expected a bool, got int"),
         ({"mesh": "yes"}, TypeError, "mesh: expected a bool, got str"),
-        ({"steps": 3}, TypeError, "steps: expected an argument among"),
+        ({"steps": 3}, TypeError, "steps: expected an input of this Model"),
         ({"mesh": True, "force": torch.zeros(28, 3, dtype=torch.float64)}, ValueError, "force: expected None beside"),
     ],
 )
 def test_bad_input(given, error, text) -> None:
     model, x, v = cantilever()
     with pytest.raises(error, match=text):
-        # TODO62: the solver of this call
-        dv.error_budget(model, x, v, **{"time_step": 0.05, "sweeps": 3, **SCENE} | given)
+        dv.error_budget(model, x, v, **{"solver": dv.VBD(0.05, 3), **SCENE} | given)

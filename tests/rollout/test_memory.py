@@ -1,6 +1,5 @@
-"""`model.memory` against bytes that torch's allocator and autograd report, within the tolerance "memory"."""
+"""`dv.memory` against bytes that torch's allocator and autograd report, within the tolerance "memory"."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
+from diffvbd.model.system import system_of
 from diffvbd.testing import tolerance
 
 SWEEPS = 20
@@ -45,7 +45,8 @@ def allocated_bytes(run: Callable[[], Any]) -> tuple[int, int]:
     return now, peak
 
 
-def own_tensors(model: dv.Model) -> list[Tensor]:
+def own_tensors(of: dv.Model, solver: dv.VBD) -> list[Tensor]:
+    model = system_of(of, solver)
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
     parts += () if model.coarse is None else (model._coarse_plan,)
     return [t for part in parts for t in part if isinstance(t, Tensor)]
@@ -68,11 +69,11 @@ def test_bytes_of_one_step(tape: str, floor: bool, scenes: int, wanted: str) -> 
     arguments[wanted].requires_grad_()
     if wanted != "rest_points":
         del arguments["rest_points"]
-    options = {"lam": 1e4, "solver": dv.VBD(0.01, SWEEPS, tape=tape)}
-    given = [x, *arguments.values(), *own_tensors(model)]
-    measured = saved_bytes(lambda: dv.step(model, x, **arguments, **options), given)
-    predicted = model.memory(dv.VBD(0.01, SWEEPS, tape=tape), scenes=scenes, rest=wanted == "rest_points")
-    graph = model.memory(dv.VBD(0.01, SWEEPS), rest=True)["kept"] - model.memory(dv.VBD(0.01, SWEEPS))["kept"]
+    solver = dv.VBD(0.01, SWEEPS, tape=tape)
+    given = [x, *arguments.values(), *own_tensors(model, solver)]
+    measured = saved_bytes(lambda: dv.step(model, x, solver=solver, lam=1e4, **arguments), given)
+    predicted = dv.memory(model, solver, scenes=scenes, rest=wanted == "rest_points")
+    graph = dv.memory(model, dv.VBD(0.01, SWEEPS), rest=True)["kept"] - dv.memory(model, dv.VBD(0.01, SWEEPS))["kept"]
     assert_near(predicted["step"] + (graph if wanted == "rest_points" else 0), measured)
 
 
@@ -85,15 +86,10 @@ def test_bytes_of_one_step_with_coarse_corrections(floor: bool, wanted: str) -> 
     x = model.rest_points[None]
     arguments = {"x": x, "v": torch.zeros_like(x), "mu": torch.full((model.num_tets,), 1e4, dtype=x.dtype)}
     arguments[wanted].requires_grad_()
-    options = {"lam": 1e4, "solver": dv.VBD(0.01, 8, tape="compact")}
-    given = [*arguments.values(), *own_tensors(model)]
-    measured = saved_bytes(
-        lambda: dv.step(
-            model, **arguments, **(options | {"solver": dataclasses.replace(options["solver"], subspace="coarse")})
-        ),
-        given,
-    )
-    predicted = model.memory(dv.VBD(0.01, 8, tape="compact"), material=wanted == "mu")
+    solver = dv.VBD(0.01, 8, tape="compact", subspace="coarse")
+    given = [*arguments.values(), *own_tensors(model, solver)]
+    measured = saved_bytes(lambda: dv.step(model, solver=solver, lam=1e4, **arguments), given)
+    predicted = dv.memory(model, solver, material=wanted == "mu")
     frame = 2 * x.numel() * x.element_size()  # which a rollout returns
     assert_near(predicted["kept"] - frame, measured)
 
@@ -105,7 +101,8 @@ def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype:
     for floor, extra in ((False, 0), (True, {"full": 4, "compact": 1, "recompute": 0}[tape])):
         model = beam_model(floor, dtype)
         item = model.mass.element_size()
-        tape_bytes = model.memory(
+        tape_bytes = dv.memory(
+            model,
             dv.VBD(0.01, SWEEPS, tape=tape),
             scenes=2,
         )["tape"]
@@ -114,25 +111,28 @@ def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype:
         sizes = []
         for sweeps in (SWEEPS, 2 * SWEEPS):
             v = torch.zeros_like(x).requires_grad_()
-            options = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, sweeps, tape=tape)}
-            # TODO62: the solver of this call
-            sizes.append(saved_bytes(lambda v=v, o=options, x=x, m=model: dv.step(m, x, v, **o), own_tensors(model)))
+            solver = dv.VBD(0.01, sweeps, tape=tape)
+
+            def run(v: Tensor = v, solver: dv.VBD = solver, x: Tensor = x, model: dv.Model = model) -> Any:
+                return dv.step(model, x, v, solver, mu=1e4, lam=1e4)
+
+            sizes.append(saved_bytes(run, own_tensors(model, solver)))
         assert sizes[1] - sizes[0] == tape_bytes
 
 
-@pytest.mark.parametrize(("name", "value"), [("sweeps", None), ("material", 1), ("rest", None)])
+@pytest.mark.parametrize(("name", "value"), [("steps", None), ("material", 1), ("rest", None)])
 def test_bad_arguments_are_named(name: str, value: Any) -> None:
     with pytest.raises(TypeError, match=f"^{name}: expected"):
-        beam_model().memory(**{"sweeps": 3, name: value})
+        dv.memory(beam_model(), dv.VBD(0.01, 3), **{name: value})
 
 
 def test_auto_chooses_by_size() -> None:
     model = beam_model()
-    small, large = (model.memory(dv.VBD(0.01, sweeps, tape="auto")) for sweeps in (20, 60_000))
+    small, large = (dv.memory(model, dv.VBD(0.01, sweeps, tape="auto")) for sweeps in (20, 60_000))
     assert small["tape"] == 20 * model.num_active * 72
     assert large["tape"] == 60_000 * model.num_active * 24
-    long = model.memory(dv.VBD(0.01, 20), steps=100_000)
-    assert long["kept"] < 0.05 * model.memory(dv.VBD(0.01, 20), steps=100_000, checkpoint_every=None)["kept"]
+    long = dv.memory(model, dv.VBD(0.01, 20), steps=100_000)
+    assert long["kept"] < 0.05 * dv.memory(model, dv.VBD(0.01, 20), steps=100_000, checkpoint_every=None)["kept"]
 
 
 ROLLOUTS = [
@@ -161,11 +161,11 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
     x = model.rest_points.clone()
     v = torch.zeros_like(x).requires_grad_()
     mu = torch.full((model.num_tets,), 1e4, dtype=x.dtype, requires_grad=True)
-    options = {"mu": mu, "lam": 1e4, "check_energy": False, "solver": dv.VBD(0.01, SWEEPS,
-                                                                             tape=tape)}  # a look takes some memory for a moment  # fmt: skip
+    solver, quiet = dv.VBD(0.01, SWEEPS, tape=tape), dv.Checks(energy=False)  # a look takes some memory for a moment
 
     def forward(steps: int = steps, schedule: Any = schedule, save: Any = save) -> dv.results.Trajectory:
-        return dv.rollout(model, x, v, steps=steps, checkpoint_every=schedule, save=save, **options)
+        return dv.rollout(model, x, v, solver, steps=steps, checkpoint_every=schedule, save=save, checks=quiet, mu=mu,
+                          lam=1e4)  # fmt: skip
 
     def backward(*given: Any) -> None:
         trajectory = forward(*given)
@@ -178,7 +178,7 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
     )
     held, _ = allocated_bytes(forward)
     peak = allocated_bytes(backward)[1]
-    predicted = model.memory(dv.VBD(0.01, SWEEPS, tape=tape), steps=steps, checkpoint_every=schedule, save=save)
+    predicted = dv.memory(model, solver, steps=steps, checkpoint_every=schedule, save=save)
     if isinstance(schedule, dv.BinomialCheckpoints) and save != "last":  # an upper estimate, see its documentation
         assert 0.7 * predicted["kept"] <= peak - passing <= predicted["kept"]
     else:
@@ -193,19 +193,12 @@ def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
     model = beam_model()
     x = model.rest_points.clone()
     v = torch.zeros_like(x).requires_grad_()
-    options = {
-        "mu": 1e4,
-        "lam": 1e4,
-        "steps": 36,
-        "save": "last",
-        "check_energy": False,
-        "solver": dv.VBD(0.01, SWEEPS),
-    }
+    options = {"mu": 1e4, "lam": 1e4, "steps": 36, "save": "last", "checks": dv.Checks(energy=False),
+               "solver": dv.VBD(0.01, SWEEPS, tape="full")}  # fmt: skip
     dv.rollout(model, x, v, **options)  # what a Model measures once is over
-    adjoint = dv.ReverseSweep("full")
     peaks = []
     for schedule in (None, 6, dv.BinomialCheckpoints(3)):
-        kept = {"checkpoint_every": schedule, "adjoint": adjoint}
+        kept = {"checkpoint_every": schedule}
         peaks.append(allocated_bytes(lambda k=kept: dv.rollout(model, x, v, **options, **k).x.sum().backward())[1])
     assert peaks[1] < 0.25 * peaks[0]
     assert peaks[2] < 0.3 * peaks[1]
@@ -213,6 +206,9 @@ def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
 
 def test_bytes_of_the_model_are_those_of_its_tensors() -> None:
     model = beam_model()
-    storages = {t.data_ptr(): t.numel() * t.element_size() for t in own_tensors(model)}
-    assert model.memory(dv.VBD(0.01, 1))["model"] == sum(storages.values())
-    assert model.memory(dv.VBD(0.01, 1))["total"] == sum(model.memory(dv.VBD(0.01, 1))[k] for k in ("kept", "scratch"))
+    storages = {t.data_ptr(): t.numel() * t.element_size() for t in own_tensors(model, dv.VBD(0.01, 1))}
+    found = dv.memory(model, dv.VBD(0.01, 1))
+    assert found["model"] == sum(storages.values())
+    assert dv.memory(model, dv.VBD(0.01, 1))["total"] == sum(
+        dv.memory(model, dv.VBD(0.01, 1))[k] for k in ("kept", "scratch")
+    )

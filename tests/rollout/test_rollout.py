@@ -31,10 +31,8 @@ CASES = ["plain", "floor_damped", "anchored", "batch"]
 
 def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], list[Tensor]]:
     """The inputs with fresh leaves, and the leaves."""
-    parameters = {k: t.clone().requires_grad_() for k, t in inputs.get("parameters", {}).items()}
-    call = {k: t.clone().requires_grad_() if isinstance(t, Tensor) else t for k, t in inputs.items()}
-    call = {**call, "parameters": parameters} if parameters else call
-    return call, [t for t in (*call.values(), *parameters.values()) if isinstance(t, Tensor)]
+    call = {name: t.clone().requires_grad_() for name, t in inputs.items()}
+    return call, list(call.values())
 
 
 def loss_of_frames(x: Tensor, v: Tensor) -> Tensor:
@@ -42,13 +40,12 @@ def loss_of_frames(x: Tensor, v: Tensor) -> Tensor:
     return (weights * x.square()).sum() + 0.01 * (weights * v).sum()
 
 
-def looped(model: dv.Model, call: dict[str, Any], steps: int = STEPS) -> tuple[Tensor, Tensor]:
+def looped(scene: Any, model: dv.Model, call: dict[str, Any], steps: int = STEPS) -> tuple[Tensor, Tensor]:
     options = {k: value for k, value in call.items() if k not in ("x", "v")}
     x, v = call["x"], call["v"]
     frames = [(x, v)]
     for _ in range(steps):
-        # TODO62: the solver of this call
-        x, v = dv.step(model, x, v, **options, sweeps=SWEEPS)
+        x, v = dv.step(model, x, v, scene.solver(SWEEPS), **options)
         frames.append((x, v))
     return torch.stack([f[0] for f in frames]), torch.stack([f[1] for f in frames])
 
@@ -58,14 +55,13 @@ def test_rollout_is_a_loop_of_steps_under_every_schedule(device: str, case: str)
     scene = build_scene(case)
     model, inputs = scene.model(device), scene.inputs(device=device)
     call, leaves = leaves_of(inputs)
-    expected = looped(model, call)
+    expected = looped(scene, model, call)
     slopes = torch.autograd.grad(loss_of_frames(*expected), leaves, allow_unused=True)
     assert sum(s is not None and float(s.abs().max()) > 0 for s in slopes) >= 7
     first = None
     for schedule in SCHEDULES:
         call, leaves = leaves_of(inputs)
-        # TODO62: the solver of this call
-        trajectory = dv.rollout(model, **call, steps=STEPS, checkpoint_every=schedule, sweeps=SWEEPS)
+        trajectory = dv.rollout(model, **call, steps=STEPS, checkpoint_every=schedule, solver=scene.solver(SWEEPS))
         assert trajectory.steps == list(range(STEPS + 1))
         assert torch.equal(trajectory.x, expected[0]) and torch.equal(trajectory.v, expected[1])
         grads = torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True)
@@ -83,10 +79,11 @@ def test_tapes_under_checkpoints(device: str, tape: str) -> None:
     scene = build_scene("floor_filtered")
     model, inputs = scene.model(device), scene.inputs(device=device)
     results = []
-    for adjoint, schedule in ((dv.ReverseSweep("full"), None), (dv.ReverseSweep(tape), 3)):
+    for kept, schedule in (("full", None), (tape, 3)):
         call, leaves = leaves_of(inputs)
-        # TODO62: the solver of this call
-        trajectory = dv.rollout(model, **call, steps=5, adjoint=adjoint, checkpoint_every=schedule, sweeps=SWEEPS)
+        trajectory = dv.rollout(
+            model, **call, solver=scene.solver(SWEEPS, tape=kept), steps=5, checkpoint_every=schedule
+        )
         results.append(torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True))
     assert all(a is None or relative_error(a, b) <= tolerance("schedules") for a, b in zip(*results, strict=True))
 
@@ -94,7 +91,7 @@ def test_tapes_under_checkpoints(device: str, tape: str) -> None:
 def test_no_grad_rollouts_save_nothing(device: str) -> None:
     scene = build_scene("plain")
     model, inputs = scene.model(device), scene.inputs(device=device)
-    expected = looped(model, inputs)
+    expected = looped(scene, model, inputs)
     for schedule in (None, 2, dv.BinomialCheckpoints(2)):
         trajectory = dv.rollout(model, solver=scene.solver(SWEEPS), **inputs, steps=STEPS, checkpoint_every=schedule)
         assert torch.equal(trajectory.x, expected[0]) and not trajectory.x.requires_grad
@@ -118,9 +115,8 @@ def controlled(device: str, schedule: Any, every_argument: bool) -> list[Tensor]
     options = inputs | {"force": force}
     if every_argument:
         options["mu"] = lambda k, x, v: inputs["mu"] * scale * (1 + 0.1 * k)
-        options["parameters"] = inputs["parameters"] | {"floor_kappa": lambda k, x, v: 2e4 * scale}
-    # TODO62: the solver of this call
-    trajectory = dv.rollout(model, **options, steps=STEPS, checkpoint_every=schedule, sweeps=SWEEPS)
+        options["floor_kappa"] = lambda k, x, v: 2e4 * scale
+    trajectory = dv.rollout(model, **options, steps=STEPS, checkpoint_every=schedule, solver=scene.solver(SWEEPS))
     leaves = [*network.parameters(), *([scale] if every_argument else [])]
     return list(torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves))
 
@@ -150,10 +146,10 @@ def values_per_step(name: str, value: Tensor) -> Tensor:
 def test_per_step_and_callables_of_every_argument(device: str, name: str, schedule: Any) -> None:
     scene = build_scene("anchored")
     model, inputs = scene.model(device), scene.inputs(device=device)
-    base = inputs["parameters"][name] if "." in name else inputs[name]
+    base = inputs[name]
 
     def given(value: Any) -> dict[str, Any]:
-        return inputs | ({"parameters": {name: value}} if "." in name else {name: value})
+        return inputs | {name: value}
 
     results = []
     for form in ("loop", "per_step", "callable"):
@@ -161,13 +157,11 @@ def test_per_step_and_callables_of_every_argument(device: str, name: str, schedu
         if form == "loop":
             x, v = inputs["x"], inputs["v"]
             for k in range(STEPS):
-                # TODO62: the solver of this call
-                x, v = dv.step(model, **(given(values[k]) | {"x": x, "v": v}), sweeps=SWEEPS)
+                x, v = dv.step(model, **(given(values[k]) | {"x": x, "v": v}), solver=scene.solver(SWEEPS))
         else:
             value = dv.per_step(values) if form == "per_step" else lambda k, x, v, values=values: values[k]
-            # TODO62: the solver of this call
             trajectory = dv.rollout(
-                model, **given(value), steps=STEPS, checkpoint_every=schedule, save="last", sweeps=SWEEPS
+                model, **given(value), steps=STEPS, checkpoint_every=schedule, save="last", solver=scene.solver(SWEEPS)
             )
             x, v = trajectory.x[-1], trajectory.v[-1]
         results.append((x, v, *torch.autograd.grad(loss_of_frames(x, v), values)))
@@ -178,16 +172,14 @@ def test_per_step_and_callables_of_every_argument(device: str, name: str, schedu
         assert relative_error(result[2], results[0][2]) <= tolerance("schedules")
 
 
-@pytest.mark.parametrize("name", ["mu", "force", "prescribed", "density", "parameters"])
+@pytest.mark.parametrize("name", ["mu", "force", "prescribed", "density", "anchor_stiffness"])
 def test_wrong_number_of_steps_raises(name: str) -> None:
     scene = build_scene("anchored")
     model, inputs = scene.model(), scene.inputs()
-    base = inputs["parameters"]["anchor_stiffness"] if name == "parameters" else inputs[name]
+    base = inputs[name]
     value: Any = dv.per_step(torch.stack([base] * (STEPS + 1)))
-    value = {"anchor_stiffness": value} if name == "parameters" else value
     with pytest.raises(ValueError, match=f"{name}.*{STEPS} steps.*{STEPS + 1}"):
-        # TODO62: the solver of this call
-        dv.rollout(model, **(inputs | {name: value}), steps=STEPS, sweeps=SWEEPS)
+        dv.rollout(model, **(inputs | {name: value}), steps=STEPS, solver=scene.solver(SWEEPS))
 
 
 @pytest.mark.parametrize("value", [3.0, [1.0, 2.0], torch.tensor(1.0), None])
@@ -208,10 +200,11 @@ def test_per_step_wants_a_tensor_with_a_leading_dimension(value: Any) -> None:
 def test_save_modes(device: str, save: Any, kept: list[int], schedule: Any) -> None:
     scene = build_scene("batch")
     model, inputs = scene.model(device), scene.inputs(device=device)
-    frames = looped(model, inputs)
+    frames = looped(scene, model, inputs)
     call, leaves = leaves_of(inputs)
-    # TODO62: the solver of this call
-    trajectory = dv.rollout(model, **call, steps=STEPS, save=save, checkpoint_every=schedule, sweeps=SWEEPS)
+    trajectory = dv.rollout(
+        model, **call, steps=STEPS, save=save, checkpoint_every=schedule, solver=scene.solver(SWEEPS)
+    )
     assert trajectory.steps == kept
     assert torch.equal(trajectory.x, frames[0][kept]) and torch.equal(trajectory.v, frames[1][kept])
     torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True)
@@ -221,20 +214,19 @@ def test_save_modes(device: str, save: Any, kept: list[int], schedule: Any) -> N
 def test_observations_are_stacked_and_differentiable(device: str, schedule: Any) -> None:
     scene = build_scene("plain")
     model, inputs = scene.model(device), scene.inputs(device=device)
-    frames = looped(model, inputs)
+    frames = looped(scene, model, inputs)
     tip = frames[0][1:, -1]
     observers = {
-        "tensor": lambda x, v, k: x[-1],
-        "tuple": lambda x, v, k: (x[-1], v.square().sum(), torch.tensor(k)),
-        "dict": lambda x, v, k: {"tip": x[-1], "nested": [v.square().sum()]},
-        "none": lambda x, v, k: None,
+        "tensor": lambda k, x, v: x[-1],
+        "tuple": lambda k, x, v: (x[-1], v.square().sum(), torch.tensor(k)),
+        "dict": lambda k, x, v: {"tip": x[-1], "nested": [v.square().sum()]},
+        "none": lambda k, x, v: None,
     }
     seen = {}
     for form, observe in observers.items():
         call, leaves = leaves_of(inputs)
         options = {"steps": STEPS, "save": "last", "checkpoint_every": schedule}
-        # TODO62: the solver of this call
-        seen[form] = dv.rollout(model, **call, observe=observe, **options, sweeps=SWEEPS).observations
+        seen[form] = dv.rollout(model, **call, observe=observe, **options, solver=scene.solver(SWEEPS)).observations
         if form == "tensor":
             (slope,) = torch.autograd.grad(seen[form].square().sum(), leaves[0])
     assert torch.equal(seen["tensor"], tip)
@@ -244,7 +236,7 @@ def test_observations_are_stacked_and_differentiable(device: str, schedule: Any)
     assert torch.equal(seen["dict"]["tip"], tip) and torch.equal(seen["dict"]["nested"][0], seen["tuple"][1])
     assert seen["none"] is None
     call, leaves = leaves_of(inputs)
-    (expected,) = torch.autograd.grad(looped(model, call)[0][1:, -1].square().sum(), leaves[0])
+    (expected,) = torch.autograd.grad(looped(scene, model, call)[0][1:, -1].square().sum(), leaves[0])
     assert expected.abs().max() > 0
     assert relative_error(slope, expected) <= tolerance("schedules")
 
@@ -254,8 +246,7 @@ def test_observing_something_else_raises() -> None:
     with pytest.raises(TypeError, match=r"values: expected a tensor of shape \[steps, ...\], got shape \[\]"):
         dv.per_step(torch.ones(()))
     with pytest.raises(TypeError, match="observe.*float"):
-        # TODO62: the solver of this call
-        dv.rollout(scene.model(), **scene.inputs(), steps=2, observe=lambda k, x, v: float(k), sweeps=1)
+        dv.rollout(scene.model(), **scene.inputs(), steps=2, observe=lambda k, x, v: float(k), solver=scene.solver(1))
 
 
 def test_zero_steps_return_the_initial_state(device: str) -> None:
@@ -265,8 +256,7 @@ def test_zero_steps_return_the_initial_state(device: str) -> None:
         for schedule in (None, "auto", 2, dv.BinomialCheckpoints(1)):
             call, leaves = leaves_of(inputs)
             options = {"steps": 0, "save": save, "checkpoint_every": schedule}
-            # TODO62: the solver of this call
-            trajectory = dv.rollout(model, **call, observe=lambda k, x, v: x, **options, sweeps=SWEEPS)
+            trajectory = dv.rollout(model, **call, observe=lambda k, x, v: x, **options, solver=scene.solver(SWEEPS))
             assert trajectory.steps == [0] and trajectory.observations is None
             assert torch.equal(trajectory.x[0], inputs["x"]) and torch.equal(trajectory.v[0], inputs["v"])
             (slope,) = torch.autograd.grad(trajectory.x.sum(), leaves[0])
@@ -282,10 +272,9 @@ def test_zero_steps_return_the_initial_state(device: str) -> None:
 )  # fmt: skip
 def test_bad_options_raise(name: str, value: Any, error: type[Exception]) -> None:
     scene = build_scene("plain")
-    options = scene.inputs() | {"steps": 2, "sweeps": 1, name: value}
+    options = scene.inputs() | {"steps": 2, name: value}
     with pytest.raises(error, match=f"{name}: expected .*got"):
-        # TODO62: the solver of this call
-        dv.rollout(scene.model(), **options)
+        dv.rollout(scene.model(), solver=scene.solver(1), **options)
 
 
 # --- cost of a schedule -----------------------------------------------------------------------------------------------
@@ -307,8 +296,9 @@ def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -
     x = inputs["x"].clone().requires_grad_()
     options = inputs | {"x": x, "force": force}
     schedule = dv.BinomialCheckpoints(snapshots)
-    # TODO62: the solver of this call
-    trajectory = dv.rollout(model, **options, steps=steps, save="last", checkpoint_every=schedule, sweeps=1)
+    trajectory = dv.rollout(
+        model, **options, steps=steps, save="last", checkpoint_every=schedule, solver=scene.solver(1)
+    )
     assert runs == [1] * steps
     trajectory.x.sum().backward()
     repeats = next(t for t in range(steps + 1) if comb(snapshots + t, t) >= steps)
@@ -323,9 +313,10 @@ def test_changing_an_argument_before_a_checkpointed_backward_raises(device: str,
     model, inputs = scene.model(device), scene.inputs(device=device)
     call, _ = leaves_of(inputs)
     options = {k: value for k, value in call.items() if k not in ("x", "v")}
-    # TODO62: the solver of this call
-    end = dv.rollout(model, call["x"], call["v"], steps=4, checkpoint_every=schedule, **options, sweeps=1).x[-1]
-    changed = call["parameters"][name] if "." in name else call[name]
+    end = dv.rollout(
+        model, call["x"], call["v"], steps=4, checkpoint_every=schedule, **options, solver=scene.solver(1)
+    ).x[-1]
+    changed = call[name]
     with torch.no_grad():
         changed.mul_(2)
     with pytest.raises(RuntimeError, match="changed in place|modified by an inplace operation"):
@@ -344,8 +335,7 @@ def test_values_of_all_steps_without_per_step_say_what_takes_them(name: str) -> 
     model, inputs = scene.model(), scene.inputs()
     whole = inputs[name].expand(*inputs["x"].shape[:-2], *inputs[name].shape[-1 if name == "mu" else -2 :])
     with pytest.raises(ValueError, match=rf"{name}: .*in a rollout, per_step\({name}\) takes one for each step"):
-        # TODO62: the solver of this call
-        dv.rollout(model, **(inputs | {name: torch.stack([whole] * FEW)}), steps=FEW, sweeps=TWO_SWEEPS)
+        dv.rollout(model, **(inputs | {name: torch.stack([whole] * FEW)}), steps=FEW, solver=scene.solver(TWO_SWEEPS))
 
 
 @pytest.mark.parametrize("name", ["mu", "gravity", "prescribed", "rest_points"])
@@ -354,14 +344,12 @@ def test_a_function_that_returns_nothing_raises(name: str) -> None:
     scene = build_scene("anchored")
     model, inputs = scene.model(), scene.inputs()
     with pytest.raises(TypeError, match=f"{name}: expected a function that returns the value.*got None .in step 0"):
-        # TODO62: the solver of this call
-        dv.rollout(model, **(inputs | {name: lambda k, x, v: None}), steps=FEW, sweeps=TWO_SWEEPS)
+        dv.rollout(model, **(inputs | {name: lambda k, x, v: None}), steps=FEW, solver=scene.solver(TWO_SWEEPS))
 
 
 def test_a_trajectory_prints_in_one_line() -> None:
     scene = build_scene("anchored")
-    # TODO62: the solver of this call
-    found = dv.rollout(scene.model(), **scene.inputs(), steps=4, save=2, sweeps=1)
+    found = dv.rollout(scene.model(), **scene.inputs(), steps=4, save=2, solver=scene.solver(1))
     expected = f"Trajectory(3 frames of steps 0 to 4, x and v of shape {list(found.x.shape)})"
     assert repr(found) == expected
 
@@ -369,10 +357,8 @@ def test_a_trajectory_prints_in_one_line() -> None:
 def test_a_force_of_none_is_no_force() -> None:
     scene = build_scene("anchored")
     model, inputs = scene.model(), {k: value for k, value in scene.inputs().items() if k != "force"}
-    # TODO62: the solver of this call
-    without = dv.rollout(model, **inputs, steps=FEW, sweeps=TWO_SWEEPS)
-    # TODO62: the solver of this call
-    none = dv.rollout(model, **inputs, force=lambda k, x, v: None, steps=FEW, sweeps=TWO_SWEEPS)
+    without = dv.rollout(model, **inputs, steps=FEW, solver=scene.solver(TWO_SWEEPS))
+    none = dv.rollout(model, **inputs, force=lambda k, x, v: None, steps=FEW, solver=scene.solver(TWO_SWEEPS))
     assert torch.equal(none.x, without.x)
 
 
@@ -383,66 +369,59 @@ def test_an_error_of_a_step_says_which_step_it_was() -> None:
     rest = inputs["rest_points"] if inputs.get("rest_points") is not None else model.rest_points
     turned = inputs | {"rest_points": lambda k, x, v: rest if k < 2 else -rest}
     with pytest.raises(ValueError, match=r"rest_points: .*at tet \d+ of scene 0 .in step 2.$"):
-        # TODO62: the solver of this call
-        dv.rollout(model, **turned, steps=FEW, sweeps=TWO_SWEEPS)
+        dv.rollout(model, **turned, steps=FEW, solver=scene.solver(TWO_SWEEPS))
 
 
 @pytest.mark.parametrize(
-    ("name", "function"), [("mu", lambda k: 1e4), ("force", lambda x, v: 0.0), ("parameters", lambda: 1e3)]
+    ("name", "function"), [("mu", lambda k: 1e4), ("force", lambda x, v: 0.0), ("anchor_stiffness", lambda: 1e3)]
 )
 def test_a_function_of_other_arguments_raises(name: str, function: Callable[..., Any]) -> None:
     scene = build_scene("anchored")
-    value = {"anchor_stiffness": function} if name == "parameters" else function
+    value = function
     with pytest.raises(TypeError, match=rf"{name}.*: expected a function of step, x, v: too many positional"):
-        # TODO62: the solver of this call
-        dv.rollout(scene.model(), **(scene.inputs() | {name: value}), steps=FEW, sweeps=TWO_SWEEPS)
+        dv.rollout(scene.model(), **(scene.inputs() | {name: value}), steps=FEW, solver=scene.solver(TWO_SWEEPS))
 
 
 @pytest.mark.parametrize(
     ("observe", "says"),
     [
-        (lambda x, v: x, "expected a function of x, v, step: too many positional"),
-        (lambda step, x, v: x, "expected a function of x, v, step in this order, got step, x, v"),
-        (lambda step, *rest, x=None: step, "expected a function of x, v, step in this order, got step"),
-        (3, "expected a function of x, v, step, got int"),
-        (lambda x, v, k: {str(k): x}, r"with the keys \['1'\] after each .* keys \['2'\] after step 2"),
-        (lambda x, v, k: (x,) * (5 - k), "expected a tuple of 4 after each .* got a tuple of 3 after step 2"),
-        (lambda x, v, k: (x,) * k, "expected a tuple of 1 after each .* got a tuple of 2 after step 2"),
-        (lambda x, v, k: {"a": x} if k == 1 else x, r"with the keys \['a'\] after each .* got a tensor of shape"),
-        (lambda x, v, k: None if k == 1 else x, "expected None after each .* got a tensor of shape"),
-        (lambda x, v, k: {"a": x[:k]}, r"a tensor of shape \[1, .* after each .* \[2, .* after step 2"),
+        (lambda x, v: x, "expected a function of step, x, v: too many positional"),
+        (lambda x, v, step: x, "expected a function of step, x, v in this order, got x, v, step"),
+        (lambda x, *rest, step=None: x, "expected a function of step, x, v in this order, got x"),
+        (3, "expected a function of step, x, v, got int"),
+        (lambda k, x, v: {str(k): x}, r"with the keys \['1'\] after each .* keys \['2'\] after step 2"),
+        (lambda k, x, v: (x,) * (5 - k), "expected a tuple of 4 after each .* got a tuple of 3 after step 2"),
+        (lambda k, x, v: (x,) * k, "expected a tuple of 1 after each .* got a tuple of 2 after step 2"),
+        (lambda k, x, v: {"a": x} if k == 1 else x, r"with the keys \['a'\] after each .* got a tensor of shape"),
+        (lambda k, x, v: None if k == 1 else x, "expected None after each .* got a tensor of shape"),
+        (lambda k, x, v: {"a": x[:k]}, r"a tensor of shape \[1, .* after each .* \[2, .* after step 2"),
     ],
 )
 def test_what_observe_returns_is_alike_after_each_step(observe: Any, says: str) -> None:
     scene = build_scene("anchored")
     with pytest.raises((TypeError, ValueError), match=f"observe: .*{says}"):
-        # TODO62: the solver of this call
-        dv.rollout(scene.model(), **scene.inputs(), steps=3, observe=observe, sweeps=1)
+        dv.rollout(scene.model(), **scene.inputs(), steps=3, observe=observe, solver=scene.solver(1))
 
 
 def test_save_takes_words_and_integers() -> None:
     scene = build_scene("anchored")
     given = {**scene.inputs(), "steps": 5}
-    # TODO62: the solver of this call
-    assert dv.rollout(scene.model(), **given, save=np.int64(2), sweeps=1).steps == [0, 2, 4, 5]
+    assert dv.rollout(scene.model(), **given, save=np.int64(2), solver=scene.solver(1)).steps == [0, 2, 4, 5]
     for bad in (np.arange(2), torch.arange(2), 2.0, True, 0, "some"):
         with pytest.raises(ValueError, match='save: expected "all", "last" or an integer > 0, got'):
-            # TODO62: the solver of this call
-            dv.rollout(scene.model(), **given, save=bad, sweeps=1)
+            dv.rollout(scene.model(), **given, save=bad, solver=scene.solver(1))
     with pytest.raises(TypeError, match="checkpoint_every: expected an integer, got ndarray"):
-        # TODO62: the solver of this call
-        dv.rollout(scene.model(), **given, checkpoint_every=np.arange(2), sweeps=1)  # pyright: ignore[reportArgumentType]
+        dv.rollout(scene.model(), **given, checkpoint_every=np.arange(2), solver=scene.solver(1))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("name", ["force", "prescribed"])
 def test_a_function_that_returns_no_finite_number_is_named(name: str) -> None:
     model = dv.Model(dv.mesh.cube(), pinned=[0])
-    x, given = model.rest_points, {"mu": 1e4, "lam": 1e4, "time_step": 0.01, name: lambda k, x, v: float("inf")}
+    x, given = model.rest_points, {"mu": 1e4, "lam": 1e4, name: lambda k, x, v: float("inf")}
     with pytest.raises(ValueError, match=f"^{name}: expected finite values, got inf"):
         dv.rollout(model, x, 0 * x, dv.VBD(0.01, TWO_SWEEPS), **given, steps=FEW)
     with pytest.raises(ValueError, match=f"^{name}: expected finite values, got inf"):
-        # TODO62: the solver of this call
-        dv.solve(model, x, 0 * x, **(given | {name: float("inf")}))
+        dv.solve(model, x, 0 * x, dv.VBD(0.01, 1), **(given | {name: float("inf")}))
 
 
 # --- functions that return something else under checkpoints -----------------------------------------------------------

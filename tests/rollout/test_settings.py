@@ -1,44 +1,33 @@
-"""Settings given to a rollout run what the same arguments run."""
+"""What a solver is refused for, and the number of its steps over a duration."""
+
+import dataclasses
 
 import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd import mesh
 
 MATERIAL = {"mu": 1e5, "lam": 1e5}
 
 
-@pytest.fixture(scope="module")
-def beam() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
-    body = mesh.beam(5, 2, 2, size=(0.4, 0.1, 0.1))
-    model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
-    return model, model.rest_points, torch.zeros_like(model.rest_points)
-
-
-# TODO62: dtype=torch.float32 of Settings is gone
 @pytest.mark.parametrize(
     ("given", "error", "text"),
     [
-        ({"settings": dv.VBD(0.01, 5), "steps": 2, "sweeps": 3}, TypeError, "sweeps: expected None beside"),
-        ({"settings": dv.VBD(0.01, 5), "steps": 2, "integrator": dv.SDIRK2()}, TypeError, "integrator: expected"),
-        ({"settings": dv.VBD(0.01, 5)}, TypeError, "duration: expected either duration or steps"),
-        ({"settings": dv.VBD(0.01, 5), "steps": 2, "duration": 1.0}, TypeError, "duration: expected either"),
-        ({"settings": dv.VBD(0.01, 5), "duration": -1.0}, ValueError, "duration: expected"),
-        ({"settings": "best", "steps": 2}, TypeError, "settings: expected diffvbd.Settings"),
-        ({"settings": "auto", "steps": 2}, TypeError, "duration: expected it beside"),
-        ({"settings": dv.VBD(0.01, 5), "steps": 2}, ValueError, "settings: expected those"),
-        ({"duration": 1.0, "time_step": 0.01, "sweeps": 3}, TypeError, "duration: expected it beside settings"),
-        ({"steps": 2, "sweeps": 3}, TypeError, "time_step: expected a number"),
-        ({"steps": 2, "time_step": 0.01}, TypeError, "sweeps: expected a number"),
-        ({"time_step": 0.01, "sweeps": 3}, TypeError, "steps: expected"),
+        ({}, TypeError, "steps: expected either steps or duration, got neither"),
+        ({"steps": 2, "duration": 1.0}, TypeError, "steps: expected either steps or duration, got both"),
+        ({"duration": -1.0}, ValueError, "duration: expected"),
+        ({"solver": 0.01, "steps": 2}, TypeError, "solver: expected"),
+        ({"steps": 2, "sweeps": 3}, TypeError, "sweeps: expected an input of this Model"),
+        ({"steps": 2, "floor_kapa": 3.0}, TypeError, "floor_kapa: expected .*no FloorBarrier|is 'floor_kappa' meant"),
+        ({"steps": 2, "pair_kappa": 3.0}, TypeError, "pair_kappa: expected .*which has no PairBarrier"),
+        ({"steps": 2, "checks": True}, TypeError, "checks: expected a diffvbd.Checks"),
     ],
 )
-def test_what_does_not_go_together_raises(beam, given, error, text) -> None:
-    model, x, v = beam
+def test_what_does_not_go_together_raises(given, error, text) -> None:
+    model = dv.Model(dv.mesh.cube(), pinned=[0])
+    x = model.rest_points
     with pytest.raises(error, match=text):
-        # TODO62: the solver of this call
-        dv.rollout(model, x, v, **MATERIAL, **given)
+        dv.rollout(model, x, 0 * x, **{"solver": dv.VBD(0.01, 5), **MATERIAL, **given})
 
 
 @pytest.mark.parametrize(
@@ -49,17 +38,17 @@ def test_what_does_not_go_together_raises(beam, given, error, text) -> None:
         ({"integrator": dv.SDIRK2}, ValueError, "integrator: expected an object"),
         ({"tape": "some"}, ValueError, "tape: expected"),
         ({"block": "other"}, ValueError, "block: expected"),
+        ({"start": "rest"}, ValueError, "start: expected"),
         ({"relaxation": 2.0}, ValueError, "relaxation: expected a number in"),
         ({"relaxation": None}, TypeError, "relaxation: expected a number, got NoneType"),
-        ({"coarse": "yes"}, TypeError, "coarse: expected a diffvbd.CoarseSpace"),
-        ({"acceleration": 5}, TypeError, "acceleration: expected a diffvbd.Anderson"),
-        ({"dtype": "float64"}, ValueError, "dtype: expected torch.float64"),
-        ({"checkpoint_every": 0}, ValueError, "checkpoint_every: expected an integer >= 1"),
-        ({"checkpoint_every": "all"}, ValueError, 'checkpoint_every: expected "auto"'),
-        ({"predicted": 3}, TypeError, "predicted: expected a diffvbd.Prediction"),
+        ({"subspace": "yes"}, TypeError, "subspace: expected"),
+        ({"subspace": "coarse", "block": "paper"}, ValueError, "subspace: expected no coarse space"),
+        ({"subspace": "coarse", "saturation": 0.1}, ValueError, "subspace: expected no coarse space"),
+        ({"saturation": -1.0}, ValueError, "saturation: expected"),
+        ({"regularization": -1.0}, ValueError, "regularization: expected"),
     ],
 )
-def test_settings_are_checked_where_they_are_made(given, error, text) -> None:
+def test_a_solver_is_checked_where_it_is_made(given, error, text) -> None:
     with pytest.raises(error, match=text):
         dv.VBD(**{"time_step": 0.01, "sweeps": 5} | given)
 
@@ -70,8 +59,18 @@ def test_steps_of_what_is_no_duration_raise(duration) -> None:
         dv.VBD(0.01, 5).steps(duration)
 
 
-def test_steps_over_a_duration() -> None:
-    assert dv.VBD(0.01, 5).on(4, 0.1).time_step == 0.1 / 4
-    for steps, duration, said in ((0, 0.1, "steps: expected an integer >= 1"), (4, 0.0, "duration: expected")):
-        with pytest.raises(ValueError, match=said):
-            dv.VBD(0.01, 5).on(steps, duration)
+def test_a_duration_is_equal_steps_of_at_most_the_time_step() -> None:
+    model = dv.Model(dv.mesh.cube(), pinned=[0])
+    x, solver = model.rest_points, dv.VBD(0.04, 5)
+    found = dv.rollout(model, x, 0 * x, solver, duration=0.1, **MATERIAL)
+    same = dv.rollout(model, x, 0 * x, dataclasses.replace(solver, time_step=0.1 / 3), steps=3, **MATERIAL)
+    assert torch.equal(found.x, same.x) and found.steps == [0, 1, 2, 3]
+
+
+def test_inputs_print_as_a_table() -> None:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=(0.0, 1.0)), dv.Anchor(2.0))
+    inputs = dv.Model(dv.mesh.cube(), energies=energies).inputs
+    assert inputs["floor_height"].shape == "[..., 2]" and inputs["floor_height"].unit == "m"
+    assert inputs["floor_kappa"].source == "FloorBarrier" and {"mu", "young", "anchor_points"} <= set(inputs)
+    assert len(str(inputs).splitlines()) == len(inputs) + 1
+    assert "mu" not in dv.Model(dv.mesh.cube(), energies=dv.Anchor(1.0)).inputs

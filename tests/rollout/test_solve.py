@@ -1,5 +1,6 @@
 """Claim: dv.solve sweeps until the step has converged, says so, and has the derivative of the converged step."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,24 +14,24 @@ from diffvbd.testing import build_scene, contact_scenes, evaluate, relative_erro
 CASES = ("plain", "paper", "stiff", "floor_damped", "floor_corner", "anchored", "batch")
 
 
-def scene_on(device: str, case: str) -> tuple[dv.Model, dict[str, Any]]:
+def scene_on(device: str, case: str) -> tuple[dv.Model, dv.VBD, dict[str, Any]]:
     scene = build_scene(case, "delaunay")
-    return scene.model(device), scene.inputs(device=device)
+    return scene.model(device), scene.solver(1), scene.inputs(device=device)
 
 
 @pytest.mark.parametrize("goal", (1e-4, 1e-9))
 @pytest.mark.parametrize("case", CASES)
 def test_the_residual_meets_the_tolerance(device: str, case: str, goal: float) -> None:
     """Measured by the reference's potential."""
-    model, inputs = scene_on(device, case)
-    # TODO62: the solver of this call
-    done = dv.solve(model, tolerance=goal, check_every=5, **inputs)
+    model, solver, inputs = scene_on(device, case)
+    done = dv.solve(model, solver=solver, tolerance=goal, check_every=5, **inputs)
     assert done.converged and done.sweeps >= 5
-    x, v, h = inputs["x"], inputs["v"], inputs["time_step"]
+    x, v, h = inputs["x"], inputs["v"], solver.time_step
     mass = torch.where(model.mass > 0, model.mass, 1.0)[:, None]
     y = x + h * v + h * h * (inputs["gravity"] + inputs["force"] / mass)
+    parameters = {k: t for k, t in inputs.items() if k.startswith(("floor", "anchor"))}
     left = reference.residual(model, done.x, y, inputs["mu"], inputs["lam"], h, x, density=inputs["density"],
-                              rest_points=inputs["rest_points"], parameters=inputs.get("parameters"))  # fmt: skip
+                              rest_points=inputs["rest_points"], parameters=parameters)  # fmt: skip
     left, inertia = (torch.where(model.pinned[:, None], 0.0, a) for a in (left, mass * (done.x - y)))
     scale = inertia.flatten(-2).norm(dim=-1) + (left - inertia).flatten(-2).norm(dim=-1)
     residual = float((left.flatten(-2).norm(dim=-1) / scale).max())
@@ -41,28 +42,25 @@ def test_the_residual_meets_the_tolerance(device: str, case: str, goal: float) -
 
 @pytest.mark.parametrize("case", CASES)
 def test_it_is_a_step_of_as_many_sweeps(device: str, case: str) -> None:
-    model, inputs = scene_on(device, case)
-    # TODO62: the solver of this call
-    done = dv.solve(model, tolerance=1e-6, **inputs)
-    # TODO62: the solver of this call
-    x, v = dv.step(model, **inputs, sweeps=done.sweeps)
+    model, solver, inputs = scene_on(device, case)
+    done = dv.solve(model, solver=solver, tolerance=1e-6, **inputs)
+    x, v = dv.step(model, **inputs, solver=replace(solver, sweeps=done.sweeps))
     assert relative_error(done.x, x) <= tolerance("forward")
-    assert relative_error(done.v * inputs["time_step"], v * inputs["time_step"]) <= tolerance("travel")
+    assert relative_error(done.v * solver.time_step, v * solver.time_step) <= tolerance("travel")
     assert device != "cpu" or (torch.equal(done.x, x) and torch.equal(done.v, v))
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_its_default_derivative_is_that_of_the_executed_sweeps(device: str, case: str) -> None:
     """At convergence; the two come to it by different ways."""
-    model, inputs = scene_on(device, case)
+    model, solver, inputs = scene_on(device, case)
 
     def run(adjoint: Any) -> dict[str, torch.Tensor]:
         def solved(**options: Any) -> tuple[torch.Tensor, torch.Tensor]:
-            # TODO62: the solver of this call
-            done = dv.solve(model, tolerance=1e-13, adjoint=adjoint, on_failure="warn", **options)
+            done = dv.solve(model, solver=solver, tolerance=1e-13, adjoint=adjoint, on_failure="warn", **options)
             return done.x, done.v
 
-        return evaluate(solved, inputs)
+        return evaluate(solved, inputs, solver.time_step)
 
     implicit, executed = run(dv.GlobalAdjoint(tolerance=1e-13)), run(dv.ReverseSweep())
     names = [name for name in executed if name.startswith("grad_") and bool(executed[name].any())]
@@ -72,12 +70,13 @@ def test_its_default_derivative_is_that_of_the_executed_sweeps(device: str, case
 
 
 def test_its_gradient_agrees_with_differences(device: str) -> None:
-    model, inputs = scene_on(device, "floor_damped")
-    fixed = {k: inputs.pop(k) for k in ("lam", "time_step", "density", "gravity", "prescribed", "force", "parameters")}
+    model, solver, inputs = scene_on(device, "floor_damped")
+    keys = ("lam", "density", "gravity", "prescribed", "force", "floor_kappa", "floor_height", "floor_normal")
+    fixed = {k: inputs.pop(k) for k in (*keys, "floor_damping", "floor_dhat") if k in inputs}
 
     def loss(**arguments: Any) -> torch.Tensor:
-        # TODO62: the solver of this call
-        done = dv.solve(model, tolerance=1e-13, adjoint=dv.GlobalAdjoint(tolerance=1e-12), **arguments, **fixed)
+        done = dv.solve(model, solver=solver, tolerance=1e-13, adjoint=dv.GlobalAdjoint(tolerance=1e-12),
+                        **arguments, **fixed)  # fmt: skip
         return done.x.square().sum() + 0.01 * done.v[..., 0].sum()
 
     check = dv.check_gradients(loss, inputs, verbose=False)
@@ -94,14 +93,12 @@ def test_a_body_at_rest_or_in_free_fall_needs_no_sweep(device: str) -> None:
 
 
 def test_not_converging_is_never_silent(device: str) -> None:
-    model, inputs = scene_on(device, "stiff")
+    model, solver, inputs = scene_on(device, "stiff")
     message = "solve: expected a residual of at most 1e-09, got .* after 7 sweeps"
     with pytest.raises(RuntimeError, match=message):
-        # TODO62: the solver of this call
-        dv.solve(model, tolerance=1e-9, max_sweeps=7, **inputs)
+        dv.solve(model, solver=solver, tolerance=1e-9, max_sweeps=7, **inputs)
     with pytest.warns(RuntimeWarning, match=message):
-        # TODO62: the solver of this call
-        done = dv.solve(model, tolerance=1e-9, max_sweeps=7, on_failure="warn", **inputs)
+        done = dv.solve(model, solver=solver, tolerance=1e-9, max_sweeps=7, on_failure="warn", **inputs)
     assert not done.converged and done.sweeps == 7 and done.residual > 1e-9
 
 
@@ -121,28 +118,28 @@ BAD = [
 
 @pytest.mark.parametrize(("options", "error", "message"), BAD)
 def test_bad_arguments_are_named(options: dict, error: type, message: str) -> None:
-    model, inputs = scene_on("cpu", "plain")
+    model, solver, inputs = scene_on("cpu", "plain")
     with pytest.raises(error, match=message):
-        # TODO62: the solver of this call
-        dv.solve(model, **(inputs | options))
+        dv.solve(model, solver=solver, **(inputs | options))
 
 
 def test_float32(device: str) -> None:
     scene = build_scene("floor_damped", "delaunay")
-    # TODO62: the solver of this call
     single = dv.solve(
-        scene.model(device).to(dtype=torch.float32), tolerance=1e-4, **scene.inputs(torch.float32, device)
+        scene.model(device).to(dtype=torch.float32),
+        solver=scene.solver(1),
+        tolerance=1e-4,
+        **scene.inputs(torch.float32, device),
     )
-    # TODO62: the solver of this call
-    double = dv.solve(scene.model(), **scene.inputs())
+    double = dv.solve(scene.model(), solver=scene.solver(1), **scene.inputs())
     assert relative_error(single.x, double.x) <= tolerance("float32_forward") and single.x.dtype == torch.float32
 
 
 # --- with contact -----------------------------------------------------------------------------------------------------
 
 
-# TODO62: part of a solver in these options
-SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.005}
+SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4}
+STEP = 0.005
 
 
 def pushed(device: str = "cpu", dtype: torch.dtype = torch.float64) -> tuple[dv.Model, dict[str, Any]]:
@@ -159,12 +156,11 @@ def pushed(device: str = "cpu", dtype: torch.dtype = torch.float64) -> tuple[dv.
 @pytest.mark.parametrize("goal", (1e-4, 1e-11))
 def test_the_residual_of_every_body_meets_the_tolerance(device: str, goal: float) -> None:
     model, given = pushed(device)
-    # TODO62: the solver of this call
-    done = dv.solve(model, tolerance=goal, **given, **SOFT)
+    done = dv.solve(model, solver=dv.VBD(STEP, 1), tolerance=goal, **given, **SOFT)
     assert done.converged and 0 < done.residual <= goal
     assert dv.contact.status(model).cut == [0, 0] and dv.contact.status(model).pairs > 0
     x, v = given.pop("x"), given.pop("v")
-    told = dv.diagnose(model, done.x, previous=(x, v), warn=False, **given, **SOFT)
+    told = dv.diagnose(model, done.x, dv.VBD(STEP, 1), previous=(x, v), warn=False, **given, **SOFT)
     assert told.residuals is not None and told.residuals.shape == (2, 2)
     rel, least = tolerance("reported_residual"), tolerance("linear_residual")
     assert float(told.residuals.max()) == pytest.approx(done.residual, rel=rel, abs=least)
@@ -172,13 +168,10 @@ def test_the_residual_of_every_body_meets_the_tolerance(device: str, goal: float
 
 def test_it_is_a_step_of_as_many_sweeps_with_contact(device: str) -> None:
     model, given = pushed(device)
-    # TODO62: the solver of this call
-    done = dv.solve(model, tolerance=1e-6, **given, **SOFT)
-    # TODO62: the solver of this call
-    x, v = dv.step(model, **given, **SOFT, sweeps=done.sweeps)
+    done = dv.solve(model, solver=dv.VBD(STEP, 1), tolerance=1e-6, **given, **SOFT)
+    x, v = dv.step(model, **given, **SOFT, solver=dv.VBD(STEP, done.sweeps))
     assert torch.equal(done.x, x) and torch.equal(done.v, v)
-    # TODO62: the solver of this call
-    sooner = dv.solve(model, tolerance=1e-2, check_every=3, **given, **SOFT)
+    sooner = dv.solve(model, solver=dv.VBD(STEP, 1), tolerance=1e-2, check_every=3, **given, **SOFT)
     assert sooner.sweeps < done.sweeps
 
 
@@ -188,16 +181,12 @@ def test_its_derivative_is_that_of_the_executed_sweeps(device: str) -> None:
     leaves["friction"] = torch.tensor(0.4, dtype=torch.float64, device=device, requires_grad=True)
 
     def gradients(run: Any) -> tuple[torch.Tensor, ...]:
-        named = {"friction": leaves["friction"]}
-        end = run(parameters=named, **{k: t for k, t in leaves.items() if k != "friction"}, **SOFT)
+        end = run(**leaves, **SOFT)
         return torch.autograd.grad((end * torch.linspace(0, 1, 3).to(end)).sum(), list(leaves.values()))
 
-    # TODO62: the solver of this call
-    found = dv.solve(model, tolerance=1e-6, **given, **SOFT)
-    # TODO62: the solver of this call
-    solved = gradients(lambda **options: dv.solve(model, tolerance=1e-6, **options).x)
-    # TODO62: the solver of this call
-    stepped = gradients(lambda **options: dv.step(model, **options, sweeps=found.sweeps)[0])
+    found = dv.solve(model, solver=dv.VBD(STEP, 1), tolerance=1e-6, **given, **SOFT)
+    solved = gradients(lambda **options: dv.solve(model, solver=dv.VBD(STEP, 1), tolerance=1e-6, **options).x)
+    stepped = gradients(lambda **options: dv.step(model, **options, solver=dv.VBD(STEP, found.sweeps))[0])
     for name, a, b in zip(leaves, solved, stepped, strict=True):
         assert torch.equal(a, b) and a.any(), name
 
@@ -215,5 +204,4 @@ def test_a_step_that_bounds_cut_short_does_not_converge_and_says_so() -> None:
 def test_too_few_sweeps_for_friction_say_so() -> None:
     model, given = pushed()
     with pytest.raises(RuntimeError, match=r"after 7 sweeps; take more .*larger Friction\(velocity=\)"):
-        # TODO62: the solver of this call
-        dv.solve(model, max_sweeps=7, **given, **SOFT)
+        dv.solve(model, solver=dv.VBD(STEP, 1), max_sweeps=7, **given, **SOFT)

@@ -68,17 +68,13 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("force", [1.0, 2.0, 3.0], "list"),
     ("gravity", "off", "str|off"),
     ("gravity", -9.81, "float|9.81"),
-    ("gravity", None, "None"),
     ("prescribed", "here", "str"),
     ("rest_points", MESH, "TetMesh"),
     ("floor_kappa", "stiff", "str"),
-    ("floor_kappa", None, "None"),
-    ("parameters", [("floor_kappa", 1.0)], "list"),
     ("adjoint", "full", "str|full"),
     # numbers that no float holds
-    *((name, 10**400, "1329 bits") for name in ("mu", "lam", "density", "time_step", "floor_kappa")),
+    *((name, 10**400, "1329 bits") for name in ("mu", "lam", "density", "floor_kappa")),
     ("gravity", (0, -(10**400), 0), "1329 bits"),
-    ("sweeps", 10**400, "10000"),
     # not finite
     *((name, spoiled(bad, 3, 1), str(bad)) for name in ("x", "v", "force") for bad in (NAN, INF)),
     *((name, bad, str(bad)) for name in ("force", "prescribed") for bad in (NAN, INF, np.float32(NAN))),
@@ -89,12 +85,8 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("rest_points", spoiled(NAN, 5, 0), "nan"),
     ("rest_points", spoiled(INF, 5, 0), "nan|inf"),
     *((name, bad, str(bad)) for name in ("mu", "lam", "density") for bad in (NAN, INF)),
-    *((f"floor_barrier.{name}", NAN, "nan") for name in ("kappa", "dhat", "damping")),
-    ("parameters", {"floor_height": doubles(NAN)}, "nan"),
-    ("parameters", {"floor_normal": doubles([0.0, NAN, 0.0])}, "nan"),
-    ("parameters", {"floor_normal": doubles([0.0, 0.0, 0.0])}, "nan|0"),
+    *((f"floor_{name}", NAN, "nan") for name in ("kappa", "dhat", "damping")),
     ("anchor_stiffness", NAN, "nan"),
-    ("parameters", {"anchor_points": spoiled(NAN, 3, 1)}, "nan"),
     # range
     ("mu", -1.0, "-1"),
     ("mu", doubles(1.0, 1.0, 1.0, -2.5, 1.0, 1.0), "-2.5.*tet 3"),
@@ -108,34 +100,36 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("floor_dhat", -1.0, "-1"),
     ("floor_damping", -1.0, "-1"),
     ("anchor_stiffness", -1.0, "-1"),
-    ("parameters", {"floor.kappa": 1.0}, r"'floor.kappa' \(is 'floor_barrier.kappa' meant\?\)$"),
-    ("parameters", {"friction": 1.0}, "'friction.coefficient': the Model has no Friction among its"),
-    ("parameters", {"pair_barier.kappa": 1.0}, r"\(is 'pair_barrier.kappa' meant\?\): the Model has no PairBarrier"),
-    ("parameters", {"kappa": 1.0}, "'kappa'$"),
+    ("flor_kappa", 1.0, r": is 'floor_kappa' meant\?$"),
+    ("friction", 1.0, "has no Friction among its"),
+    ("pair_kappa", 1.0, "has no PairBarrier among its"),
+    ("muu", 1.0, r": is 'mu' meant\?$"),
+    ("qqq", 1.0, r"anchor_points\)$"),
     ("floor_kappa", torch.ones(1, 1, dtype=torch.float64), r"shape \[1, 1\]$"),
-    ("parameters", {3: 1.0}, "3$"),
     # rest shapes that are no shapes
     ("rest_points", torch.from_numpy(MESH.points * [-1.0, 1.0, 1.0]), r"-0\.16.* at tet 0 of scene 0"),
     ("rest_points", torch.from_numpy(MESH.points * [1.0, 1.0, 0.0]), r"got 0 at tet 0 of scene 0"),
     ("rest_points", spoiled(-1.0, 7), r"-.* at tet 0 of scene 0"),
-    # counts and sizes
-    ("time_step", 0, "0"),
-    ("time_step", -0.1, "-0.1"),
-    ("time_step", NAN, "nan"),
-    ("time_step", INF, "inf"),
-    ("time_step", 1e-310, "1e-310"),
-    ("time_step", 1e-160, "1e-160"),
-    ("time_step", 1e160, r"1e\+160"),
-    ("time_step", True, "bool"),
-    ("time_step", "fast", "str"),
-    ("time_step", None, "None"),
-    ("sweeps", -1, "-1"),
-    ("sweeps", 1.5, "1.5"),
-    ("sweeps", 2.0, "2.0"),
-    ("sweeps", True, "bool"),
-    ("sweeps", "3", "'3'"),
-    ("sweeps", None, "None"),
 ]
+
+SOLVERS: list[tuple[str, Any, str]] = [
+    *(("time_step", value, got) for value, got in
+      ((0, "0"), (-0.1, "-0.1"), (NAN, "nan"), (INF, "inf"), (10**400, "1329 bits"), (True, "bool"), ("fast", "str"), (None, "None"))),
+    *(("sweeps", value, got) for value, got in
+      ((-1, "-1"), (1.5, "1.5"), (2.0, "2.0"), (10**400, "10000"), (True, "bool"), ("3", "'3'"), (None, "None"))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value", "got"), SOLVERS, ids=lambda a: str(a)[:24])
+def test_bad_argument_of_a_solver(name: str, value: Any, got: str) -> None:
+    given: dict[str, Any] = {"time_step": 0.01, "sweeps": 1, name: value}
+    raises(lambda: dv.VBD(**given), name, got)
+
+
+@pytest.mark.parametrize("time_step", (1e-310, 1e-160, 1e160))
+def test_a_time_step_whose_square_no_float_holds(device: str, time_step: float) -> None:
+    raises(lambda: step_with(model_of(device), "solver", dv.VBD(time_step, 1)), "time_step", re.escape(str(time_step)))
+
 
 
 def step_with(model: dv.Model, name: str, value: Any, lead: tuple[int, ...] = (), **options: Any) -> Any:
@@ -143,9 +137,7 @@ def step_with(model: dv.Model, name: str, value: Any, lead: tuple[int, ...] = ()
     x = torch.from_numpy(MESH.points.copy()).repeat(*lead, 1, 1).to(device)
     given: dict[str, Any] = {"x": x, "v": torch.zeros_like(x), **STEP, **options}
     value = value if getattr(value, "is_meta", False) else on_device(value, device)
-    given |= {"parameters": {name: value}} if "." in name else {name: value}
-    # TODO62: the solver of this call
-    return dv.step(model, **given)
+    return dv.step(model, **given | {name: value})
 
 
 @pytest.mark.parametrize(("name", "value", "got"), ARGUMENTS, ids=lambda a: str(a)[:24].replace("\n", " "))
@@ -158,11 +150,27 @@ def test_bad_argument_of_a_step(device: str, value_checks: None, name: str, valu
     step_with(model, "mu", 1e4)  # the Model still works
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("floor_height", doubles(NAN)), ("floor_normal", doubles([0.0, NAN, 0.0])),
+                        ("floor_normal", doubles([0.0, 0.0, 0.0])), ("anchor_points", spoiled(NAN, 3, 1))],
+)  # fmt: skip
+def test_parameters_of_energies_are_finite(device: str, value_checks: None, name: str, value: Tensor) -> None:
+    raises(lambda: step_with(model_of(device), name, value), "parameters", "nan")
+
+
+def test_none_is_a_default(device: str) -> None:
+    model = model_of(device)
+    expected = step_with(model, "mu", 1e4)[0]
+    for name in ("gravity", "floor_kappa", "prescribed", "rest_points"):
+        assert torch.equal(step_with(model, name, None)[0], expected)
+
+
 def test_negative_lam_is_legal_where_its_block_allows_it(device: str, value_checks: None) -> None:
-    assert torch.isfinite(step_with(model_of(device, "exact"), "lam", -9e3)[0]).all()
-    raises(lambda: step_with(model_of(device, "paper"), "lam", -1.0), "lam", "-1")
-    for kind in ("exact", "paper"):
-        assert torch.isfinite(step_with(model_of(device, kind), "mu", 0.0)[0]).all()
+    model, paper = model_of(device), dv.VBD(0.01, 1, block="paper")
+    assert torch.isfinite(step_with(model, "lam", -9e3)[0]).all()
+    raises(lambda: step_with(model, "lam", -1.0, solver=paper), "lam", "-1")
+    for solver in (STEP["solver"], paper):
+        assert torch.isfinite(step_with(model, "mu", 0.0, solver=solver)[0]).all()
 
 
 @pytest.mark.parametrize(
@@ -206,9 +214,7 @@ def test_numbers_of_numpy_are_numbers(device: str) -> None:
 def test_numbers_that_float32_cannot_hold(device: str, name: str, number: float) -> None:
     model = model_of(device, dtype=torch.float32)
     x = model.rest_points
-    given = STEP | ({"parameters": {name: number}} if "." in name else {name: number})
-    # TODO62: the solver of this call
-    raises(lambda: dv.step(model, x, 0 * x, **given), name, r"torch.float32 can hold .* got 1e\+39")
+    raises(lambda: dv.step(model, x, 0 * x, **STEP | {name: number}), name, r"torch.float32 can hold .* got 1e\+39")
 
 
 def test_a_value_check_names_the_scene(device: str, value_checks: None) -> None:
@@ -239,30 +245,26 @@ def test_a_model_of_another_class_or_mesh() -> None:
 
 # --- debug_checks -----------------------------------------------------------------------------------------------------
 
-# TODO62: part of a solver in these options
-HUGE = {"mu": 1e305, "lam": 1e308, "time_step": 1.0}
+HUGE = {"mu": 1e305, "lam": 1e308}
 
 
 @pytest.mark.parametrize("lead", [(), (1,), (2,), (5,)])
 def test_debug_checks_say_where_a_position_ceased_to_be_finite(device: str, lead: tuple[int, ...]) -> None:
-    model = model_of(device, start="predictor")  # the other start is at rest and stays finite
+    model, solver = model_of(device), dv.VBD(1.0, 3, start="predictor")  # the other start is at rest and stays finite
     x = model.rest_points.repeat(*lead, 1, 1)
     force = torch.zeros_like(x)
     force.reshape(-1, 8, 3)[-1] = 1e150  # the last scene only
-    # TODO62: solver options in HUGE | ...
-    options = HUGE | {"sweeps": 3, "force": force}
+    options = HUGE | {"force": force}
     if lead:
         for name in ("mu", "lam"):
             options[name] = torch.full((*lead, 1), 1e4, dtype=torch.float64, device=device)
             options[name][-1] = HUGE[name]
     with dv.debug_checks():
         with pytest.raises(RuntimeError) as error:
-            # TODO62: the solver of this call
-            dv.step(model, x, torch.zeros_like(x), **options)
+            dv.step(model, x, torch.zeros_like(x), solver, **options)
     scene = lead[-1] - 1 if lead else 0
     assert re.search(rf"step 0, sweep \d+, color \d+, vertex \d+, scene {scene}\b", str(error.value)), str(error.value)
-    # TODO62: the solver of this call
-    x, _ = dv.step(model, x, torch.zeros_like(x), **options)  # off again
+    x, _ = dv.step(model, x, torch.zeros_like(x), solver, **options)  # off again
     assert not torch.isfinite(x).all()
 
 
@@ -316,8 +318,7 @@ def test_a_function_that_returns_no_number_is_named_under_checkpoints(name: str)
     x = model.rest_points.requires_grad_()
     bad = [0.0, float("nan"), 0.0] if name == "gravity" else float("nan")
     with pytest.raises(ValueError, match=f"{name}: expected .*nan.*in step 0"):
-        # TODO62: the solver of this call
-        dv.rollout(model, x, x.detach() * 0, steps=4, checkpoint_every=2, **{**GIVEN, name: lambda step, x, v: bad})
+        dv.rollout(model, x, x.detach() * 0, steps=4, checkpoint_every=2, **GIVEN | {name: lambda step, x, v: bad})
 
 
 def test_values_that_are_not_finite_under_vmap() -> None:
@@ -336,8 +337,7 @@ def test_a_start_on_the_wrong_side_of_a_floor(more: tuple, sweeps: int) -> None:
     x[0, :, 1] += 0.1
     said = "x: expected every unpinned vertex above floor plane 1, got 3 on or below it in scene 1: vertices "
     with pytest.raises(ValueError, match=said):
-        # TODO62: the solver of this call
-        dv.step(model, x, x * 0, **{**GIVEN}, sweeps=sweeps)
+        dv.step(model, x, x * 0, dv.VBD(0.01, sweeps), mu=1e4, lam=1e4)
 
 
 def test_a_step_on_a_floor_with_friction_that_leaves_all_bounds_raises() -> None:
@@ -346,5 +346,4 @@ def test_a_step_on_a_floor_with_friction_that_leaves_all_bounds_raises() -> None
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     v[:, 1], v[0, 0] = -1e10, -1e10 / 3
     with pytest.raises(RuntimeError, match="positions became non-finite in the step"):
-        # TODO62: the solver of this call
-        dv.step(model, x, v, **{**GIVEN}, sweeps=1)
+        dv.step(model, x, v, dv.VBD(0.01, 1), mu=1e4, lam=1e4)

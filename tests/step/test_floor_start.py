@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffvbd.contact.start import Decided, _Start
 from diffvbd.model.bodies import Bodies, OtherBodies
-from diffvbd.ops.contact_part import PartBodies
+from diffvbd.ops.contact import PartBodies
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.safeguards import FILTER_ETA
 from diffvbd.step.arguments import CHORD

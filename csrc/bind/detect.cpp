@@ -1,0 +1,129 @@
+// Operators that search: pairs of primitives, intersections of surfaces, islands of bodies.
+#include "detect.h"
+
+namespace diffvbd {
+namespace {
+
+// What a search reads of surfaces; with room and own_room also how far it looks.
+template <class T>
+contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Tensor& collider,
+                                 const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
+                                 const Tensor& triangles, const Tensor& edges, const Tensor& points,
+                                 const Tensor& planes, const Tensor& body, const Tensor& held, int64_t mesh_bodies,
+                                 bool self_contact, bool between_bodies) {
+  const Reader<T> read(x);
+  const int64_t b = read.b, n = body.numel();
+  require(read.v <= n && mesh_bodies >= 0, "contact: expected body of shape [N], N >= vertices, and mesh_bodies >= 0");
+  const auto primitives = [&](const char* name, const Tensor& t, int64_t each, int32_t& count) {
+    require(b * t.numel() <= std::numeric_limits<int32_t>::max(),
+            "contact: too large, expected at most 2^31 corners of primitives");
+    count = static_cast<int32_t>(t.size(0));
+    return read.index(name, t, each * count);
+  };
+  contact::Surfaces<T> out{};
+  out.x = read.positions(), out.origin = read.vectors_or_null("origin", origin);
+  out.collider = read.like("collider", collider, 3 * b * (n - read.v));
+  out.collider_next = read.like("collider_next", collider_next, 3 * b * (n - read.v));
+  out.rest = read.like("rest", rest, 3 * n), out.radius = read.like("radius", radius, n);
+  out.triangles = primitives("triangles", triangles, 3, out.num_triangles);
+  out.edges = primitives("edges", edges, 2, out.num_edges);
+  out.points = primitives("points", points, 1, out.num_points);
+  out.planes = primitives("planes", planes, 3, out.num_planes);
+  out.body = read.index("body", body, n), out.held = read.flags("held", held, n);
+  require(b * n + 1 <= std::numeric_limits<int32_t>::max(),
+          "contact: too large, expected at most 2^31 corner points in all scenes");
+  out.scenes = b;
+  out.vertices = static_cast<int32_t>(read.v), out.corners = static_cast<int32_t>(n);
+  out.mesh_bodies = count_of(mesh_bodies);
+  out.self_contact = self_contact, out.between_bodies = between_bodies;
+  const double base = static_cast<double>(out.key_base());
+  require(3.0 * static_cast<double>(b) * base * base < 0x1p63, "contact: too many scenes of this size");
+  return out;
+}
+
+void require_capacity(int64_t capacity) {
+  require(capacity >= 0 && 4 * capacity <= std::numeric_limits<int32_t>::max(),
+          "contact: expected 0 <= capacity < 2^29");
+}
+
+// Results as in contact/candidates.h. mesh_bodies: body labels from there on are colliders; room [scenes, mesh_bodies +
+// 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
+// many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
+DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,
+                 In triangles, In edges, In points, In planes, In body, In held, In room, In own_room,
+                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat, int64_t capacity,
+                 bool trim) {
+  const Device device(x);
+  require_capacity(capacity);
+  return dispatch_float(x, [&]<class T>(T) {
+    auto in = surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body,
+                             held, mesh_bodies, self_contact, between_bodies);
+    require(std::isfinite(dhat), "contact: expected a finite dhat");
+    const Reader<T> read(x);
+    in.room = read.like("room", room, read.b * (in.mesh_bodies + int64_t{1}));
+    in.own_room = read.like("own_room", own_room, read.b * (in.mesh_bodies + int64_t{1}));
+    in.dhat = static_cast<T>(dhat);
+    const int64_t b = in.scenes, n = in.corners;
+    Tensor near_corners = device.empty({b, n, contact::kNearRow}, ScalarType::Int);
+    Tensor near_values = device.empty({b, n, contact::kNearValues}), smallest = device.empty({b});
+    Tensor counts = device.empty({contact::kCounts}, ScalarType::Long);
+    contact::Detected<T> out{};
+    out.near_corners = data<int32_t>(near_corners), out.near_values = data<T>(near_values);
+    out.counts = data<int64_t>(counts), out.smallest = data<T>(smallest);
+    out.capacity = capacity;
+#ifndef USE_CUDA
+    const std::vector<uint64_t> keys = detect<T>(in, out);
+    // Rows that no pair fills would cost more than the search where there is room for many.
+    if (trim) out.capacity = std::min(capacity, static_cast<int64_t>(keys.size()));
+#endif
+    Tensor pairs = device.empty({out.capacity, contact::kPairRow}, ScalarType::Int);
+    Tensor constants = device.empty({out.capacity, contact::kConstants});
+    Tensor ptr = device.empty({b * n + 1}, ScalarType::Int), entry = device.empty({4 * out.capacity}, ScalarType::Int);
+    out.pairs = data<int32_t>(pairs), out.constants = data<T>(constants);
+    out.ptr = data<int32_t>(ptr), out.entry = data<int32_t>(entry);
+#ifdef USE_CUDA
+    const Tensor work = device.bytes(static_cast<int64_t>(cuda::detect_workspace_bytes<T>(in, capacity)));
+    DIFFVBD_RUN(device, detect<T>, in, out, work.data_ptr());
+#else
+    store_list<T>(in, keys, out);
+#endif
+    return Out<8>(pairs, constants, ptr, entry, near_corners, near_values, counts, smallest);
+  });
+}
+
+// Results as in contact/intersect.h.
+DIFFVBD_OPERATOR(Out<3>, contact_intersections, In x, In origin, In collider, In rest, In radius, In triangles,
+                 In edges, In points, In planes, In body, In held, int64_t mesh_bodies, bool self_contact,
+                 bool between_bodies, int64_t capacity) {
+  const Device device(x);
+  require_capacity(capacity);
+  return dispatch_float(x, [&]<class T>(T) {
+    const auto in = surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points, planes, body,
+                                   held, mesh_bodies, self_contact, between_bodies);
+    Tensor pairs = device.empty({capacity, contact::kCrossingRow}, ScalarType::Int);
+    Tensor first = device.empty({in.scenes, 2, 2}, ScalarType::Int);
+    Tensor counts = device.empty({in.scenes, 2}, ScalarType::Long);
+    const contact::Intersections out{capacity, data<int32_t>(pairs), data<int64_t>(counts), data<int32_t>(first)};
+    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::intersections_workspace_bytes<T>(in, capacity));)
+    DIFFVBD_RUN(device, find_intersections<T>, in, out DIFFVBD_ON_CUDA(, work.data_ptr()));
+    return Out<3>(pairs, counts, first);
+  });
+}
+
+// The smallest body of the island that each body is in [B, bodies] int32, or -1 (contact/islands.h).
+DIFFVBD_OPERATOR(Tensor, contact_islands, In x, In origin, In move, In mass, In collider, In collider_next, In planes,
+                 In body, In body_order, In body_ptr, In held, In radius, In room, int64_t mesh_bodies, double dhat,
+                 bool any_direction) {
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    const auto in = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
+                                     held, radius, room, mesh_bodies, dhat, any_direction);
+    Tensor island = device.empty({in.scenes, in.mesh_bodies}, ScalarType::Int);
+    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::islands_workspace_bytes<T>(in));)
+    DIFFVBD_RUN(device, find_islands<T>, in, data<int32_t>(island) DIFFVBD_ON_CUDA(, work.data_ptr()));
+    return island;
+  });
+}
+
+}  // namespace
+}  // namespace diffvbd

@@ -1,0 +1,247 @@
+// Operators of the rigid correction of bodies that touch.
+#include "../contact/rigid_reverse.h"
+#include "../contact/rigid_tries.h"
+#include "body.h"
+#include "contact.h"
+
+namespace diffvbd {
+namespace {
+
+struct TouchingSettings {
+  Ints data_count;
+  double time_step, friction_eps;
+};
+
+// move: what is tried, memory of the operator, or null. groups [B, 4, bodies]: as contact/groups.h has them; empty
+// where they do not matter, or all bodies are one.
+template <class T>
+contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q, const T* move,
+                                        const Tensor& groups) {
+  const Reader<T> read(t.x);
+  const int64_t b = read.b, v = read.v, colliders = read.colliders(t.collider), corners = v + colliders;
+  contact::RigidInputs<T> in{};
+  in.scene = rigid_inputs<T>({t.x, t.x_prev, t.y, t.mass, t.energy_data, t.origin, t.order, t.ptr, t.x, t.order},
+                             q.data_count, q.time_step, false);
+  const int64_t bodies = in.scene.bodies;
+  in.free = read.flags("free", t.free, bodies);
+  contact::AdvanceInputs<T>& gate = in.gate;
+  gate.x = read.positions(), gate.move = move;
+  gate.origin = in.scene.origin.data;
+  gate.center = read.vectors("center", t.center), gate.room = read.of_vertices("room", t.room);
+  gate.collider = gate.collider_next = read.like("collider", t.collider, 3 * b * colliders);
+  in.collider_prev = read.like("collider_prev", t.collider_prev, 3 * b * colliders);
+  gate.held = read.flags("held", t.held, corners), gate.body = read.index("body", t.body, corners);
+  gate.listed = pair_list(t.pairs, t.pair_ptr, t.pair_entry, t.x, b * corners);
+  gate.constants = pair_constants<T>(t.constants, t.pairs, t.x);
+  gate.scenes = b;
+  gate.vertices = static_cast<int32_t>(v), gate.corners = static_cast<int32_t>(corners);
+  gate.bodies = static_cast<int32_t>(bodies);
+  gate.whole = true;
+  if (t.lag.numel() > 0) {
+    in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, t.x, b * corners);
+    in.lag = read.like("lag", t.lag, t.lag_pairs.size(0) * contact::kLagScalars);
+  }
+  in.kappa = read.batch("kappa", t.kappa, 1);
+  if (t.floor_lag.numel() > 0 && v > 0) {
+    in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
+    in.floor_lag = read.batch("floor_lag", t.floor_lag, v * in.planes * contact::kFloorLag);
+  }
+  if (groups.numel() > 0) in.groups = read.index("groups", groups, contact::kGroupRows * b * bodies);
+  in.room = contact::most_grouped(bodies);
+  in.has_friction = 0 < q.friction_eps;
+  in.friction_eps = in.has_friction ? q.friction_eps : 1;
+  return in;
+}
+
+// In a system in which the bodies of a mask move, or, if that is empty, all. alone: only groups of one do, and the
+// memory of a factor has room for no others.
+template <class T>
+void set_moving(contact::RigidInputs<T>& in, const Tensor& moving, bool alone, const Tensor& x) {
+  if (!in.together() && alone) in.room = std::min<int64_t>(in.bodies(), 1);
+  const bool all = moving.dim() == 1 && moving.size(0) == 0;
+  const bool* mask =
+      array<bool>("moving", moving, x, ScalarType::Bool, all ? 0 : in.scene.scenes * int64_t{in.bodies()});
+  if (!all && moving.numel() > 0) in.moving = mask;
+}
+
+DIFFVBD_ON_CUDA(cuda::PairRoom room_of(const TouchingFields& f) {
+  return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
+})
+
+// The Newton step of the rigid motions of all bodies of a scene, float64: centers of mass [scenes, bodies, 3], motion
+// [scenes, bodies, 6], the factors of groups that touch, in the memory [scenes, bodies, 6, 6 most] that
+// contact/groups.h says, and groups [scenes, 4, bodies]; of few bodies one factor [scenes, 6 bodies, 6 bodies], and no
+// groups. moving [scenes, bodies]: only groups of these bodies move; or [0]: all do. alone: of many bodies only groups
+// of one do, with factors [scenes, bodies, 6, 6].
+DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
+                 double friction_eps, In moving, bool alone) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const Device device(x);
+  require_positions(x);
+  const int64_t b = x.size(0), n = ptr.numel() - 1, six = contact::kUnknowns;
+  const bool few = n <= contact::kFew;
+  Tensor groups =
+      device.empty(few ? std::vector<int64_t>{0} : std::vector<int64_t>{b, contact::kGroupRows, n}, ScalarType::Int);
+  return dispatch_float(x, [&]<class T>(T) {
+    auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, nullptr, groups);
+    set_moving(in, moving, alone, x);
+    Tensor centers = device.empty({b, n, 3}, ScalarType::Double),
+           motion = device.empty({b, n, six}, ScalarType::Double);
+    Tensor factor = device.empty(
+        few ? std::vector<int64_t>{b, six * n, six * n} : std::vector<int64_t>{b, n, six, six * int64_t{in.room}},
+        ScalarType::Double);
+    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_system_bytes(in, room_of(f)));)
+    DIFFVBD_RUN(device, rigid_system<T>, in, DIFFVBD_ON_CUDA(room_of(f), ) data<double>(centers), data<double>(motion),
+                data<double>(factor), in.groups ? data<int32_t>(groups) : nullptr DIFFVBD_ON_CUDA(, work.data_ptr()));
+    return Out<4>(centers, motion, factor, groups);
+  });
+}
+
+// The state after each body has taken what it may of its motion [scenes, bodies, 6]; that share [scenes, bodies], zero
+// of what does not move beside a mask `moving`; whether it has a motion; whether it was held up where others that were
+// have gone on; and how much of its shift is left [m].
+DIFFVBD_OPERATOR(Out<5>, contact_rigid_move, DIFFVBD_PARAMETERS(TOUCHING) In centers, In motion, Ints data_count,
+                 double time_step, double friction_eps, In moving) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    const Reader<T> read(x);
+    const Tensor way = device.like_x(), none = device.empty({0});
+    auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, data_or_null<T>(way), none);
+    set_moving(in, moving, false, x);
+    const int64_t b = read.b, n = in.bodies();
+    const double *center = read.doubles("centers", centers, 3 * b * n),
+                 *motions = read.doubles("motion", motion, contact::kUnknowns * b * n);
+    const Tensor end = device.like_x(), share = device.empty({b, n}, ScalarType::Double),
+                 moved = device.empty({b, n}, ScalarType::Bool), held_up = device.empty({b, n}, ScalarType::Bool),
+                 left = device.empty({b, n});
+    const contact::RigidOutcome<T> out{data<double>(share), data<bool>(moved), data<bool>(held_up), data<T>(left)};
+    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_move_bytes(in, room_of(f)));)
+    DIFFVBD_RUN(device, rigid_move<T>, in, DIFFVBD_ON_CUDA(room_of(f), ) center, motions, data<T>(way), out,
+                data<T>(end) DIFFVBD_ON_CUDA(, work.data_ptr()));
+    return Out<5>(end, share, moved, held_up, left);
+  });
+}
+
+// The work of pairs in two virtual motions, and the rows that it goes through.
+struct WorkTensors {
+  Tensor barrier, pushes, friction, by_x, by_p, by_q, since, by_kappa, lag_bar;
+  WorkTensors(const TouchingFields& f, const Device& device) {
+    const int64_t b = f.x.size(0), corners = f.body.size(0), listed = f.pairs.size(0),
+                  lagged = f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0;
+    barrier = device.empty({listed, 4, contact::kWorkScalars});
+    pushes = device.empty({listed}, ScalarType::Byte);
+    friction = device.empty({lagged, 4, contact::kWorkScalars});
+    by_x = device.empty({b, corners, 3}), by_p = device.empty({b, corners, 3}), by_q = device.empty({b, corners, 3});
+    since = device.empty({lagged > 0 ? b : 0, corners, 3});
+    by_kappa = device.zeros({listed}), lag_bar = device.zeros({lagged, contact::kLagScalars});
+  }
+  template <class T>
+  contact::RigidWork<T> view() const {
+    return {data<T>(barrier), data<T>(by_kappa), data<uint8_t>(pushes), data<T>(friction),
+            data<T>(lag_bar), barrier.size(0),   friction.size(0)};
+  }
+  template <class T>
+  contact::PointWork<T> sums() const {
+    return {data<T>(by_x), data<T>(by_p), data<T>(by_q), data_or_null<T>(since)};
+  }
+};
+
+// Of the virtual work of two motions p and q of all corner points [scenes, N, 3] that pairs do: its derivatives by
+// where these points are, by p and by q [scenes, N, 3] each; since [scenes, N, 3]: the first of lagged pairs alone, or
+// empty; by kappa for each listed pair; and less those by what is lagged [lagged, 9]. This part of
+// contact_rigid_reverse can so be tested by itself.
+DIFFVBD_OPERATOR(Out<6>, contact_rigid_backward, DIFFVBD_PARAMETERS(TOUCHING) In p, In q, In groups, Ints data_count,
+                 double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    const auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, nullptr, groups);
+    const Reader<T> read(x);
+    const int64_t size = 3 * read.b * in.gate.corners;
+    const contact::VirtualMotions<T> given{read.like("p", p, size), read.like("q", q, size)};
+    const WorkTensors out(f, device);
+    DIFFVBD_ON_CUDA(const Tensor pushing = device.empty({1 + f.pairs.size(0)}, ScalarType::Int);)
+    DIFFVBD_RUN(device, rigid_backward<T>, in, given, out.view<T>(),
+                out.sums<T>() DIFFVBD_ON_CUDA(, data<int32_t>(pushing)));
+    return Out<6>(out.by_x, out.by_p, out.by_q, out.since, out.by_kappa, out.lag_bar);
+  });
+}
+
+// The adjoint of corrections one after another, each from `at` [scenes, V, 3], by its motion, share, factor and groups,
+// of that of where the last one led, x_bar [scenes, V, 3]: of the first `at`, x_prev, y and mass, of data as of
+// rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed pair
+// adds to that of kappa, and of lag.
+DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors motion, Tensors share,
+                 Tensors factor, Tensors groups, In x_bar, Ints data_count, double time_step, double friction_eps,
+                 bool wants_data) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const Device device(x);
+  for (const auto* each : {&motion, &share, &factor, &groups}) {
+    require(each->size() == at.size() && !at.empty(),
+            "diffvbd::contact_rigid_reverse: expected as many at, motion, share, factor and groups, one at least");
+  }
+  return dispatch_float(x, [&]<class T>(T) {
+    const Reader<T> read(x);
+    std::vector<contact::RigidInputs<T>> inputs;
+    for (size_t k = 0; k < at.size(); ++k) {
+      auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, nullptr, groups[k]);
+      const int64_t rows = read.b * in.bodies();
+      in.scene.x = in.gate.x = read.vectors("at", at[k]);
+      if (!in.together() && factor[k].dim() == 4) in.room = factor[k].size(3) / contact::kUnknowns;
+      read.doubles("factor", factor[k], read.b * in.matrix_size());
+      require(read.b == 0 || in.together() == (in.groups == nullptr),
+              "diffvbd::contact_rigid: expected groups as contact_rigid_system returns them");
+      read.doubles("motion", motion[k], contact::kUnknowns * rows), read.doubles("share", share[k], rows);
+      inputs.push_back(in);
+    }
+    const auto& last = inputs.back();
+    const int64_t b = read.b, v = read.v, corners = last.gate.corners;
+    const WorkTensors pairs_out(f, device);
+    const Tensor p = device.zeros({b, corners, 3}), q = device.zeros({b, corners, 3}), way = device.empty({b, v, 3});
+    const RigidBars bars(last.scene, true, wants_data, [&](Ints sizes, bool) { return device.zeros(sizes); });
+    const Tensor floor_out = device.zeros({last.planes > 0 ? b : 0, v, last.planes, contact::kFloorLag});
+    const Tensor collider_out = device.zeros({b, corners - v, 3}),
+                 collider_prev_out = device.zeros({b, corners - v, 3});
+    const contact::CorrectionAdjoints<T> out{bars.pointers<T>(nullptr, nullptr), data_or_null<T>(floor_out),
+                                             data<T>(collider_out), data<T>(collider_prev_out)};
+    const Tensor solution = device.empty({b, last.bodies(), contact::kUnknowns}, ScalarType::Double);
+    DIFFVBD_ON_CUDA(const Tensor pushing = device.empty({b + f.pairs.size(0)}, ScalarType::Int);)
+    const auto work = pairs_out.view<T>();
+    const auto sums = pairs_out.sums<T>();
+    const T* end_bar = read.vectors("x_bar", x_bar);
+    for (size_t k = inputs.size(); k-- > 0;) {
+      const auto& in = inputs[k];
+      const auto *motions = data<const double>(motion[k]), *shares = data<const double>(share[k]),
+                 *factors = data<const double>(factor[k]);
+      double* l = data<double>(solution);
+#ifdef USE_CUDA
+      const cuda::RigidReverse<T> own{motions,
+                                      shares,
+                                      factors,
+                                      end_bar,
+                                      l,
+                                      data<T>(p),
+                                      data<T>(q),
+                                      data<T>(way),
+                                      work,
+                                      sums,
+                                      data<int32_t>(pushing),
+                                      out};
+      DIFFVBD_RUN(device, rigid_reverse<T>, in, own);
+#else
+      rigid_end_backward<T>(in, motions, shares, end_bar, l, data<T>(way), out.vertices.mass);
+      rigid_solve<T>(in, factors, l);
+      rigid_virtual_motions<T>(in, motions, l, data<T>(p), data<T>(q));
+      rigid_backward<T>(in, {data<T>(p), data<T>(q)}, work, sums);
+      rigid_vertices_backward<T>(in, motions, l, data<T>(way), sums, out);
+#endif
+      end_bar = out.vertices.x;
+    }
+    return Out<11>(bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_out, collider_out,
+                   collider_prev_out, pairs_out.by_kappa, pairs_out.lag_bar);
+  });
+}
+
+}  // namespace
+}  // namespace diffvbd

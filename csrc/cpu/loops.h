@@ -1,0 +1,340 @@
+// Loops over bodies, vertices and pairs that need no file of their own, with the names and arguments of the launches in
+// csrc/cuda.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "../coarse/rise.h"
+#include "../contact/lag.h"
+#include "../contact/lowest.h"
+#include "../contact/passes.h"
+#include "../contact/sweep_rooms.h"
+#include "../contact/translation.h"
+#include "../contact/unsupported.h"
+#include "../rigid/reverse.h"
+#include "../start/part.h"
+#include "bodies.h"
+#include "kernels.h"
+#include "reductions.h"
+#include "run.h"
+
+namespace diffvbd {
+
+// Calls f(scene, item) for all items of all scenes, of which a thread gets at least so many.
+template <class F>
+void for_items(int64_t scenes, int64_t items, int64_t grain, const F& f) {
+  torch::stable::parallel_for(0, scenes * items, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) f(i / items, static_cast<int32_t>(i % items));
+  });
+}
+
+// --- the start of a step, the rigid correction, potentials
+// ------------------------------------------------------------
+
+// others: whether some vertices are in no body that is corrected
+template <class T>
+void rigid_correct(const rigid::Inputs<T>& in, bool others, T* x, T* velocity) {
+  if (others) for_vertices(in, [&](int64_t scene, int32_t i) { keep_vertex(in, scene, i, x, velocity); });
+  for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
+    rigid::Iteration record[rigid::kMaxIterations];
+    if (in.data.data != nullptr) {
+      rigid::correct<true>(body, team, record, x, velocity);
+    } else {
+      rigid::correct<false>(body, team, record, x, velocity);
+    }
+  });
+}
+template <class T>
+void rigid_reverse(const rigid::Inputs<T>& in, bool others, const rigid::Adjoints<T>& a) {
+  if (others) for_vertices(in, [&](int64_t scene, int32_t i) { reverse_kept(in, a, scene, i); });
+  for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
+    rigid::Iteration record[rigid::kMaxIterations];
+    if (in.data.data != nullptr) {
+      rigid::reverse<true>(body, team, record, a);
+    } else {
+      rigid::reverse<false>(body, team, record, a);
+    }
+  });
+}
+
+// Bodies whose start is chosen, null for none; their second state; and what receives whether they take it.
+template <class T>
+struct StartChoice {
+  const start::Candidates<T>* two;
+  T* second;
+  uint8_t* taken;
+};
+template <class T>
+void begin(const start::Inputs<T>& in, const StartChoice<T>& of_corrected, const StartChoice<T>& of_others, T* x_start,
+           T* y) {
+  if (in.some_alone) {
+    T* second = of_others.two && of_others.second != y ? of_others.second : nullptr;
+    for_vertices(in.bodies, [&](int64_t scene, int32_t i) { begin_vertex(in, x_start, second, y, scene, i); });
+  }
+  if (of_others.two) {
+    for_bodies(of_others.two->bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+      of_others.taken[body.scene * in.others + body.body] = start::way_between(*of_others.two, body, team).rise <= 0;
+    });
+    for_vertices(in.bodies, [&](int64_t scene, int32_t i) { choose_vertex(in, x_start, of_others.second, scene, i); });
+  }
+  for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+    if (in.bodies.data.data != nullptr) {
+      start::begin_body<true>(in, body, team, x_start, y, of_corrected.taken);
+    } else {
+      start::begin_body<false>(in, body, team, x_start, y, of_corrected.taken);
+    }
+  });
+  if (of_corrected.two) {
+    for_bodies(of_corrected.two->bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+      start::part_body(in, *of_corrected.two, body, team, x_start, of_corrected.second, of_corrected.taken);
+    });
+  }
+}
+template <class T>
+void begin_backward(const start::Inputs<T>& in, const start::Adjoints<T>& a, T* coasted, T* y) {
+  if (in.some_alone) {
+    for_vertices(in.bodies, [&](int64_t scene, int32_t i) { reverse_vertex(in, a, scene, i); });
+  }
+  for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+    rigid::Iteration record[rigid::kMaxIterations];
+    if (in.bodies.data.data != nullptr) {
+      start::reverse_body<true>(in, body, team, record, coasted, y, a);
+    } else {
+      start::reverse_body<false>(in, body, team, record, coasted, y, a);
+    }
+  });
+}
+
+// out [B, bodies, 2]: the rise, and how much of it is rounding at most; infinite where a vertex would be too near a
+// plane.
+template <class T>
+void potential_rise(const coarse::RiseInputs<T>& in, double* out) {
+  static_assert(coarse::kBlockTets == kLanes);
+  const int64_t scenes = in.bodies.scenes, vertices = in.bodies.vertices;
+  // x[i] and to[i] - x[i] as rows of four
+  const Buffer<T> at(size_t(scenes * vertices) * 4, true), way(size_t(scenes * vertices) * 4, true);
+  for (int64_t v = 0; v < scenes * vertices; ++v) {
+    for (int c = 0; c < 3; ++c) {
+      at.get()[4 * v + c] = in.bodies.x[3 * v + c];
+      way.get()[4 * v + c] = in.to[3 * v + c] - in.bodies.x[3 * v + c];
+    }
+  }
+  const auto kernels = coarse_kernels<T>(kExactBlock);
+  for_bodies(in.bodies, [&](const rigid::Body<T>& b, const Threads& team) {
+    double single[3];
+    team.template sum<3>(b.size(), single, [&](int32_t i, double* sum) {
+      const int32_t v = b.vertex(i);
+      rigid::add_rise(b, v, rigid::Body<T>::at(in.to + 3 * b.row(v)), sum);
+    });
+    double change[2 * coarse::kDegree];
+    const int64_t row = 4 * b.scene * vertices;
+    const int32_t first = in.block_ptr[b.body];
+    const T* rest = in.rest.data + b.scene * in.rest.scene;
+    const T* material = in.material.data + b.scene * in.material.scene;
+    team.template sum<2 * coarse::kDegree>(in.block_ptr[b.body + 1] - first, change, [&](int32_t i, double* sum) {
+      double c[coarse::kDegree] = {};
+      kernels.line(in.corner, rest, material, at.get() + row, way.get() + row, first + i, first + i + 1, c);
+      for (int k = 0; k < coarse::kDegree; ++k) sum[k] += c[k], sum[coarse::kDegree + k] += std::abs(c[k]);
+    });
+    const double h2 = b.in.time_step * b.in.time_step;
+    double* to = out + 2 * (b.scene * in.bodies.bodies + b.body);
+    to[0] = single[0], to[1] = single[1];
+    for (int k = 0; k < coarse::kDegree; ++k) to[0] += h2 * change[k], to[1] += h2 * change[coarse::kDegree + k];
+    if (single[2] > 0) to[0] = std::numeric_limits<double>::infinity();
+  });
+}
+
+// --- contact
+// ----------------------------------------------------------------------------------------------------------
+
+template <class T>
+void unsupported(const contact::UnsupportedInputs<T>& in, T* out) {
+  for_bodies(in.scene,
+             [&](const rigid::Body<T>& b, const Threads& team) { contact::leave_unsupported(in, b, team, out); });
+}
+template <class T>
+void unsupported_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
+                          const contact::UnsupportedAdjoints<T>& out) {
+  for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
+    contact::reverse_unsupported(in, b, team, bar, out);
+  });
+}
+
+// wishes [B, bodies] and most [B]: memory
+template <class T>
+void sweep_rooms(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* rooms) {
+  const int64_t grain = pieces_per_thread(in.bodies > 0 ? in.vertices / in.bodies : 0);
+  for_items(in.scenes, in.bodies, grain, [&](int64_t scene, int32_t body) {
+    const int64_t i = scene * in.bodies + body;
+    wishes[i] = contact::wish_of_body(in, contact::ways_of_body(in, scene, body, 0, 1), i);
+  });
+  for (int64_t s = 0; s < in.scenes; ++s) most[s] = contact::most_of_scene(in, wishes, s, 0, 1);
+  for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
+    rooms[scene * in.vertices + v] = contact::sweep_room(in, most[scene], scene, v);
+  });
+}
+
+template <class T>
+void body_sums(const contact::TranslationInputs<T>& in, T* sums) {
+  for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
+    const contact::Mean<T> mean =
+        contact::mean_of_body(in, row / in.bodies, static_cast<int32_t>(row % in.bodies), 0, 1);
+    const T values[] = {mean.sum.x, mean.sum.y, mean.sum.z, mean.mass};
+    std::copy_n(values, 4, sums + 4 * row);
+  }
+}
+// sums [B, bodies, 4]: memory
+template <class T>
+void translation(const contact::TranslationInputs<T>& in, T* sums, T* out) {
+  body_sums(in, sums);
+  for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
+    const int64_t scene = row / in.bodies, body = row % in.bodies, first = in.island[row];
+    T* to = out + 3 * row;
+    if (first >= 0 && first < body) {  // that of its island's first body
+      std::copy_n(out + 3 * (scene * in.bodies + first), 3, to);
+      continue;
+    }
+    const auto u = contact::translation_of(in, sums, scene, static_cast<int32_t>(body));
+    to[0] = u.x, to[1] = u.y, to[2] = u.z;
+  }
+}
+// zeroed [B, bodies, 6 and more], x_bar and planes_bar are zero
+template <class T>
+void translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed, T* move_bar,
+                          T* mass_bar, T* x_bar, T* planes_bar) {
+  const int64_t rows = in.scenes * in.bodies, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
+  body_sums(in, sums);
+  T *rate = zeroed, *mean = zeroed + 3 * rows;
+  for (int64_t row = 0; row < rows; ++row) {
+    contact::reverse_island(in, sums, u_bar, row / in.bodies, static_cast<int32_t>(row % in.bodies), rate, mean, x_bar,
+                            planes_bar + row / in.bodies * scalars);
+  }
+  for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
+    contact::reverse_vertex_share(in, rate, mean, scene, v, move_bar, mass_bar);
+  });
+}
+
+// own [B, bodies, planes]: memory
+template <class T>
+void lowest_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out) {
+  const auto each = [&](auto&& f) {
+    int64_t i = 0;
+    for (int64_t b = 0; b < in.scenes; ++b) {
+      for (int32_t body = 0; body < in.bodies; ++body) {
+        for (int32_t plane = 0; plane < in.num_planes; ++plane) f(i++, b, body, plane);
+      }
+    }
+  };
+  each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
+    own[i] = contact::lowest_of_body(in, b, body, plane, 0, 1).vertex;
+  });
+  each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
+    const int32_t first = in.island[b * in.bodies + body];
+    out[i] = first >= 0 && first < body ? out[i - int64_t{body - first} * in.num_planes]  // that of its first body
+                                        : contact::lowest_of_island(in, own, b, body, plane);
+  });
+}
+
+// Positions in the user's numbering.
+template <class T>
+struct UserPositions {
+  const T* x;
+  Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+};
+// Calls f(pair, record, corners, constants, kappa) for each listed pair.
+template <class T, class F>
+void for_pairs(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, const F& f) {
+  const int64_t count = in.listed.ptr[scenes * in.corners] / 4;
+  for (int64_t pair = 0; pair < count; ++pair) {
+    const int32_t* record = in.listed.pairs + contact::kPairRow * pair;
+    const UserPositions<T> positions{x + int64_t{record[5]} * 3 * in.num_vertices};
+    const contact::Source<T, UserPositions<T>> source{in, record[5], positions};
+    const contact::PairConstants<T> a(in.constants + contact::kConstants * pair);
+    f(pair, record, source.corners(record), a, in.kappa.data[record[5] * in.kappa.scene]);
+  }
+}
+// Adds what the corners of a pair receive to points [B, N, 3].
+template <class T>
+void add_at_corners(const contact::ContactInputs<T>& in, const int32_t* record, const Vec3<T> (&values)[4], T* points) {
+  for (int k = 0; k < 4; ++k) contact::add_at(points + 3 * (record[5] * in.corners + record[k]), values[k]);
+}
+
+template <class T>
+void pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values) {
+  std::fill_n(values, pairs * contact::kLagScalars, T(0));
+  for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+    contact::store_lag(contact::lag_state(record[4], corners, a, stiffness), values + contact::kLagScalars * pair);
+  });
+}
+template <class T>
+void pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, const T* bar, T* points,
+                       T* kappa) {
+  std::fill_n(points, 3 * scenes * in.corners, T(0)), std::fill_n(kappa, scenes, T(0));
+  for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+    contact::PairAdjoint<T> out;
+    contact::reverse_lag(record[4], corners, a, stiffness, bar + contact::kLagScalars * pair, out);
+    add_at_corners(in, record, out.x, points);
+    kappa[record[5]] += out.kappa;
+  });
+}
+template <class T>
+void rubbing(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x, int64_t scenes,
+             int64_t pairs, T* values, T* push) {
+  std::fill_n(values, pairs * contact::kLagScalars, T(0)), std::fill_n(push, 3 * scenes * in.corners, T(0));
+  for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+    const auto state = contact::lag_state(record[4], corners, a, stiffness);
+    contact::store_rubbing(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
+                           values + contact::kLagScalars * pair);
+    Vec3<T> force[4];
+    for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
+    add_at_corners(in, record, force, push);
+  });
+}
+// friction and damping may be null
+template <class T>
+void rubbing_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
+                      const contact::RubbingBars<T>& given, const T* x, int64_t scenes, T* points, T* kappa,
+                      T* friction, T* damping) {
+  std::fill_n(points, 3 * scenes * in.corners, T(0));
+  for (T* bars : {kappa, friction, damping}) {
+    if (bars) std::fill_n(bars, scenes, T(0));
+  }
+  for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+    const int64_t scene = record[5];
+    contact::RubbingAdjoint<T> out;
+    given.reverse(by, pair, record, corners, a, stiffness, out);
+    add_at_corners(in, record, out.pair.x, points);
+    kappa[scene] += out.pair.kappa;
+    if (friction) friction[scene] += out.friction;
+    if (damping) damping[scene] += out.damping;
+  });
+}
+
+// --- sums over a mesh
+// -------------------------------------------------------------------------------------------------
+
+template <class T>
+void gather_rows(const T* values, const int64_t* index, int64_t scenes, int64_t vertices, int64_t n, int64_t c,
+                 T* out) {
+  for (int64_t i = 0; i < scenes; ++i) gather_rows(values + i * vertices * c, index, n, c, out + i * n * c);
+}
+template <class T>
+void sum_segments(const T* values, const int64_t* ptr, const int32_t* entry, int64_t scenes, int64_t n,
+                  int64_t segments, int64_t c, T* out) {
+  for (int64_t i = 0; i < scenes; ++i)
+    sum_segments(values + i * n * c, ptr, entry, segments, c, out + i * segments * c);
+}
+template <class T>
+void sum_rows(const T* values, int64_t rows, int64_t columns, T* out) {
+  for (int64_t i = 0; i < rows; ++i) out[i] = pairwise_sum(values + i * columns, columns);
+}
+template <class T>
+void pack_rest(const Plan& plan, int64_t scenes, const T* rest, T* packed) {
+  const int64_t size = int64_t{plan.slots} * kPairRest * kLanes;
+  for (int64_t i = 0; i < scenes; ++i) pack_rest<T>(plan, rest + i * plan.num_tets * kRestScalars, packed + i * size);
+}
+
+}  // namespace diffvbd

@@ -1,0 +1,318 @@
+"""Shapes of what each operator returns, from its arguments, for torch.compile; no operator is differentiable itself.
+
+A row gets the arguments by the names that csrc/bind gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+
+from ..energies import VERTEX_ENERGIES
+from ..mask import CONTACT
+from .fields import (
+    CONSTANTS,
+    COUNTS,
+    CROSSING_ROW,
+    FEW,
+    LAG_SCALARS,
+    LANES,
+    NEAR_ROW,
+    NEAR_VALUES,
+    PAIR_ROW,
+    PLANE_SCALARS,
+    REST_ROW,
+    REST_SCALARS,
+    START_LOWER,
+    SWEEP_ADJOINTS,
+    TET_READS_X_PREV,
+    UNKNOWNS,
+    WAYS,
+    CoarseSizes,
+    corrections_shape,
+    most_grouped,
+    tape_shape,
+)
+from .load import raw
+
+Row = Callable[[Any], Any]
+INT, LONG, BOOL, BYTE, DOUBLE = torch.int32, torch.int64, torch.bool, torch.uint8, torch.float64
+
+
+def new(like: Tensor, *shape: Any, dtype: torch.dtype | None = None) -> Tensor:
+    return like.new_empty(shape, dtype=dtype)
+
+
+def same(t: Tensor, count: int) -> list[Tensor]:
+    return [torch.empty_like(t) for _ in range(count)]
+
+
+def wanted(flag: Any, like: Tensor, *shape: Any) -> Tensor:
+    return new(like, *(shape if flag else (0,)))
+
+
+def scalars_of_data(data_count: Sequence[int]) -> tuple[int, int]:
+    """Scalars of energy data that a scene has, and that each vertex has."""
+    counts = list(zip(VERTEX_ENERGIES, data_count, strict=True))
+    return sum(n for e, n in counts if not e.per_vertex), sum(n for e, n in counts if e.per_vertex)
+
+
+# --- sweeps and bodies ------------------------------------------------------------------------------------------------
+
+
+def _sweep(a: Any) -> Any:
+    x = a.x_start
+    tape = new(x, *tape_shape(x, a.sizes, a.energies, a.sweeps, a.launch, a.tape_policy))
+    done = corrections_shape(x, a.coarse, a.sweeps, a.energies) if a.coarse_plan.numel() else (0,)
+    cut = (x.shape[0] if a.energies & CONTACT else 0, a.sweeps, x.shape[1])
+    return torch.empty_like(x), tape, new(x, *cut, dtype=BYTE), new(x, *done)
+
+
+def _body_adjoints(x: Tensor, a: Any, wants: Sequence[bool]) -> list[Tensor]:
+    """Of mu, lam, mass, rest. CUDA sums the material that a scene shares."""
+    shares = a.mu.is_cuda and a.mu.shape[-1] == 1 and a.lam.shape[-1] == 1 and not TET_READS_X_PREV
+    (b, v), tets = x.shape[:2], a.sizes[1]
+    material = (b, 1 if shares else tets)
+    shapes = (material, material, (b, v), (b, tets, REST_SCALARS))
+    return [wanted(flag, x, *shape) for shape, flag in zip(shapes, (wants[0], *wants), strict=True)]
+
+
+def _sweep_backward(a: Any) -> Any:
+    x, wants = a.x, a.wants
+    b, v = x.shape[:2]
+    own = [*same(x, 3), *_body_adjoints(x, a, wants[:3]), wanted(wants[3], x, b, a.energy_data.shape[-1])]
+    last = [wanted(wants[0], x, *a.corners_prev.shape), wanted(wants[4], x, *a.coarse_factor.shape)]
+    if not a.energies & CONTACT:
+        return (*own, *(new(x, 0) for _ in range(len(SWEEP_ADJOINTS) - len(own) - len(last))), *last)
+    colliders = a.collider.shape[1] if a.collider.dim() == 3 else 0
+    planes = a.floor_lag.numel() // max(1, a.floor_lag.shape[0] * 4 * v)
+    shapes = ((b, colliders, 3), (b, colliders, 3), (b,), (a.lag_pairs.shape[0], LAG_SCALARS), (b, v, planes, 4))
+    return (*own, *(new(x, *shape) for shape in shapes), *last)
+
+
+def _fused_step(a: Any) -> Any:
+    return *same(a.x, 2), new(a.x, *tape_shape(a.x, a.sizes, a.energies, a.sweeps, a.launch, a.tape_policy))
+
+
+def _fused_step_backward(a: Any) -> Any:
+    states = [wanted(flag, a.x, *a.x.shape) for flag in a.wants[:4]]
+    return (*states, *_body_adjoints(a.x, a, a.wants[4:]))
+
+
+def _rigid_backward(a: Any) -> Any:
+    x, (b, v), (shared, own) = a.x, a.x.shape[:2], scalars_of_data(a.data_count)
+    x_prev = wanted(a.energy_data.numel() or a.v_bar.numel(), x, *x.shape)
+    return (torch.empty_like(x), x_prev, torch.empty_like(x), new(x, b, v),
+            new(x, b, a.spread.shape[0] if a.wants_data else 0, shared),
+            new(x, b, v if a.wants_data else 0, own))  # fmt: skip
+
+
+def _begin(a: Any) -> Any:
+    def decisions(made: bool, ptr: Tensor) -> Tensor:
+        return new(a.x, a.x.shape[0] if made else 0, ptr.shape[0] - 1, dtype=BYTE)
+
+    return *same(a.x, 2), decisions(getattr(a, "from") == START_LOWER, a.other_ptr), decisions(a.parts, a.ptr)
+
+
+def _begin_backward(a: Any) -> Any:
+    x, (b, v), (shared, own) = a.x, a.x.shape[:2], scalars_of_data(a.data_count)
+    bodies, rows = (a.spread.shape[0], v) if a.wants[2] else (0, 0)
+    return (*same(x, 2), wanted(a.wants[0], x, *x.shape), wanted(a.wants[1], x, *x.shape), new(x, b, v),
+            new(x, b, bodies, shared), new(x, b, rows, own),
+            new(x, b, rows if a.filters else 0, a.data_count[0]))  # fmt: skip
+
+
+# --- coarse spaces ----------------------------------------------------------------------------------------------------
+
+
+def _scenes(*tensors: Tensor) -> int:
+    return max(t.shape[0] for t in tensors)
+
+
+def _coarse_stiffness(a: Any) -> Any:
+    sizes = CoarseSizes(*a.sizes)
+    return new(a.mu, _scenes(a.mu, a.lam, a.gradients, a.volume), sizes.groups, 3, 3, sizes.width, sizes.width)
+
+
+def _coarse_stiffness_backward(a: Any) -> Any:
+    scenes, tets = _scenes(a.mu, a.lam, a.gradients, a.volume), a.gradients.shape[1]
+    rest = tets if a.wants_rest else 0
+    return tuple(new(a.mu, scenes, *own) for own in ((tets,), (tets,), (rest, 4, 3), (rest,)))
+
+
+# --- contact ----------------------------------------------------------------------------------------------------------
+
+
+def _bodies(a: Any) -> int:
+    """How many the lists by body have."""
+    return (a.ptr if hasattr(a, "order") else a.body_ptr).shape[0] - 1
+
+
+def _of_planes(planes: Tensor, wants: bool = True) -> int:
+    return planes.shape[-1] if wants and planes.numel() else 0
+
+
+def _points(x: Tensor, collider: Tensor) -> Tensor:
+    """One vector for each corner point."""
+    return new(x, x.shape[0], x.shape[1] + (collider.shape[1] if collider.dim() == 3 else 0), 3)
+
+
+def _contact_detect(a: Any) -> Any:
+    x, b, n = a.x, a.x.shape[0], a.body.shape[0]
+    rows = torch.library.get_ctx().new_dynamic_size() if a.trim and x.device.type == "cpu" else a.capacity
+    return (new(x, rows, PAIR_ROW, dtype=INT), new(x, rows, CONSTANTS), new(x, b * n + 1, dtype=INT),
+            new(x, 4 * rows, dtype=INT), new(x, b, n, NEAR_ROW, dtype=INT), new(x, b, n, NEAR_VALUES),
+            new(x, COUNTS, dtype=LONG), new(x, b))  # fmt: skip
+
+
+def _contact_keep(a: Any) -> Any:
+    count, like = torch.library.get_ctx().new_dynamic_size() if a.exact else a.pairs.shape[0], a.constants
+    return (new(like, count, dtype=LONG), new(like, count, a.pairs.shape[1], dtype=INT),
+            new(like, count, like.shape[1]), new(like, *a.ptr.shape, dtype=INT),
+            new(like, 4 * count, dtype=INT))  # fmt: skip
+
+
+def _contact_rooms(a: Any) -> Any:
+    b, n = a.x.shape[0], _bodies(a)
+    return new(a.x, b, n, dtype=INT), new(a.x, b, n + 1), new(a.x, b, n + 1), new(a.x, b, n)
+
+
+def _contact_unsupported_backward(a: Any) -> Any:
+    b, v = a.x.shape[:2]
+    scalars = a.planes.numel() // a.planes.shape[0] if a.planes.numel() else 0
+    return (new(a.x, b if scalars else 0, v, 3), torch.empty_like(a.x), torch.empty_like(a.force), new(a.x, b, v),
+            new(a.x, b if a.wants_planes else 0, a.held_bodies.shape[0], scalars))  # fmt: skip
+
+
+def _contact_above_floor_backward(a: Any) -> Any:
+    b, n = a.x.shape[0], _bodies(a)
+    return (torch.empty_like(a.x), new(a.x, b if a.u.numel() else 0, n, 3), torch.empty_like(a.x),
+            new(a.x, b, n, _of_planes(a.planes, a.wants_planes)))  # fmt: skip
+
+
+def _contact_rigid_system(a: Any) -> Any:
+    b, n = a.x.shape[0], a.free.shape[0]
+    six, together = UNKNOWNS, n <= FEW
+    factor = (b, six * n, six * n) if together else (b, n, six, six * (1 if a.alone else most_grouped(n)))
+    doubles = (new(a.x, *shape, dtype=DOUBLE) for shape in ((b, n, 3), (b, n, six), factor))
+    return *doubles, new(a.x, *((0,) if together else (b, 4, n)), dtype=INT)
+
+
+def _contact_rigid_move(a: Any) -> Any:
+    size = a.x.shape[0], a.free.shape[0]
+    return torch.empty_like(a.x), *(new(a.x, *size, dtype=dtype) for dtype in (DOUBLE, BOOL, BOOL, a.x.dtype))
+
+
+def _pairs(a: Any) -> tuple[int, int]:
+    return a.pairs.shape[0], a.lag_pairs.shape[0] if a.lag.numel() else 0
+
+
+def _contact_rigid_backward(a: Any) -> Any:
+    (listed, lagged), b, n = _pairs(a), a.x.shape[0], a.body.shape[0]
+    shapes = (*[(b, n, 3)] * 3, (b if lagged else 0, n, 3), (listed,), (lagged, LAG_SCALARS))
+    return tuple(new(a.x, *shape) for shape in shapes)
+
+
+def _contact_rigid_reverse(a: Any) -> Any:
+    (listed, lagged), (b, v), (shared, own) = _pairs(a), a.x.shape[:2], scalars_of_data(a.data_count)
+    planes = a.floor_lag.numel() // max(1, a.floor_lag.shape[0] * v * 4)
+    data = ((b, a.free.shape[0] if a.wants_data else 0, shared), (b, v if a.wants_data else 0, own))
+    colliders = (b, a.body.shape[0] - v, 3)
+    shapes = ((b, v), *data, (b if planes else 0, v, planes, 4), colliders, colliders, (listed,), (lagged, LAG_SCALARS))
+    return *same(a.x, 3), *(new(a.x, *shape) for shape in shapes)
+
+
+TABLE: dict[str, Row] = {
+    "pack_rest": lambda a: new(a.rest, a.rest.shape[0], a.sizes[2], REST_ROW[a.rest.device.type],
+                               LANES[a.rest.device.type]),
+    "tet_gather": lambda a: new(a.values, a.values.shape[0], a.tets.shape[0], 4, a.values.shape[2]),
+    "star_sum": lambda a: new(a.values, a.values.shape[0], a.star_ptr.shape[0] - 1, a.values.shape[3]),
+    "row_sum": lambda a: new(a.values, a.values.shape[0]),
+    "segment_sum": lambda a: new(a.values, a.values.shape[0], a.ptr.shape[0] - 1, a.values.shape[2]),
+    "neighbor_pairs": lambda a: (new(a.points, a.max_pairs, 3, dtype=INT), new(a.points, 1, dtype=LONG)),
+    "sweep": _sweep,
+    "sweep_backward": _sweep_backward,
+    "fused_step": _fused_step,
+    "fused_step_backward": _fused_step_backward,
+    "rigid": lambda a: tuple(same(a.x, 2)),
+    "rigid_backward": _rigid_backward,
+    "begin": _begin,
+    "begin_backward": _begin_backward,
+    "potential_rise": lambda a: new(a.x, a.x.shape[0], a.ptr.shape[0] - 1, 2, dtype=DOUBLE),
+    "coarse_matrix": lambda a: new(a.x_prev, a.x_prev.shape[0], 9 * a.mass.shape[-1]),
+    "coarse_matrix_backward": lambda a: (torch.empty_like(a.x_prev),
+                                         new(a.x_prev, a.x_prev.shape[0], *a.stiffness.shape[1:]),
+                                         new(a.x_prev, a.x_prev.shape[0], *a.mass.shape[1:])),
+    "coarse_stiffness": _coarse_stiffness,
+    "coarse_stiffness_backward": _coarse_stiffness_backward,
+    "coarse_mass": lambda a: new(a.mass, a.mass.shape[0], CoarseSizes(*a.sizes).cells),
+    "coarse_mass_backward": lambda a: new(a.bar, a.bar.shape[0], CoarseSizes(*a.sizes).vertices),
+    "contact_detect": _contact_detect,
+    "contact_intersections": lambda a: (new(a.x, a.capacity, CROSSING_ROW, dtype=INT),
+                                        new(a.x, a.x.shape[0], 2, dtype=LONG), new(a.x, a.x.shape[0], 2, 2, dtype=INT)),
+    "contact_islands": lambda a: new(a.x, a.x.shape[0], a.mesh_bodies, dtype=INT),
+    "contact_motion": lambda a: (torch.empty_like(a.x), new(a.x, len(WAYS), a.x.shape[0], _bodies(a)),
+                                 new(a.x, a.x.shape[0], _bodies(a), 4)),
+    "contact_motion_backward": lambda a: (torch.empty_like(a.x), new(a.x, *a.x.shape[:2]), torch.empty_like(a.x)),
+    "contact_coast": lambda a: torch.empty_like(a.x),
+    "contact_coast_backward": lambda a: (torch.empty_like(a.x), new(a.x, *a.x.shape[:2]), torch.empty_like(a.x)),
+    "contact_rooms": _contact_rooms,
+    "contact_sweep_rooms": lambda a: new(a.x, *a.x.shape[:2]),
+    "contact_unsupported": lambda a: torch.empty_like(a.x),
+    "contact_unsupported_backward": _contact_unsupported_backward,
+    "contact_lowest": lambda a: new(a.x, *a.island.shape, a.planes.shape[-1] // PLANE_SCALARS, dtype=INT),
+    "contact_translation": lambda a: new(a.x, *a.island.shape, 3),
+    "contact_translation_backward": lambda a: (torch.empty_like(a.move), new(a.x, *a.x.shape[:2]),
+                                               torch.empty_like(a.x), new(a.x, a.x.shape[0], _of_planes(a.planes))),
+    "contact_advance": lambda a: (new(a.x, *(a.u if a.whole else a.x).shape[:2]), new(a.x, 1, dtype=LONG)),
+    "contact_narrow": lambda a: torch.empty_like(a.constants),
+    "contact_keep": _contact_keep,
+    "contact_lag": lambda a: new(a.x, a.pairs.shape[0], LAG_SCALARS),
+    "contact_lag_backward": lambda a: (_points(a.x, a.collider), new(a.x, a.x.shape[0])),
+    "contact_rubbing": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), _points(a.x, a.collider)),
+    "contact_rubbing_backward": lambda a: (_points(a.x, a.collider), *(new(a.x, a.x.shape[0] if t.numel() else 0)
+                                                                       for t in (a.kappa, a.friction, a.damping))),
+    "contact_above_floor": lambda a: (torch.empty_like(a.x), new(a.x, a.x.shape[0], _bodies(a), dtype=BOOL)),
+    "contact_above_floor_backward": _contact_above_floor_backward,
+    "contact_frames": lambda a: (torch.empty_like(a.stretch), *same(a.x, 2), new(a.x, *a.x.shape[:2]),
+                                 new(a.x, a.x.shape[0] if a.own_room.numel() else 0, a.x.shape[1])),
+    "contact_bends": lambda a: (*same(a.x, 3), new(a.x, *a.x.shape[:2], dtype=BYTE)),
+    "contact_hold": lambda a: (torch.empty_like(a.way), torch.empty_like(a.state)),
+    "contact_held_up": lambda a: (torch.empty_like(a.base), torch.empty_like(a.state)),
+    "contact_falls": lambda a: (torch.empty_like(a.share), *same(a.x, 2)),
+    "contact_start": lambda a: (torch.empty_like(a.x), torch.empty_like(a.share, dtype=BOOL)),
+    "contact_start_backward": lambda a: (*same(a.x, 5),
+                                         new(a.x, *a.x.shape[:2], _of_planes(a.planes, a.wants_planes))),
+    "contact_rigid_system": _contact_rigid_system,
+    "contact_rigid_move": _contact_rigid_move,
+    "contact_rigid_backward": _contact_rigid_backward,
+    "contact_rigid_reverse": _contact_rigid_reverse,
+}  # fmt: skip
+
+
+def _not_differentiable(ctx: Any, *grads: Tensor) -> NoReturn:
+    raise NotImplementedError("diffvbd: the raw operators are not differentiable; call diffvbd.step")
+
+
+def _register(name: str, row: Row) -> None:
+    names = [argument.name for argument in getattr(raw, name).default._schema.arguments]
+
+    def shapes(*arguments: Any) -> Any:
+        # torch asks, too, where some are on the meta device, and then what comes back would be as if all were
+        given = (t for a in arguments for t in (a if isinstance(a, list) else (a,)))
+        devices = {t.device for t in given if isinstance(t, Tensor)}
+        if len(devices) > 1:
+            found = ", ".join(sorted(str(device) for device in devices))
+            raise ValueError(f"diffvbd::{name}: expected tensors on one device, got {found}")
+        return row(SimpleNamespace(**dict(zip(names, arguments, strict=True))))
+
+    torch.library.register_fake(f"diffvbd::{name}", shapes)
+    torch.library.register_autograd(f"diffvbd::{name}", _not_differentiable)
+
+
+for _name, _row in TABLE.items():
+    _register(_name, _row)

@@ -1,0 +1,42 @@
+"""Claim: each program in examples/ runs without a warning and prints the right numbers, among them gradients."""
+
+import re
+import runpy
+import warnings
+
+import pytest
+from helpers.paths import ROOT
+
+FOLDER = ROOT / "examples"
+NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]\d+)?")
+# Lower and upper bound of each printed number, in order.
+EXPECTED = {
+    "first_gradient": [(0.048, 0.051), (3.5e-7, 4.5e-7)],
+    "identify_material": [(79_900, 80_100), (0.399, 0.401), (80_000, 80_000), (0.4, 0.4)],
+    "contact_drop": [(0.100, 0.120), (0.1087, 0.1088), (0.25, 0.29), (0.27, 0.28), (-0.40, -0.32), (-0.363, -0.362)],
+    "soft_gripper": [(7.0, 10.0), (2.0, 6.0), (1.0, 2.5)],
+    "train_policy": [(0.12, 0.25), (0.0, 0.05)],
+    "custom_energy": [(19.99, 20.01), (20, 20)],
+}
+
+
+def run(name: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_example_prints_the_right_numbers(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = run(name, capsys)
+    numbers = [float(text) for text in NUMBER.findall(printed)]
+    assert len(numbers) == len(EXPECTED[name]), printed
+    for number, (low, high) in zip(numbers, EXPECTED[name], strict=True):
+        assert low <= number <= high, printed
+    if name == "first_gradient":
+        assert "differences agree: True" in printed
+
+
+def test_every_example_is_run() -> None:
+    assert {path.stem for path in FOLDER.glob("*.py")} == set(EXPECTED)
