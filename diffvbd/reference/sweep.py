@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..model.model import Model
-from ..model.system import system_of
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
 from .energies import StableNeoHookean, build_energies, floor_friction
 from .rigid import Correction
@@ -26,7 +24,7 @@ class Trajectory(NamedTuple):
 
 def executed(model: Any, solver: Any) -> Any:
     """The model with the attributes that the solver decides; what is no Model has them already."""
-    return system_of(model, solver) if isinstance(model, Model) else model
+    return model._executed_by(solver) if hasattr(model, "_executed_by") else model
 
 
 def step(
