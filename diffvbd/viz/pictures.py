@@ -27,6 +27,7 @@ from diffvbd.viz.drawing import (
     motions_as_arrays,
     new_figure,
     save_motion,
+    tidy,
 )
 from diffvbd.viz.motion import save_motions
 
@@ -176,8 +177,7 @@ def learning(
         axes.semilogy(seconds, np.minimum.accumulate(losses), label=name, color=color)
     axes.set(xlabel="seconds", ylabel="lowest loss so far")
     axes.legend(frameon=False)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+    tidy(axes)
     chart.subplots_adjust(left=0.2, right=0.96, bottom=0.12, top=0.95)
     figure.savefig(path)
 
@@ -241,8 +241,7 @@ def paths(
     chart.semilogy([row["distance"] for row in history], color=INK)
     chart.set(xlabel="iteration", ylabel="distance from the target [m]")
     for panel in (side, top, chart):
-        panel.grid(alpha=0.3)
-        panel.spines[["top", "right"]].set_visible(False)
+        tidy(panel)
     below.subplots_adjust(left=0.06, right=0.98, bottom=0.17, top=0.9, wspace=0.28)
     figure.savefig(path)
 
@@ -295,8 +294,7 @@ def landing(
     for axes, key, scale, label in zip(charts, ("loss", "uncovered"), (1, 100), ("loss", "uncovered [%]"), strict=True):
         axes.plot([scale * row[key] for row in history], color=INK)
         axes.set_ylabel(label)
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     charts[0].set_yscale("log")
     charts[0].tick_params(which="minor", labelleft=False)
     charts[1].set_xlabel("iteration")
@@ -432,8 +430,7 @@ def cloud(
     for axes, key in zip(charts, ("loss", estimate), strict=True):
         axes.semilogy([row[key] for row in history], color=INK)
         axes.set_ylabel(key.replace("_", " ") + (" [m]" if key != "loss" else ""))
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     charts[1].set_xlabel("iteration")
     right.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)
     figure.savefig(path)
