@@ -54,6 +54,8 @@ class Model:
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
+    _executed_by: Any  # (solver) -> System; system.py adds it
+
     rest_points: Tensor = _copy("_rest_points", "Rest positions [m], shape [V, 3].")
     density: Tensor = _copy("_density", "[kg/m^3], shape [T].")
     mass: Tensor = _copy("_mass", "Masses of the vertices [kg], shape [V].")

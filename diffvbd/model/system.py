@@ -133,3 +133,6 @@ def system_of(model: Model, solver: VBD) -> System:
     check_kind("solver", solver, VBD)
     model = model.model if isinstance(model, System) else model
     return model.derived(solver.key, partial(System, model, solver))
+
+
+Model._executed_by = system_of  # for the reference, which imports nothing of the package
