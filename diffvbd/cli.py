@@ -408,7 +408,7 @@ def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
 
 
 def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
-    """What was given of a Scene, the others have defaults; `pinned` [V] of --pin."""
+    """Arguments given of a Scene, the others have defaults; `pinned` [V] of --pin."""
     names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
              "integrator", "subspace")  # fmt: skip
     values = {name: getattr(options, name) for name in names if getattr(options, name) is not None}

@@ -223,7 +223,7 @@ class _Sweeping:
 
     @property
     def remedy(self) -> str:
-        """What else may help where the sweeps do not converge."""
+        """Advice where the sweeps do not converge."""
         if self.where is None and self.model.coarse is not None:
             return 'plain sweeps (subspace="rigid"), in case the corrections stall'
         if self.where is None:
