@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
-from .checks import check_count, fail
+from ._common.checks import check_count, fail
 
 if dist.is_available():
     # The first step of an optimiser imports this. Its defaults then keep the process group alive beyond
@@ -28,7 +28,7 @@ __all__ = ["backward", "gathered", "own", "share"]
 
 
 def share(count: int) -> slice:
-    """Which of ``count`` rows (scenes, bodies) belong to this rank: as many as to the others, or one more or less.
+    """Rows of ``count`` (scenes, bodies) that belong to this rank: as many as to the others, or one more or less.
 
     Raises:
         TypeError, ValueError: fewer rows than ranks; no integer.

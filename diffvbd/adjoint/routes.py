@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from .. import ops
-from ..checks import check_bool, check_count, check_positive, fail, is_word
+from .._common.checks import check_bool, check_count, check_positive, fail, is_word
 
 # Up to which bytes of a step's full tape "auto" keeps it: these, or on CUDA this share of the device's memory if that
 # is more.
@@ -59,7 +59,7 @@ class Unrolled:
 
 @dataclass(frozen=True)
 class LinearSolve:
-    """How the linear solves of one step's backward ended; what GlobalAdjoint hands to its ``report``.
+    """Outcome of the linear solves of one step's backward, which GlobalAdjoint hands to its ``report``.
 
     Attributes:
         iterations: Of conjugate gradients, the most over all scenes.

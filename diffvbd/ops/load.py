@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from ..scopes import transformed
+from .._common.context import transformed
 
 _FOLDER = Path(__file__).parents[1]  # of the package, where the objects are
 _COMMAND = "pip install --no-build-isolation -e ."  # in a checkout
@@ -37,6 +37,8 @@ def load() -> None:
             "folder, whose sources hide the installed package"
         )
     torch.ops.load_library(str(path))
+    if not hasattr(torch.ops.diffvbd, "constants"):
+        raise ImportError(f"diffvbd was built from older sources: run `{_COMMAND}` in this folder")
     path = _built("_C_cuda")
     if torch.version.cuda and path is not None:
         try:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from ..tuples import replaced
+from .._common.context import replaced
 from .fields import (
     FULL_TAPE,
     NO_TAPE,
@@ -18,7 +18,7 @@ from .fields import (
     SweepSettings,
     as_list,
 )
-from .load import raw
+from .load import direct as raw
 
 
 def build_plan(

@@ -11,21 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import check_bool
+from .._common.checks import check_bool
+from .._common.constants import ELASTIC
+from .._common.context import is_captured, looks_at, may_copy, replaced
+from .._common.messages import is_silent, page, percent, warn
 from ..energies import Anchor
-from ..mask import ELASTIC
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import Integrator
 from ..model.system import System
 from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
-from ..said import is_silent, page, percent, warn
-from ..scopes import is_captured, looks_at, may_copy
 from ..step.arguments import Prepared, acceleration_of, collider_state
-from ..step.contact_cycles import CUT
+from ..step.contact import CUT, outcomes
 from ..step.integrators import Solve
-from ..step.met import outcomes
 from ..step.predict import begin, energy_data
 from ..step.residual import (
     UNBALANCED_FRICTION,
@@ -38,12 +37,11 @@ from ..step.residual import (
     what_helps,
 )
 from ..step.stability import FAR, fault_of, reach_of, size_of
-from ..tuples import replaced
 
 
 @dataclass(frozen=True)
 class Checks:
-    """What a rollout looks at and warns (UserWarning) of, each time, in one sentence that says what to do.
+    """Checks of a rollout. Each warns (UserWarning), every time, in one sentence that says what to do.
 
     A rollout that ends with what is not finite, or too far away, always warns.
 
@@ -170,7 +168,7 @@ class EndLook:
         self.kept, self.last, self.start = {}, None, ()
 
     def fault(self) -> str:
-        """What is at fault where the state that the latest step has left is lost."""
+        """Cause of a lost state after the latest step."""
         if self.last is None or not looks_at(self.last[1]):
             return "take a smaller time_step, more sweeps, or float64"
         return fault_of(self.model, self.last[0], self.integrator, *self.last[1:])
@@ -377,8 +375,8 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
 
 
 def _looked_at(asked: bool | None, model: System, steps: int) -> frozenset[int]:
-    """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
-    many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
+    """Steps that are looked at: all where one asks; where bodies may hit something, whose gain may be over in a step,
+    as many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
     meets = model.touches or model.floor is not None
     looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
     count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)

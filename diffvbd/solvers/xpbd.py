@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_time_step, fail, is_word
-from ..lasting import lasting_tensors
+from .._common.checks import check_time_step, fail, is_word
+from .._common.context import lasting_tensors
 from ..mesh import TetMesh
 from ..step.arguments import GRAVITY
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
@@ -26,7 +26,7 @@ from .particles import (
 
 
 class Projection(NamedTuple):
-    """What an update of n constraints makes of the state; both of its directions start from it."""
+    """Intermediate results of an update of n constraints; both of its directions start from them."""
 
     direction: Tensor  # n [..., n, 3]
     inverse: Tensor  # 1 / |xa - xb| [1/m] [..., n, 1]

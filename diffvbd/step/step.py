@@ -10,11 +10,11 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
+from .._common.checks import check_tensor, fail, to_float
+from .._common.context import refuse_refinement, refuse_transforms
 from ..adjoint.routes import Adjoint, check_adjoint
-from ..checks import check_tensor, fail, to_float
 from ..model.model import Model
 from ..model.solver import BDF2, VBD
-from ..scopes import refuse_refinement, refuse_transforms
 from .advance import advance
 from .arguments import check_prescribed, check_state, given_of, prepare, system_for
 from .integrators import check_staged, take
@@ -81,7 +81,7 @@ def step(
 
 @dataclass(frozen=True)
 class Tape:
-    """What :func:`diffvbd.step_backward` needs of one step; opaque.
+    """Record of one step that :func:`diffvbd.step_backward` needs; opaque.
 
     Holds the arguments of ``wrt`` and the step's x', v' [m, m/s], shape [..., V, 3], with their graph. A graph cannot
     be copied or stored, so a tape cannot: keep the states, and run step_forward again.

@@ -1,4 +1,4 @@
-"""What every picture is made of."""
+"""Bodies, scenery, axes and colors: the parts of every picture."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.checks import check_count, check_positive
 from diffvbd.mesh.arrays import float_array, to_numpy
+
+from .._common.checks import check_count, check_positive
 
 COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
 OTHER = "#8c8c8c"
@@ -120,6 +121,12 @@ def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = 
     return Scenery(points, triangles, color)
 
 
+def tidy(axes: Any) -> None:
+    """A faint grid, and no frame at the top and on the right."""
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
 def course(figure: Any, history: Sequence[Mapping[str, float]], truth: Mapping[str, float]) -> None:
     """Charts of the loss and of relative errors over iterations."""
     iterations = np.arange(len(history))
@@ -133,8 +140,7 @@ def course(figure: Any, history: Sequence[Mapping[str, float]], truth: Mapping[s
         charts[1].set_ylabel("relative error")
         charts[1].legend(frameon=False)
     for axes in charts:
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     figure.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from ..checks import fail
+from .._common.checks import fail
 
 TRIED = 1000  # ports
 _REPLACING = threading.Lock()
@@ -94,7 +94,7 @@ def refusal(headers: Any, host: str) -> str:
 
 
 def _is_own(asked: str, host: str) -> bool:
-    """Whether a Host header names this server by an address, which no other site can claim, or by its own name."""
+    """True if a Host header names this server by an address, which no other site can claim, or by its own name."""
     try:
         name = urlsplit(f"//{asked}").hostname or ""
     except ValueError:

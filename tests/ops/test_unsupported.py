@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.step.unsupported import _Unsupported
+from diffvbd.step.contact import _Unsupported
 from diffvbd.testing import generator, relative_error, tolerance
 
 H, DHAT = 0.01, 0.1

@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.contact.start import Decided, _Start
+from diffvbd._contact.start import Decided, _Start
 from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.ops.contact import PartBodies
 from diffvbd.reference.energies import FloorBarrier
-from diffvbd.safeguards import FILTER_ETA
+from diffvbd._common.constants import FILTER_ETA
 from diffvbd.step.arguments import CHORD
-from diffvbd.step.start import begin
+from diffvbd.step.predict import begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {

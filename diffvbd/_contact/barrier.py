@@ -1,0 +1,135 @@
+"""Contact between bodies, with oneself and with colliders: the barrier of pairs, and friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from .._common.checks import check_bool, check_count, check_number, check_positive, fail, refuse_gradients
+from .._common.constants import CONTACT
+
+MOST_REACH = 1e6  # [m]; its square must be a number in float32
+LEAST_VELOCITY = 1e-12  # [m/s]; its square times that of a time step must be a number in float32
+
+
+def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
+    return {k: torch.as_tensor(getattr(energy, k), dtype=like.dtype, device=like.device) for k in energy.parameters}
+
+
+@dataclass(frozen=True, eq=False)
+class PairBarrier:
+    """IPC log barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) between surfaces of a Model's bodies and its colliders.
+
+    Every pair of a point and a triangle and of two edges counts once, with d their distance, whatever features are
+    closest; edges that become parallel are mollified. From a start without intersections no executed sweep lets two
+    surfaces cross, at any speed and any number of sweeps: each motion leaves a plane between the sides of every pair
+    that could meet, and no vertex goes farther than pairs were looked for. What has been held up is lost as velocity
+    (see :func:`diffvbd.contact.status`). Two places of one body that coincide at rest (a crack, doubled vertices) are
+    never a pair: they may pass through each other.
+
+    Args:
+        kappa: Barrier stiffness [N/m].
+        dhat: Activation distance [m]. Pairs of one body that are closer at rest use 0.9 of their rest distance.
+        self_contact: Pairs within a body.
+        between_bodies: Pairs of different bodies. Pairs with colliders always count.
+        damping: Damping of approaching motion of pairs that started the step closer than dhat [N s/m]. It fades in with
+            their normal force N there, by N / (N + kappa dhat / 10), lest a motion jump where a pair comes to be that
+            close one step sooner.
+        detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
+            advance in R parts; what pairs have held up tries again in the next part. None: one, and up to four in
+            steps in which bodies want to go farther beside each other than ``reach`` lets them. As long as pairs still
+            hold something up, such a step goes on, with more sweeps, up to eight parts in all (docs/contact.md). What
+            is prescribed then moves in the first part.
+        reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
+            detections, beside the motion that bodies near each other share. None: that is one mean edge of its body,
+            or 8 where a single body moves.
+        capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
+            room runs again.
+
+    Inputs: ``pair_kappa`` and ``pair_damping`` (scalars).
+
+    Raises:
+        ValueError, TypeError: For numbers out of range.
+
+    Source: Li et al. (2020) for the barrier; planes between sides after Chen et al. (2025) and planar division;
+    docs/method.md, section 12.
+    """
+
+    name: ClassVar[str] = "pair"
+    bit: ClassVar[int] = CONTACT
+    parameters: ClassVar[dict[str, int]] = {"kappa": 0, "damping": 0}
+    units: ClassVar[dict[str, str]] = {"kappa": "N/m", "damping": "N s/m"}
+
+    kappa: float = 400.0
+    dhat: float = 0.02
+    self_contact: bool = True
+    between_bodies: bool = True
+    damping: float = 0.0
+    detections: int | None = None
+    reach: float | None = None
+    capacity: int | None = None
+
+    def __post_init__(self) -> None:
+        refuse_gradients(self)
+        object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
+        object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
+        object.__setattr__(self, "damping", check_number("damping", self.damping))
+        for name in ("self_contact", "between_bodies"):
+            check_bool(name, getattr(self, name))
+        if self.detections is not None:
+            object.__setattr__(self, "detections", check_count("detections", self.detections, 1, 1000))
+        if self.reach is not None:
+            object.__setattr__(self, "reach", check_positive("reach", self.reach, "m"))
+            if self.reach <= self.dhat:
+                fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
+        for name, length in (("dhat", self.dhat), ("reach", self.reach or 0.0)):
+            if length > MOST_REACH:
+                fail(name, f"at most {MOST_REACH:g} m", length)
+        if self.capacity is not None:
+            object.__setattr__(self, "capacity", check_count("capacity", self.capacity, 1, 2**26))
+
+    def constants(self, like: Tensor) -> dict[str, Tensor]:
+        return _scalars(self, like)
+
+
+@dataclass(frozen=True, eq=False)
+class Friction:
+    """Friction of everything that touches: floors (FloorBarrier), pairs and colliders (PairBarrier).
+
+    The smooth friction potential of IPC: normal forces, normals and weights are those of the start of the step, all
+    differentiated; below ``velocity`` [m/s] the force fades linearly to zero, so that a sticking contact creeps at a
+    fraction of it.
+
+    Args:
+        coefficient: mu_f >= 0.
+        velocity: eps_v > 0 [m/s].
+
+    Input: ``friction`` (scalar), the coefficient.
+
+    Raises:
+        ValueError: A coefficient < 0 or not finite, a velocity below 1e-12 m/s.
+        TypeError: What is no number, or a tensor that requires grad.
+
+    Source: Li et al. (2020), section 5; docs/method.md, section 12.
+    """
+
+    name: ClassVar[str] = "friction"
+    bit: ClassVar[int] = CONTACT
+    parameters: ClassVar[dict[str, int]] = {"coefficient": 0}
+    units: ClassVar[dict[str, str]] = {"coefficient": "-"}
+
+    coefficient: float = 0.5
+    velocity: float = 1e-3
+
+    def __post_init__(self) -> None:
+        refuse_gradients(self)
+        object.__setattr__(self, "coefficient", check_number("coefficient", self.coefficient))
+        object.__setattr__(self, "velocity", check_positive("velocity", self.velocity, "m/s"))
+        if self.velocity < LEAST_VELOCITY:
+            fail("velocity", f"at least {LEAST_VELOCITY:g} m/s", self.velocity)
+
+    def constants(self, like: Tensor) -> dict[str, Tensor]:
+        return _scalars(self, like)

@@ -1,0 +1,59 @@
+"""Detection as a step asks for it: which pairs are near, which vertices lowest."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._contact.barrier import PairBarrier
+from .._contact.surface import ContactSurface
+from ..ops import contact as contact_lag
+from ..ops import contact as ops_contact
+
+
+def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
+           capacity: int, room: Tensor | None = None, own_room: Tensor | None = None
+           ) -> tuple[Tensor, ...]:  # fmt: skip
+    """Pairs that may come closer than dhat before the next detection, and the nearest pair of each corner point.
+
+    Args:
+        x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  was, now: Collider points [B, Vc, 3] [m].
+        capacity: Pairs of all scenes that fit.
+        room, own_room: How far the vertices of each body may go beside its island and beside its own rigid motion, and
+            the largest [B, bodies + 1] [m]; None: nobody moves.
+
+    Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
+        pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
+        the mollifier, hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
+        near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [4] int64
+        (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
+    """
+    s = surface
+    room, own_room = (x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (room, own_room))
+    return ops_contact.contact_detect(
+        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room,
+        own_room, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
+        not torch.compiler.is_compiling(),
+    )  # fmt: skip
+
+
+def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: ContactSurface, self_contact: bool,
+                  between_bodies: bool, capacity: int = 0) -> ops_contact.Intersections:  # fmt: skip
+    """Edges that pass through triangles and points behind planes: :func:`diffvbd.ops.contact.contact_intersections`.
+
+    Args:
+        x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  colliders: Their points [B, Vc, 3] [m].
+        self_contact, between_bodies: Whether bodies may not cross themselves, and each other.
+        capacity: Crossings to list; their number and the first of each scene cost nothing.
+    """
+    s = surface
+    with torch.no_grad():
+        return ops_contact.contact_intersections(
+            x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius, s.triangles, s.edges,
+            s.points, s.planes, s.body, s.held, s.bodies, self_contact, between_bodies, capacity,
+        )  # fmt: skip
+
+
+def lowest(x: Tensor, origin: Tensor, data: Tensor, island: Tensor, surface: ContactSurface) -> Tensor:
+    """Lowest vertex of each body's island above each plane [B, bodies, planes] int32; ``data`` as FloorBarrier.pack."""
+    return contact_lag.lowest(x, origin, data, surface.body_order, surface.body_ptr, island)

@@ -1,0 +1,161 @@
+"""The surfaces of a Model's bodies and colliders, as detection reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._contact.barrier import PairBarrier
+from .._contact.colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
+from ..mesh import TetMesh
+
+CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
+# Mean edges of its body that a vertex may go where no reach is given: beside its island, where one body moves and where
+# several do; beside the rigid motion of its body, at least and at most; and that of a body which is held, whose
+# every motion is a deformation. The farther, the more pairs there are.
+MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
+LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
+# Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
+COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSurface:
+    """Corner points are the V vertices of the mesh, then the points of the colliders; N of them."""
+
+    rest: Tensor  # [N, 3] [m]
+    radius: Tensor  # [N] [m]
+    triangles: Tensor  # [F, 3] int32, of corner points
+    edges: Tensor  # [E, 2] int32
+    points: Tensor  # [P] int32
+    planes: Tensor  # [L, 3] int32
+    body: Tensor  # [N] int32: those of the mesh, then one for each collider
+    held: Tensor  # [N] bool: pinned, or of a collider
+    held_bodies: Tensor  # [bodies] bool: a vertex of it is pinned
+    partly_held: Tensor | None  # [V] bool: of a body of which a vertex is pinned and another not; None: there is none
+    plane_points: Tensor  # [N] bool: spans a plane
+    body_order: Tensor  # [V] int32: vertices by body
+    body_ptr: Tensor  # [bodies + 1] int32
+    bodies: int  # of the mesh
+    rows: tuple[slice, ...]  # of each collider in collider_points
+    most_room: Tensor  # [bodies] [m]: that any vertex is given beside its island
+    most_room_alone: Tensor  # [bodies] [m]: and where no other body is in reach of that
+    most_own_room: Tensor  # [bodies] [m]: and beside the rigid motion of its body
+    least_own_room: (
+        Tensor  # [bodies] [m]: and is given there in any case, because hardly any two sides of a body are so close
+    )
+    capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
+
+    @property
+    def collider_points(self) -> Tensor:
+        return self.rest[self.body_order.shape[0] :]
+
+    def corners_of(self, key: int) -> tuple[int, list[int]]:
+        """Scene and corner points of a pair by its key in contact_detect's counts."""
+        count = 1 + max(t.shape[0] for t in (self.triangles, self.edges, self.points, self.planes))
+        key, second = divmod(key, count)
+        key, first = divmod(key, count)
+        scene, kind = divmod(key, 3)
+        sides = ((self.points, self.triangles), (self.edges, self.edges), (self.points, self.planes))[kind]
+        corners = [side[row].reshape(-1).tolist() for side, row in zip(sides, (first, second), strict=True)]
+        return scene, corners[0] + corners[1]
+
+    def owners_of(self, first: int, second: int) -> str:
+        """Owners of two corner points, for messages."""
+        bodies = [int(self.body[corner]) for corner in (first, second)]
+        named = [f"body {b}" if b < self.bodies else f"collider {b - self.bodies}" for b in bodies]
+        return " and ".join(dict.fromkeys(named))
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> ContactSurface:
+        changes: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                value = value.to(device, dtype) if value.is_floating_point() else value.to(device)
+            changes[field.name] = value
+        return ContactSurface(**changes)
+
+
+def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders: Sequence[Collider]) -> ContactSurface:
+    """In float64 on the CPU."""
+    count, bodies = mesh.num_vertices, mesh.num_bodies
+    label = np.unique(mesh.body, return_inverse=True)[1].reshape(-1)
+    surface = mesh.surface
+    triangles, edges, points, planes = [surface], [unique_edges(surface)], [np.unique(surface)], []
+    rest, body, radius, flat, rows = [mesh.points], [label], [np.zeros(count)], [np.zeros(count, bool)], []
+    for index, collider in enumerate(colliders):
+        part, first = collider.corners(), sum(map(len, rest))
+        n = len(part.points)
+        rest.append(part.points)
+        body.append(np.full(n, bodies + index))
+        radius.append(np.full(n, part.radius))
+        flat.append(np.full(n, part.plane))
+        rows.append(slice(first - count, first - count + n))
+        triangles.append(part.triangles + first)
+        edges.append(part.edges + first)
+        points.append(part.lone + first)
+        if part.plane:
+            planes.append([first, first + 1, first + 2])
+    # of each body: neither a large obstacle nor a coarse neighbour widens a search
+    first, second = edges[0].T
+    lengths = np.linalg.norm(mesh.points[first] - mesh.points[second], axis=1)
+    total, number = (np.bincount(label[first], weights, minlength=bodies) for weights in (lengths, None))
+    edge = torch.from_numpy(total / np.maximum(number, 1))
+    held_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
+    held_bodies = torch.from_numpy(held_vertices > 0)
+    moving_bodies = held_vertices < np.bincount(label, minlength=bodies)
+    partly_held = torch.from_numpy(((held_vertices > 0) & moving_bodies)[label])
+    alone = moving_bodies.sum() <= 1 or not barrier.between_bodies
+    own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
+                      MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
+    most_room_alone = MOST_EDGES * edge
+    most_room = most_room_alone if alone else MOST_EDGES_BETWEEN * edge
+    if barrier.reach is not None:
+        most_room = most_room_alone = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
+
+    def index_tensor(parts: list[Any], width: int) -> Tensor:
+        joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
+        return torch.from_numpy(joined.astype(np.int32))
+
+    held = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
+    order = np.argsort(label, kind="stable")
+    return ContactSurface(
+        rest=torch.from_numpy(np.concatenate(rest)),
+        radius=torch.from_numpy(np.concatenate(radius)),
+        triangles=index_tensor(triangles, 3),
+        edges=index_tensor(edges, 2),
+        points=index_tensor(points, 1).reshape(-1),
+        planes=index_tensor(planes, 3),
+        body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
+        held=held,
+        held_bodies=held_bodies,
+        partly_held=partly_held if partly_held.any() else None,
+        plane_points=torch.from_numpy(np.concatenate(flat)),
+        body_order=torch.from_numpy(order.astype(np.int32)),
+        body_ptr=torch.from_numpy(np.searchsorted(label[order], np.arange(bodies + 1)).astype(np.int32)),
+        bodies=bodies,
+        rows=tuple(rows),
+        most_room=most_room,
+        most_room_alone=most_room_alone,
+        most_own_room=torch.where(held_bodies, MOST_EDGES_HELD, own) * edge,
+        least_own_room=LEAST_EDGES_OWN * edge,
+        capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
+    )
+
+
+def check_colliders(colliders: Any) -> tuple[Collider, ...]:
+    kinds = (Plane, Sphere, Capsule, Obstacle)
+    if isinstance(colliders, kinds):
+        colliders = (colliders,)
+    if not isinstance(colliders, (tuple, list)):
+        raise TypeError(f"colliders: expected a sequence of colliders, got {type(colliders).__name__}")
+    for collider in colliders:
+        if not isinstance(collider, kinds):
+            names = ", ".join(k.__name__ for k in kinds)
+            raise TypeError(f"colliders: expected instances of {names}, got {type(collider).__name__}")
+    return tuple(colliders)

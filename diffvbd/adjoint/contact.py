@@ -1,0 +1,263 @@
+"""Lagged contact: what sweeps keep of the start of a step: forces, normals and weights of pairs, differentiable."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from .._contact.pair_forces import (
+    NearPairs,
+    barrier_forces,
+    barrier_stiffness,
+    corner_points,
+    lag_of,
+    lagged_forces,
+    lagged_stiffness,
+    near_pairs,
+)
+from ..model.inputs import parameter_of
+from ..model.system import System
+from ..ops import contact as ops_contact
+from ..ops.fields import CONSTANTS
+from ..ops.sums import segment_sum
+from ..reference.energies import smoothed
+from .potential import IncrementalPotential
+
+
+class Pairs(NamedTuple):
+    """Index data of a detection: which pairs there are; not differentiable. Shapes: detection.detect."""
+
+    pairs: Tensor
+    constants: Tensor
+    ptr: Tensor
+    entry: Tensor
+
+
+def no_pairs(like: Tensor, corners: int) -> Pairs:
+    """An empty list for so many corner points of all scenes."""
+    none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
+    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
+
+
+def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
+    """Those of listed pairs that ``keep`` names, bool [pairs], and which they are. Where values must not decide sizes,
+    on CUDA and compiled, in lists of the same length, with -1 where there is none."""
+    exact = not keep.is_cuda and not torch.compiler.is_compiling()
+    rows, *kept = ops_contact.keep(keep, listed, exact)
+    return Pairs(*kept), rows
+
+
+def _gather_corners(points: Tensor, listed: Pairs) -> Tensor:
+    rows = listed.pairs.clamp(min=0).long()
+    return points[rows[:, 5:], rows[:, :4]]
+
+
+def _add_corners(values: Tensor, listed: Pairs, scenes: int, points: int) -> Tensor:
+    rows = values.flatten(0, 1)[None].contiguous()
+    return segment_sum(rows, listed.entry, listed.ptr).reshape(scenes, points, values.shape[-1])
+
+
+_at_corners = ops.Linear(_gather_corners, lambda bar, shape, listed: sum_at_corners(bar, listed, *shape[:2]), 2)
+_sum_at_corners = ops.Linear(_add_corners, lambda bar, _, listed, scenes, points: at_corners(bar, listed), 4)
+_of_scene = ops.Linear(lambda value, listed: value[listed.pairs[:, 5].clamp(min=0).to(torch.int64)],
+                       lambda bar, shape, listed: sum_of_scenes(bar, listed, shape[0]), 2)  # fmt: skip
+
+
+def at_corners(points: Tensor, listed: Pairs) -> Tensor:
+    """points [B, N, n] of all corner points at those of each pair [pairs, 4, n]; those of a row that no pair fills are
+    any, and pass no gradient on."""
+    return _at_corners(points, listed)
+
+
+def sum_at_corners(values: Tensor, listed: Pairs, scenes: int, points: int) -> Tensor:
+    """Sums of values at the corners of pairs [pairs, 4, n] over the pairs of each corner point, [B, N, n] of so many
+    scenes and corner points."""
+    return _sum_at_corners(values, listed, scenes, points)
+
+
+def sum_of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
+    """Sums of values of pairs [pairs] over those of each scene [B], in a fixed order; values are zero in rows that no
+    pair fills."""
+    if scenes <= 1:
+        return ops.sum_to(values, (1,))[:scenes]
+    ptr = listed.ptr  # pairs are sorted by scene, with four entries each
+    first = (ptr[:: (ptr.shape[0] - 1) // scenes] // 4).contiguous()
+    order = torch.arange(values.shape[0], dtype=torch.int32, device=ptr.device)
+    return segment_sum(values[None, :, None].contiguous(), order, first)[0, :, 0]
+
+
+def of_scene(value: Tensor, listed: Pairs) -> Tensor:
+    """value [B], one for each scene, for each pair [pairs]; its gradient is summed in a fixed order."""
+    return _of_scene(value, listed)
+
+
+def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed: Pairs) -> Tensor:
+    """[pairs, 9]: normal force [N], 1 where closer than dhat, normal (3), weights (4); differentiable in three.
+
+    Args:
+        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  origin: [B, V, 3] or empty.
+    """
+    return ops_contact.pair_lag(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, *listed)
+
+
+def rubbing(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
+            listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_share), normal (3),
+    weights (4); and the forces of pairs on corner points [B, N, 3] [N]. Differentiable in the first five.
+
+    Args:
+        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  friction, damping: [1 | B], or empty.
+        origin: [B, V, 3] or empty.
+    """
+    given = (t.contiguous() for t in (x, collider, kappa, friction, damping))
+    return ops_contact.pair_rubbing(*given, origin, *listed)
+
+
+# --- contact of a step at one state -----------------------------------------------------------------------------------
+
+
+class ContactState(NamedTuple):
+    """Forces at one state [N]; those of pairs on their corners [Q, 4, 3], those of planes on vertices [B, V, P, 3]."""
+
+    points: Tensor  # [B, N, 3] corner points
+    pairs: NearPairs
+    barrier: Tensor
+    lagged: NearPairs | None  # pairs of the start; None where there are none, or no start is known
+    damping: Tensor
+    friction: Tensor
+    floor: Tensor  # barrier and damping of planes; on vertices that are not pinned
+    floor_friction: Tensor
+
+    def of_pairs(self) -> tuple[Tensor, Tensor]:
+        """Normal and friction forces of pairs on corner points, both [B, N, 3]."""
+        normal = self.pairs.summed(self.barrier, self.points)
+        if self.lagged is None:
+            return normal, torch.zeros_like(normal)
+        return normal + self.lagged.summed(self.damping, self.points), self.lagged.summed(self.friction, self.points)
+
+    def on_vertices(self) -> tuple[Tensor, Tensor]:
+        """Normal and friction forces of everything on the vertices, both [B, V, 3]."""
+        count = self.floor.shape[1]
+        normal, friction = self.of_pairs()
+        return normal[:, :count] + self.floor.sum(-2), friction[:, :count] + self.floor_friction.sum(-2)
+
+
+class StepContact:
+    """Contact of a step of a Model before anything moves.
+
+    Args:
+        data: The energies' data [1 | B, n].  parameters: Those of the energies, [1 | B, ...].
+        colliders, before: Collider points at the end and at the start [B, Vc, 3].
+        x_prev: Start of the step [B, V, 3], relative to ``origin`` where there is one; None: at rest in any state, so
+            that there is neither damping nor friction.
+    """
+
+    def __init__(self, model: System, data: Tensor, parameters: dict[str, Tensor], colliders: Tensor, before: Tensor,
+                 x_prev: Tensor | None, origin: Tensor | None, time_step: float) -> None:  # fmt: skip
+        self.model, self.parameters, self.origin, self.h = model, parameters, origin, time_step
+        self.colliders, self.x_prev = colliders, x_prev
+        floor = model.floor
+        self.planes = None if floor is None else data[:, : floor.count()].double()
+        self.start = None if x_prev is None else corner_points(x_prev, origin, before)
+        self.reach = 1.0 if model.friction is None else time_step * model.friction.velocity
+        self.lag = None
+        surface, barrier = model.surface_of_contact, model.contact
+        if x_prev is not None and self.start is not None and surface is not None and barrier is not None:
+            first = before + (colliders - before) / (barrier.detections or 1)
+            near = near_pairs(x_prev, origin, before, first, surface, barrier)
+            self.lag = lag_of(near, self.start, self._number("pair_kappa"))
+
+    def _number(self, name: str) -> Tensor:
+        """A parameter [1 | B]; zero where its energy is absent."""
+        value = parameter_of(self.model, self.parameters, name)
+        return self.colliders.new_zeros((1,), dtype=torch.float64) if value is None else value.double()
+
+    def at(self, x: Tensor) -> ContactState:
+        """Forces at x [B, V, 3].
+
+        Raises:
+            ValueError: Where surfaces touch there, or positions are not finite.
+        """
+        surface, barrier = self.model.surface_of_contact, self.model.contact
+        points = corner_points(x, self.origin, self.colliders)
+        if surface is None or barrier is None:
+            pairs = _no_pairs(points)
+        else:
+            pairs = near_pairs(x, self.origin, self.colliders, self.colliders, surface, barrier)
+        pushes = barrier_forces(pairs, points, self._number("pair_kappa"))
+        damping = friction = points.new_zeros((0, 4, 3))
+        if self.lag is not None:
+            damping, friction = lagged_forces(self.lag, points, self._number("pair_damping"),
+                                              self._number("friction"), self.h, self.reach)  # fmt: skip
+        lagged = None if self.lag is None else self.lag.pairs
+        return ContactState(points, pairs, pushes, lagged, damping, friction, *self._floor(points[:, : x.shape[1]]))
+
+    def _floor(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal and friction forces of each plane on each vertex, both [B, V, P, 3]."""
+        floor = self.model.floor
+        if floor is None or self.planes is None:
+            none = x.new_zeros((*x.shape[:2], 0, 3))
+            return none, none
+        start = x if self.start is None else self.start[:, : x.shape[1]]
+        free = ~self.model._pinned[:, None, None]
+        slope, normal = floor.slopes(x, start, self.planes, self.h, None)
+        push = torch.where(free, -(slope / self.h**2)[..., None] * normal, 0.0)
+        if self.start is None or self.model.friction is None:
+            return push, torch.zeros_like(push)
+        lagged, slip, factor = self._floor_slip(x)
+        return push, torch.where(free, -(lagged * factor)[..., None] * slip, 0.0)
+
+    def _floor_slip(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Largest friction of each plane on each vertex [B, V, P], slip [B, V, P, 3], and what their product takes."""
+        floor, start = self.model.floor, self.start
+        assert floor is not None and start is not None and self.planes is not None
+        start = start[:, : x.shape[1]]
+        force, normal = floor.normal_force(start, self.planes, None)
+        lagged = self._number("friction")[:, None, None] * force
+        travel = (x - start)[:, :, None]
+        slip = travel - (travel * normal).sum(-1, keepdim=True) * normal
+        return lagged, slip, smoothed(slip.movedim(-1, -2), self.reach)[1]
+
+    def stiffness(self, forces: ContactState) -> Tensor:
+        """Trace of the contact's part of each vertex's block [N/m], [B, V]; of planes their friction alone."""
+        points, count = forces.points, forces.floor.shape[1]
+        total = barrier_stiffness(forces.pairs, points, self._number("pair_kappa"))
+        if self.lag is not None:
+            total = total + lagged_stiffness(self.lag, points, self._number("pair_damping"),
+                                             self._number("friction"), self.h, self.reach)  # fmt: skip
+        total = total[:, :count]
+        if self.model.friction is not None and self.start is not None and self.planes is not None:
+            lagged, _, factor = self._floor_slip(points[:, :count])
+            total = total + 2 * (lagged * factor).sum(-1)
+        return total
+
+
+def _no_pairs(points: Tensor) -> NearPairs:
+    whole, real = (points.new_zeros((0,), dtype=d) for d in (torch.int64, torch.float64))
+    return NearPairs(whole.reshape(0, 4), whole, whole, real, real, real)
+
+
+class ContactPotential(IncrementalPotential):
+    """The incremental potential at x with pairs and friction. Its Hessian is that without them."""
+
+    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, contact: StepContact) -> None:
+        super().__init__(model, x, fields, contact.h)
+        self.step_contact = contact
+
+    @cached_property
+    def contact(self) -> ContactState:
+        return self.step_contact.at(self.x)
+
+    def forces(self) -> Tensor:
+        """h^2 dE/dx [kg m], [B, V, 3], pairs and friction included."""
+        count = self.x.shape[1]
+        normal, friction = self.contact.of_pairs()
+        total = (normal + friction)[:, :count] + self.contact.floor_friction.sum(-2)
+        return super().forces() - (self.h**2 * total).to(self.x.dtype)
+
+    def stiffness(self) -> Tensor:
+        return super().stiffness() + (self.h**2 * self.step_contact.stiffness(self.contact))[..., None].to(self.x.dtype)
