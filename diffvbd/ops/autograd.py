@@ -147,7 +147,8 @@ class Differentiable:
                 made = output if isinstance(output, tuple) else (output,)
                 ctx.save_for_backward(*(inputs[:first] if saved is None else saved(inputs, made)))
                 ctx.rest = inputs[first:] if rest is None else rest(inputs)
-                ctx.mark_non_differentiable(*made[outputs:])
+                if made[outputs:]:  # torch.compile takes no empty mark of a function with one output
+                    ctx.mark_non_differentiable(*made[outputs:])
                 ctx.set_materialize_grads(False)
 
             @staticmethod
