@@ -212,7 +212,7 @@ def targets(path: Path) -> set[str]:
 
 
 # lowest first: each folder includes only what comes before it, and cpu and cuda not each other
-CPP_ROOMS = ("core", "energies", "sweep", "rigid", "start", "coarse", "contact", "cpu", "cuda", "bind")
+CPP_ROOMS = ("core", "energies", "sweep", "contact", "subspace", "cpu", "cuda", "bind")
 SHARED = CPP_ROOMS[: CPP_ROOMS.index("cpu")]
 
 
@@ -223,7 +223,7 @@ def inclusions() -> set[tuple[str, str]]:
 
 @needs_csrc
 def test_shared_headers_know_no_torch() -> None:
-    for folder, files in {"core": 3, "energies": 3, "sweep": 3, "contact": 3, "rigid": 3, "start": 2}.items():
+    for folder, files in {"core": 3, "energies": 3, "sweep": 3, "contact": 3, "subspace": 3}.items():
         assert folder in SHARED
         paths = sources(folder)
         assert len(paths) >= files
@@ -278,14 +278,14 @@ def constant(path: str, name: str) -> int:
 def test_constants_agree_across_languages() -> None:
     assert ops.LANES == {"cpu": constant("core/views.h", "kLanes"), "cuda": constant("core/views.h", "kSlice")}
     assert ops.REST_SCALARS == constant("energies/tet.h", "rest")
-    assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
+    assert ops.PLAN_HEADER == constant("core/views.h", "kPlanHeader")
     assert coarse_arrays.ROW == constant("core/views.h", "kRow")
     twin = reference.coarse
-    lengths = code_of(CSRC / "coarse" / "length.h") + code_of(CSRC / "core" / "safeguards.h")
+    lengths = code_of(CSRC / "subspace" / "coarse.h") + code_of(CSRC / "core" / "safeguards.h")
     names = {"kFractions": twin.HALVINGS, "kDecrease": twin.DECREASE, "kRounding": twin.ROUNDING,
              "kFailures": twin.REFUSALS}  # fmt: skip
     assert {name: float(*re.findall(rf"{name} = ([\d.e-]+);", lengths)) for name in names} == names
-    matrix = code_of(CSRC / "coarse" / "matrix.h")
+    matrix = code_of(CSRC / "subspace" / "coarse_matrix.h")
     assert float(*re.findall(r"kCollapsed = ([\d.e-]+);", matrix)) == twin.LEAST_TURN
     assert memory.WORKSPACE_BUDGET == constant("bind/cuda/sweep.h", "kWorkspaceBudget")
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))

@@ -4,7 +4,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../start/part.h"
+#include "../subspace/begin.h"
 #include "material.h"
 #include "rigid.h"
 

@@ -5,8 +5,7 @@
 #include <limits>
 #include <vector>
 
-#include "../coarse/matrix.h"
-#include "../coarse/sums.h"
+#include "../subspace/coarse_matrix.h"
 #include "arguments.h"
 #include "fields.h"
 

@@ -1,8 +1,8 @@
 // The tensors of contact, as the operators of all backends take them.
 #pragma once
 
-#include "../contact/lag.h"
-#include "../contact/lowest.h"
+#include "../contact/friction.h"
+#include "../contact/islands.h"
 #include "../contact/passes.h"
 #include "arguments.h"
 #include "fields.h"

@@ -5,8 +5,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../contact/above_floor_reverse.h"
-#include "../contact/part.h"
+#include "../contact/above_floor.h"
+#include "../contact/start.h"
 #include "contact.h"
 
 namespace diffvbd {

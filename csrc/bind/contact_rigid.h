@@ -5,8 +5,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../contact/rigid_reverse.h"
-#include "../contact/rigid_tries.h"
+#include "../subspace/contact_rigid_reverse.h"
+#include "../subspace/contact_rigid.h"
 #include "contact_start.h"
 #include "rigid.h"
 

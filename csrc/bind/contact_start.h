@@ -4,9 +4,8 @@
 #include <tuple>
 
 #include "../contact/advance.h"
-#include "../contact/keep.h"
-#include "../contact/narrow.h"
-#include "../contact/translation.h"
+#include "../contact/pair_list.h"
+#include "../contact/islands.h"
 #include "contact_part.h"
 
 namespace diffvbd {

@@ -3,7 +3,7 @@
 
 #include <cmath>
 
-#include "../contact/candidates.h"
+#include "../contact/detection.h"
 #include "../contact/islands.h"
 #include "arguments.h"
 

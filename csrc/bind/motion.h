@@ -1,7 +1,7 @@
 // The tensors of motions and rooms of bodies, as the operators of all backends take them.
 #pragma once
 
-#include "../contact/rooms.h"
+#include "../contact/trust_region.h"
 #include "contact.h"
 #include "detection.h"
 

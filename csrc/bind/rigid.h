@@ -4,7 +4,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../rigid/reverse.h"
+#include "../subspace/rigid.h"
 #include "arguments.h"
 #include "fields.h"
 

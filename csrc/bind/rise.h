@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "../coarse/rise.h"
+#include "../subspace/coarse.h"
 #include "rigid.h"
 
 namespace diffvbd {

@@ -1,7 +1,7 @@
 // The tensors of the rooms of sweeps, as the operators of all backends take them.
 #pragma once
 
-#include "../contact/sweep_rooms.h"
+#include "../contact/trust_region.h"
 #include "arguments.h"
 
 namespace diffvbd {

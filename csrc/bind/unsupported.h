@@ -3,7 +3,7 @@
 
 #include <tuple>
 
-#include "../contact/unsupported.h"
+#include "../contact/residual_acceleration.h"
 #include "arguments.h"
 
 namespace diffvbd {

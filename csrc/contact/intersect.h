@@ -2,7 +2,7 @@
 // shows, and what a start must not have. By signs of volumes in double precision, of positions plus origins.
 #pragma once
 
-#include "candidates.h"
+#include "detection.h"
 
 namespace diffvbd::contact {
 

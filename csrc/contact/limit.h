@@ -3,6 +3,7 @@
 // down to 2^-7, or 0: it is decided, not differentiated (docs/method.md, section 12).
 #pragma once
 
+#include <cstdint>
 #include <limits>
 
 #include "pairs.h"
@@ -200,3 +201,24 @@ DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool carefu
 }
 
 }  // namespace diffvbd::contact
+
+namespace diffvbd {
+
+// A first answer to whether a pair can matter, of which most pairs need no second: by how far each of its vertices may
+// be from where gaps were taken.
+
+// By how much the gap of a pair may have shrunk since it was taken, at most. bound [V], of its scene. Infinity where a
+// corner is of a collider, whose gap may be of another time.
+template <class T>
+T most_closed(const int32_t* record, int32_t vertices, const T* bound) {
+  const int first = contact::sides(record[4]);
+  T most[2] = {T(0), T(0)};
+  for (int k = 0; k < 4; ++k) {
+    if (record[k] >= vertices) return std::numeric_limits<T>::infinity();
+    T& side = most[k < first ? 0 : 1];
+    side = side < bound[record[k]] ? bound[record[k]] : side;
+  }
+  return most[0] + most[1];
+}
+
+}  // namespace diffvbd

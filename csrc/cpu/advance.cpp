@@ -5,8 +5,8 @@
 #include <atomic>
 #include <vector>
 
-#include "bounds.h"
-#include "grain.h"
+#include "../contact/limit.h"
+#include "threads.h"
 
 namespace diffvbd {
 

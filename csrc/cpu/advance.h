@@ -2,7 +2,7 @@
 #pragma once
 
 #include "../contact/advance.h"
-#include "../contact/narrow.h"
+#include "../contact/pair_list.h"
 
 namespace diffvbd {
 

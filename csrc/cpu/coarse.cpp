@@ -4,7 +4,7 @@
 #include <cmath>
 #include <limits>
 
-#include "../coarse/line.h"
+#include "../subspace/coarse.h"
 
 namespace diffvbd {
 

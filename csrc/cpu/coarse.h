@@ -3,10 +3,10 @@
 
 #include <vector>
 
-#include "../coarse/views.h"
+#include "../subspace/coarse.h"
 #include "kernels.h"
 #include "run.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 

@@ -2,8 +2,8 @@
 
 #include <algorithm>
 
-#include "../contact/sent.h"
-#include "pair_batches.h"
+#include "../contact/passes.h"
+#include "near.h"
 
 namespace diffvbd {
 

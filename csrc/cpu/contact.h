@@ -3,7 +3,7 @@
 
 #include "kernels.h"
 #include "near.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 

@@ -1,17 +1,163 @@
+// Systems of rigid motions, whose matrices are of blocks of six, one for each two bodies.
 #include "contact_rigid.h"
 
 #include <torch/csrc/stable/ops.h>
 
 #include <algorithm>
+#include <bitset>
 #include <cmath>
+#include <cstdint>
 #include <limits>
+#include <numeric>
+#include <utility>
 #include <vector>
 
-#include "../contact/rigid_slip.h"
-#include "bounds.h"
-#include "cholesky.h"
+#include "../contact/limit.h"
+#include "../subspace/contact_rigid.h"
 
 namespace diffvbd {
+
+// The Cholesky factor of a matrix of blocks of six, in its lower triangle; what is no number says that it is not
+// positive definite. Blocks of zeros are left out: bodies touch few others.
+void cholesky(int64_t size, double* a);
+// b = factor^-T factor^-1 b
+void cholesky_solve(int64_t size, const double* a, double* b);
+
+void cholesky(int64_t size, double* a) {
+  constexpr int kBlock = contact::kUnknowns;
+  std::vector<double*> filled;  // rows of blocks below that on the diagonal
+  for (double *pivot = a, *end = a + size * size; pivot < end; pivot += kBlock * (size + 1)) {
+    for (int j = 0; j < kBlock; ++j) {
+      for (int i = j; i < kBlock; ++i) {
+        double sum = pivot[size * i + j];
+        for (int k = 0; k < j; ++k) sum -= pivot[size * i + k] * pivot[size * j + k];
+        pivot[size * i + j] = i == j ? std::sqrt(sum) : sum / pivot[size * j + j];
+      }
+    }
+    filled.clear();
+    for (double* block = pivot + kBlock * size; block < end; block += kBlock * size) {
+      bool any = false;
+      for (int i = 0; i < kBlock; ++i)
+        any = any || std::any_of(block + size * i, block + size * i + kBlock, [](double x) { return x != 0; });
+      if (any) filled.push_back(block);
+    }
+    for (double* block : filled) {
+      for (int i = 0; i < kBlock; ++i) {
+        double* row = block + size * i;
+        for (int j = 0; j < kBlock; ++j) {
+          double sum = row[j];
+          for (int k = 0; k < j; ++k) sum -= row[k] * pivot[size * j + k];
+          row[j] = sum / pivot[size * j + j];
+        }
+      }
+    }
+    for (size_t r = 0; r < filled.size(); ++r) {
+      for (size_t c = 0; c <= r; ++c) {
+        double* to = filled[r] + (filled[c] - pivot) / size;  // as far right as that is below
+        for (int i = 0; i < kBlock; ++i) {
+          for (int j = 0; j < kBlock; ++j) {
+            double sum = to[size * i + j];
+            for (int k = 0; k < kBlock; ++k) sum -= filled[r][size * i + k] * filled[c][size * j + k];
+            to[size * i + j] = sum;
+          }
+        }
+      }
+    }
+  }
+}
+
+void cholesky_solve(int64_t size, const double* a, double* b) {
+  for (int64_t i = 0; i < size; ++i) {
+    for (int64_t k = 0; k < i; ++k) b[i] -= a[size * i + k] * b[k];
+    b[i] /= a[size * i + i];
+  }
+  for (int64_t i = size - 1; i >= 0; --i) {
+    b[i] /= a[size * i + i];
+    for (int64_t k = 0; k < i; ++k) b[k] -= a[size * i + k] * b[i];
+  }
+}
+
+using namespace contact;
+
+namespace {
+
+// The order in which the bodies of a group are eliminated: always next the one that touches the fewest of those left,
+// and then these touch one another. touching [count]: a bit for each other body; left as it is then.
+std::vector<int32_t> elimination_order(std::vector<uint64_t>& touching) {
+  const auto count = static_cast<int32_t>(touching.size());
+  uint64_t left = count < 64 ? (uint64_t{1} << count) - 1 : ~uint64_t{0};
+  std::vector<int32_t> order;
+  while (left != 0) {
+    int32_t next = -1, fewest = 65;
+    for (int32_t k = 0; k < count; ++k) {
+      const auto degree = static_cast<int32_t>(std::bitset<64>(touching[k] & left).count());
+      if ((left >> k & 1) && degree < fewest) next = k, fewest = degree;
+    }
+    order.push_back(next);
+    left &= ~(uint64_t{1} << next);
+    const uint64_t rest = touching[next] & left;
+    for (int32_t k = 0; k < count; ++k) {
+      if (rest >> k & 1) touching[k] |= rest & ~(uint64_t{1} << k);
+    }
+  }
+  return order;
+}
+
+}  // namespace
+
+template <class T>
+void find_groups(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, int32_t* rows) {
+  const int32_t n = in.bodies();
+  std::vector<std::pair<int32_t, int32_t>> touching;
+  each_touching(in, scene, presses, [&](int32_t a, int32_t b) { touching.emplace_back(a, b); });
+  std::vector<int32_t> root(n), size(n, 0);
+  std::iota(root.begin(), root.end(), 0);
+  const auto root_of = [&](int32_t body) {
+    while (root[body] != body) body = root[body] = root[root[body]];
+    return body;
+  };
+  for (auto [a, b] : touching) {
+    a = root_of(a), b = root_of(b);
+    root[std::max(a, b)] = std::min(a, b);
+  }
+  for (int32_t k = 0; k < n; ++k) ++size[root_of(k)];
+  int32_t *member = rows, *first = rows + n, *rank = rows + 2 * n, *count = rows + 3 * n, place = 0;
+  std::fill_n(count, n, 0);
+  for (int32_t k = 0; k < n; ++k) {
+    const int32_t own = root_of(k);
+    const bool fits = size[own] <= most_grouped(n);
+    const int32_t lead = fits ? own : k;
+    if (lead == k) {
+      first[k] = place;
+      place += fits ? size[own] : 1;
+    }
+    first[k] = first[lead];
+    rank[k] = fits ? count[first[k]]++ : 0;
+    if (!fits) count[first[k]] = kLeft;
+    member[first[k] + rank[k]] = k;
+  }
+  std::vector<uint64_t> masks(n, 0);
+  for (const auto& [a, b] : touching) {
+    if (first[a] != first[b]) continue;
+    masks[first[a] + rank[a]] |= uint64_t{1} << rank[b];
+    masks[first[b] + rank[b]] |= uint64_t{1} << rank[a];
+  }
+  for (place = 0; place < n; ++place) {
+    if (count[place] <= kFew) continue;
+    std::vector<uint64_t> own(masks.begin() + place, masks.begin() + place + count[place]);
+    const std::vector<int32_t> before(member + place, member + place + count[place]), order = elimination_order(own);
+    for (int32_t i = 0; i < count[place]; ++i) {
+      member[place + i] = before[order[i]];
+      rank[member[place + i]] = i;
+    }
+  }
+}
+
+#define DIFFVBD_INSTANTIATE(T) \
+  template void find_groups<T>(const RigidInputs<T>&, int64_t, const std::vector<PairPress>&, int32_t*);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
 
 using namespace contact;
 using rigid::Body, rigid::Vector;

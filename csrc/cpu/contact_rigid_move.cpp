@@ -5,8 +5,8 @@
 #include <utility>
 #include <vector>
 
-#include "../contact/rigid_tries.h"
-#include "bounds.h"
+#include "../contact/limit.h"
+#include "../subspace/contact_rigid.h"
 #include "contact_rigid.h"
 
 namespace diffvbd {

@@ -1,8 +1,7 @@
 // The two hot loops of the CPU backend, chosen by a scene's energies and by what the processor can do.
 #pragma once
 
-#include "box_lanes.h"
-#include "pair_kernels.h"
+#include "contact_kernels.h"
 #include "scene.h"
 
 namespace diffvbd {

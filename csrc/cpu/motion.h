@@ -1,8 +1,9 @@
 // Motion and rooms of bodies on the CPU.
 #pragma once
 
-#include "../contact/coast.h"
-#include "../contact/rooms.h"
+#include "../contact/islands.h"
+#include "../contact/motion.h"
+#include "../contact/trust_region.h"
 
 namespace diffvbd {
 
@@ -21,5 +22,16 @@ void reverse_coast(const contact::MotionInputs<T>& in, double chord, const conta
 // Fills all that `work` points to.
 template <class T>
 void find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work);
+
+// Islands of bodies in contact, and sums over segments, on the CPU.
+
+// island [B, mesh_bodies]: the smallest body of each body's island, or -1 where the island must stay
+template <class T>
+void find_islands(const contact::IslandInputs<T>& in, int32_t* island);
+
+// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]), pairwise
+template <class T>
+void segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
+                 int64_t segments, int64_t c, T* out);
 
 }  // namespace diffvbd

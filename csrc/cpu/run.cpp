@@ -10,7 +10,7 @@
 #include "contact.h"
 #include "kernels.h"
 #include "message.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 namespace {

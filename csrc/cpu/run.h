@@ -2,8 +2,8 @@
 // colors.
 #pragma once
 
-#include "../coarse/views.h"
 #include "../contact/passes.h"
+#include "../subspace/coarse.h"
 #include "plan.h"
 #include "scene.h"
 

@@ -4,7 +4,7 @@
 #include <cuda_runtime_api.h>
 
 #include "../contact/advance.h"
-#include "../contact/narrow.h"
+#include "../contact/pair_list.h"
 
 namespace diffvbd::cuda {
 

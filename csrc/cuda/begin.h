@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../start/part.h"
+#include "../subspace/begin.h"
 #include "bodies.h"
 
 namespace diffvbd::cuda {

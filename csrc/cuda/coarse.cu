@@ -1,5 +1,5 @@
 // The launches of a coarse correction: gradient, restriction, solve, prolongation, length, motion; and back.
-#include "../coarse/line.h"
+#include "../subspace/coarse.h"
 #include "bodies.cuh"
 #include "coarse.h"
 #include "group.cuh"

@@ -2,8 +2,8 @@
 // of a step. No torch here.
 #pragma once
 
-#include "../coarse/length.h"
-#include "../coarse/matrix.h"
+#include "../subspace/coarse.h"
+#include "../subspace/coarse_matrix.h"
 #include "step.h"
 
 namespace diffvbd::cuda {

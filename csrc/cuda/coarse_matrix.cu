@@ -1,5 +1,5 @@
 // The matrices of a step and their inverses, body by body, and the transpose.
-#include "../coarse/line.h"
+#include "../subspace/coarse.h"
 #include "bodies.cuh"
 #include "coarse.h"
 

@@ -1,7 +1,7 @@
 // Contact on the device: launchers of the passes of contact/passes.h, for a chunk of scenes.
 #pragma once
 
-#include "../contact/lag.h"
+#include "../contact/friction.h"
 #include "../contact/passes.h"
 #include "step.h"
 

@@ -2,7 +2,7 @@
 // a warp for each corner point.
 #pragma once
 
-#include "../contact/lag.h"
+#include "../contact/friction.h"
 #include "clear_rows.cuh"
 #include "contact.cuh"
 

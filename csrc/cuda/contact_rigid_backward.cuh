@@ -1,7 +1,7 @@
 // The adjoint of a rigid correction on the device: what threads do for pairs, corner points and groups.
 #pragma once
 
-#include "../contact/rigid_reverse.h"
+#include "../subspace/contact_rigid_reverse.h"
 #include "cholesky.cuh"
 #include "contact_rigid.cuh"
 

@@ -1,6 +1,6 @@
 // The rigid correction where few bodies are solved for together: all of Newton's method in one launch, a block for each
 // group.
-#include "../contact/rigid_slip.h"
+#include "../subspace/contact_rigid.h"
 #include "cholesky.cuh"
 #include "contact_rigid_presses.cuh"
 #include "contact_rigid_rows.cuh"

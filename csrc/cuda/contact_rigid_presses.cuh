@@ -1,7 +1,7 @@
 // What pairs press in a rigid correction, for whoever adds it up: barriers as they were stored, friction as bodies go.
 #pragma once
 
-#include "../contact/rigid_slip.h"
+#include "../subspace/contact_rigid.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {

@@ -2,7 +2,7 @@
 // bodies.
 #pragma once
 
-#include "../contact/rigid_rub.h"
+#include "../subspace/contact_rigid.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {

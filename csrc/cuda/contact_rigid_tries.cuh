@@ -2,7 +2,7 @@
 // and scenes.
 #pragma once
 
-#include "../contact/rigid_tries.h"
+#include "../subspace/contact_rigid.h"
 #include "contact_rigid.cuh"
 #include "ordered.cuh"
 #include "union.cuh"

@@ -2,7 +2,7 @@
 // planes let pass of it. All of a color read where it was before any of it moved, so no vertex waits for another.
 #pragma once
 
-#include "../contact/sent.h"
+#include "../contact/passes.h"
 #include "contact_near.cuh"
 #include "contact_rows.cuh"
 

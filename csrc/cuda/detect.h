@@ -3,7 +3,7 @@
 
 #include <cuda_runtime.h>
 
-#include "../contact/candidates.h"
+#include "../contact/detection.h"
 
 namespace diffvbd::cuda {
 

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/keep.h"
+#include "../contact/pair_list.h"
 
 namespace diffvbd::cuda {
 

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/lowest.h"
+#include "../contact/islands.h"
 
 namespace diffvbd::cuda {
 

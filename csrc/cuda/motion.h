@@ -3,8 +3,8 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/coast.h"
-#include "../contact/rooms.h"
+#include "../contact/motion.h"
+#include "../contact/trust_region.h"
 
 namespace diffvbd::cuda {
 

@@ -3,8 +3,8 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/above_floor_reverse.h"
-#include "../contact/part.h"
+#include "../contact/above_floor.h"
+#include "../contact/start.h"
 
 namespace diffvbd::cuda {
 

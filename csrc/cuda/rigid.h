@@ -3,7 +3,7 @@
 
 #include <cuda_runtime.h>
 
-#include "../rigid/reverse.h"
+#include "../subspace/rigid.h"
 #include "bodies.h"
 
 namespace diffvbd::cuda {

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../coarse/rise.h"
+#include "../subspace/coarse.h"
 
 namespace diffvbd::cuda {
 

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/translation.h"
+#include "../contact/islands.h"
 
 namespace diffvbd::cuda {
 

@@ -4,9 +4,9 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../coarse/views.h"
+#include "../subspace/coarse.h"
 #include "../contact/passes.h"
-#include "../core/plan_views.h"
+#include "../core/views.h"
 #include "../energies/energies.h"
 
 namespace diffvbd::cuda {

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/sweep_rooms.h"
+#include "../contact/trust_region.h"
 
 namespace diffvbd::cuda {
 

@@ -4,7 +4,7 @@
 
 #include <cub/device/device_radix_sort.cuh>
 
-#include "../contact/candidates.h"
+#include "../contact/detection.h"
 #include "exchange.cuh"
 #include "ordered.cuh"
 

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/unsupported.h"
+#include "../contact/residual_acceleration.h"
 
 namespace diffvbd::cuda {
 

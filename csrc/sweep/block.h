@@ -1,12 +1,22 @@
-// The system of one vertex: what its update reads, its gradient and its 3x3 block.
+// What contact brings to a block update: the part that pairs add to the block, computed color by color before the color
+// moves (contact/passes.h). What keeps surfaces apart comes after the update (contact/limit.h).
 #pragma once
 
 #include "../core/frame.h"
+#include "../core/vec.h"
 #include "../core/views.h"
 #include "../energies/energies.h"
-#include "contact_term.h"
 
 namespace diffvbd {
+
+template <class R>
+struct ContactTerm {
+  Vec3<R> g;
+  Sym3<R> H;
+};
+constexpr int kContactScalars = 9;
+
+// The system of one vertex: what its update reads, its gradient and its 3x3 block.
 
 // Everything one block update reads besides its star.
 template <class R>

@@ -8,7 +8,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cpu/bodies.h"
+#include "../../cpu/threads.h"
 #include "../rigid.h"
 #include "sweep.h"
 

@@ -6,8 +6,7 @@
 #include <vector>
 
 #include "../../cpu/detect.h"
-#include "../../cpu/intersect.h"
-#include "../../cpu/islands.h"
+#include "../../cpu/motion.h"
 #include "../detection.h"
 
 namespace {

@@ -3,7 +3,7 @@
 
 #include <torch/csrc/stable/library.h>
 
-#include "../../cpu/bodies.h"
+#include "../../cpu/threads.h"
 #include "sweep.h"
 
 namespace {

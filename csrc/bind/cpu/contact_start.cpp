@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "../../cpu/advance.h"
-#include "../../cpu/grain.h"
+#include "../../cpu/threads.h"
 #include "sweep.h"
 
 namespace {

@@ -6,7 +6,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../../cpu/bodies.h"
+#include "../../cpu/threads.h"
 #include "sweep.h"
 
 namespace {

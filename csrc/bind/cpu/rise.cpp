@@ -7,7 +7,7 @@
 #include <limits>
 #include <vector>
 
-#include "../../cpu/bodies.h"
+#include "../../cpu/threads.h"
 #include "../../cpu/kernels.h"
 #include "sweep.h"
 

@@ -5,7 +5,7 @@
 
 #include <vector>
 
-#include "../../cpu/grain.h"
+#include "../../cpu/threads.h"
 #include "sweep.h"
 
 namespace {
