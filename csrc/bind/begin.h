@@ -53,14 +53,14 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
                          in.bodies.data_count[0] <= FloorStart::kMostPlanes * FloorBarrier::stride),
           "diffvbd::begin: expected 1 to 8 planes");
   in.pinned = data<const bool>(t.pinned);
-  in.falls = data<const uint8_t>(falls);
+  in.from_predictor = data<const uint8_t>(falls);
   in.alone = alone.numel() > 0 ? data<const uint8_t>(alone) : nullptr;
   in.others = others;
   in.from = static_cast<int>(q.from);
   in.some_alone = t.order.numel() < v;
   in.filters = q.filters;
   require(q.chord != 0, "diffvbd::begin: expected chord other than 0");
-  in.chord = q.chord;
+  in.lookback = q.chord;
   in.parameters.time_step = T(q.time_step);
   in.parameters.filter_eta = T(q.filter_eta);
   return in;

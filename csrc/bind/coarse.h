@@ -44,7 +44,7 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const Set
   in.factor = {data<const T>(f.coarse_factor), 9 * cells, 1};
   in.mass = batched<T>("coarse_mass", f.coarse_mass, x, b, cells);
   in.keeps_positions = keeps_positions(given.energies);
-  in.pressed = has_vertex_energy(given.energies);
+  in.has_vertex_blocks = has_vertex_energy(given.energies);
   in.corrections = coarse::corrections_of(given.sweeps, p.every, p.begun);
   return in;
 }

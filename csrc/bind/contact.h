@@ -44,7 +44,7 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
   }
   require_like("center", t.center, x, 3 * b * v);
   require_like("room", t.room, x, b * v);
-  in.center = data<const T>(t.center), in.room = data<const T>(t.room);
+  in.center = data<const T>(t.center), in.trust_radius = data<const T>(t.room);
   in.x_prev = x_prev;
   in.origin = origin;
   in.friction_eps = static_cast<T>(friction_eps);
@@ -78,7 +78,7 @@ contact::LagCoefficients<T> lag_coefficients(const Tensor& friction, const Tenso
 }
 
 template <class T>
-contact::RubbingBars<T> rubbing_bars(const Tensor& lag, const Tensor& push, const Tensor& x, int64_t corners,
+contact::LaggedFrictionBars<T> rubbing_bars(const Tensor& lag, const Tensor& push, const Tensor& x, int64_t corners,
                                      int64_t pairs) {
   if (lag.numel()) require_like("lag_bar", lag, x, pairs * contact::kLagScalars);
   if (push.numel()) require_like("push_bar", push, x, x.size(0) * corners * 3);
@@ -86,14 +86,14 @@ contact::RubbingBars<T> rubbing_bars(const Tensor& lag, const Tensor& push, cons
 }
 
 template <class T>
-contact::LowestInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
+contact::SupportVertexInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
                                        const Tensor& body_order, const Tensor& body_ptr, const Tensor& island) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), bodies = body_ptr.numel() - 1;
   require(bodies >= 0 && is_index(body_order, x) && is_index(body_ptr, x) && is_index(island, x) &&
               body_order.numel() == v && island.numel() == b * bodies,
           "diffvbd::contact_lowest: expected bodies of x and their islands");
-  contact::LowestInputs<T> in{};
+  contact::SupportVertexInputs<T> in{};
   const int64_t scalars = planes.dim() > 0 && planes.size(0) > 0 ? planes.numel() / planes.size(0) : 0;
   require(scalars > 0 && scalars % contact::kPlaneScalars == 0,
           "diffvbd::contact_lowest: expected planes [scenes, 7 planes]");

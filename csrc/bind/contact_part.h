@@ -67,13 +67,13 @@ contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u
   contact::AboveFloorInputs<T> in{};
   in.scene = body_inputs<T>(x, order, ptr);
   in.scene.origin = batched_or_null<T>("origin", origin, x, x.size(0), 3 * x.size(1));
-  in.way = vectors<T>("way", way, x);
+  in.displacement = vectors<T>("way", way, x);
   if (u.numel() > 0) in.u = like_x<T>("u", u, x, 3 * in.scene.scenes * in.scene.bodies);
   in.floor = floor_of<T>(planes, x, in.planes);
   in.planes /= contact::kPlaneScalars;
   require(is_beside(held, x, ScalarType::Bool) && held.numel() >= x.size(1),
           "diffvbd::contact_above_floor: expected held bool of at least the vertices");
-  in.held = data<const bool>(held);
+  in.pinned = data<const bool>(held);
   return in;
 }
 
@@ -86,8 +86,8 @@ contact::StartInputs<T> start_inputs(const Tensor& x, const IndexTensors& index)
   contact::StartInputs<T> in{};
   in.scene = body_inputs<T>(x, index.order, index.ptr);
   require_of_vertices(index.held, index.body, x);
-  in.held = data<const bool>(index.held), in.body = data<const int32_t>(index.body);
-  in.held_bodies = of_dtype<bool>("held_bodies", index.held_bodies, ScalarType::Bool, x, in.scene.bodies);
+  in.pinned = data<const bool>(index.held), in.body = data<const int32_t>(index.body);
+  in.pinned_bodies = of_dtype<bool>("held_bodies", index.held_bodies, ScalarType::Bool, x, in.scene.bodies);
   return in;
 }
 
@@ -125,7 +125,7 @@ struct PartOperators {
       using T = decltype(scalar);
       const auto in = above_floor_inputs<T>(x, u, way, planes, origin, held, order, ptr);
       Tensor left = place.like_x(), stopped = place.make({in.scene.scenes, in.scene.bodies}, ScalarType::Bool);
-      place.bodies(contact::AboveFloorWays<T>{in, data<T>(left), data<bool>(stopped)});
+      place.bodies(contact::AboveFloorDisplacements<T>{in, data<T>(left), data<bool>(stopped)});
       return T2(left, stopped);
     });
   }
@@ -201,7 +201,7 @@ struct PartOperators {
       in.scene.scenes = way.size(0), in.scene.vertices = static_cast<int32_t>(way.size(1));
       const int64_t rows = in.scene.scenes * in.scene.vertices;
       Tensor way_out = place.like_x(), state_out = place.make({way.size(0), way.size(1)}, ScalarType::Byte);
-      place.vertices(contact::Holds<T>{
+      place.vertices(contact::Freeze<T>{
           in, data<const T>(way), of_dtype<uint8_t>("state", state, ScalarType::Byte, way, rows),
           of_dtype<bool>("rises", rises, ScalarType::Bool, way, rows), data<T>(way_out), data<uint8_t>(state_out)});
       return T2(way_out, state_out);
@@ -215,9 +215,9 @@ struct PartOperators {
       using T = decltype(scalar);
       auto in = start_inputs<T>(base, {held, held_bodies, body, order, ptr});
       const int64_t rows = in.scene.scenes * in.scene.vertices;
-      in.share = like_x<T>("share", share, base, rows);
+      in.fraction = like_x<T>("share", share, base, rows);
       Tensor to = place.like_x(), state_out = place.make({base.size(0), base.size(1)}, ScalarType::Byte);
-      place.bodies(contact::HeldUp<T>{in, data<const T>(base), vectors<T>("way", way, base),
+      place.bodies(contact::BlockedBodies<T>{in, data<const T>(base), vectors<T>("way", way, base),
                                       of_dtype<uint8_t>("state", state, ScalarType::Byte, base, rows), data<T>(to),
                                       data<uint8_t>(state_out)});
       return T2(to, state_out);
@@ -234,9 +234,9 @@ struct PartOperators {
       auto in = start_inputs<T>({x, move, u, left, frames, planes, origin}, {held, held_bodies, body, order, ptr},
                                 filter_eta);
       const int64_t rows = in.scene.scenes * in.scene.vertices;
-      in.fall = vectors<T>("fall", fall, x), in.share = like_x<T>("share", share, x, rows);
+      in.gravity_move = vectors<T>("fall", fall, x), in.fraction = like_x<T>("share", share, x, rows);
       Tensor went = place.make({x.size(0), x.size(1)}), at = place.like_x(), way = place.like_x();
-      place.vertices(contact::Falls<T>{in, of_dtype<uint8_t>("state", state, ScalarType::Byte, x, rows), data<T>(went),
+      place.vertices(contact::GravityMoves<T>{in, of_dtype<uint8_t>("state", state, ScalarType::Byte, x, rows), data<T>(went),
                                        data<T>(at), data<T>(way)});
       return T3(went, at, way);
     });
@@ -252,8 +252,8 @@ struct PartOperators {
       auto in = start_inputs<T>({x, move, u, left, frames, planes, origin}, {held, held_bodies, body, order, ptr},
                                 filter_eta);
       const int64_t b = in.scene.scenes, v = in.scene.vertices;
-      in.fall = vectors<T>("fall", fall, x);
-      in.share = like_x<T>("share", share, x, b * v), in.last_share = like_x<T>("last_share", last_share, x, b * v);
+      in.gravity_move = vectors<T>("fall", fall, x);
+      in.fraction = like_x<T>("share", share, x, b * v), in.last_fraction = like_x<T>("last_share", last_share, x, b * v);
       Tensor end = place.like_x(), is_short = place.make({b, v}, ScalarType::Bool);
       place.vertices(contact::Starts<T>{in,
                                         of_dtype<bool>("stopped", stopped, ScalarType::Bool, x, b * in.scene.bodies),
@@ -273,8 +273,8 @@ struct PartOperators {
       auto in = start_inputs<T>({x, move, u, left, frames, planes, origin}, {held, held_bodies, body, order, ptr},
                                 filter_eta);
       const int64_t b = in.scene.scenes, v = in.scene.vertices;
-      in.fall = vectors<T>("fall", fall, x);
-      in.share = like_x<T>("share", share, x, b * v), in.last_share = like_x<T>("last_share", last_share, x, b * v);
+      in.gravity_move = vectors<T>("fall", fall, x);
+      in.fraction = like_x<T>("share", share, x, b * v), in.last_fraction = like_x<T>("last_share", last_share, x, b * v);
       Tensor out[5] = {place.like_x(), place.like_x(), place.like_x(), place.like_x(), place.like_x()};
       Tensor planes_bar = place.make({b, v, wants_planes ? in.floor_scalars : 0});
       place.vertices(contact::ReverseStarts<T>{

@@ -36,12 +36,12 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
   gate.origin = in.scene.origin.data;
   require_like("center", t.center, t.x, 3 * b * v);
   require_like("room", t.room, t.x, b * v);
-  gate.center = data<const T>(t.center), gate.room = data<const T>(t.room);
+  gate.center = data<const T>(t.center), gate.trust_radius = data<const T>(t.room);
   require_like("collider", t.collider, t.x, 3 * b * colliders);
   require_like("collider_prev", t.collider_prev, t.x, 3 * b * colliders);
   gate.collider = gate.collider_next = data<const T>(t.collider);
   in.collider_prev = data<const T>(t.collider_prev);
-  gate.held = data<const bool>(t.held), gate.body = data<const int32_t>(t.body);
+  gate.pinned = data<const bool>(t.held), gate.body = data<const int32_t>(t.body);
   gate.listed = pair_list(t.pairs, t.pair_ptr, t.pair_entry, t.x, corners);
   require_like("constants", t.constants, t.x, t.pairs.size(0) * contact::kConstants);
   gate.constants = data<const T>(t.constants);
@@ -64,7 +64,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
             "diffvbd::contact_rigid: expected groups int32 [scenes, 4, bodies]");
     in.groups = data<const int32_t>(groups);
   }
-  in.room = contact::most_grouped(bodies);
+  in.capacity = contact::most_grouped(bodies);
   in.has_friction = 0 < friction_eps;
   in.friction_eps = in.has_friction ? friction_eps : 1;
   return in;
@@ -83,7 +83,7 @@ inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies, bool al
 // Inputs of a system in which the bodies of a mask move, or, if that is empty, all.
 template <class T>
 contact::RigidInputs<T> moving_inputs(contact::RigidInputs<T> in, const Tensor& moving, bool alone, const Tensor& x) {
-  if (!in.together()) in.room = room_of_groups(in.bodies(), alone);
+  if (!in.together()) in.capacity = room_of_groups(in.bodies(), alone);
   const bool all = moving.dim() == 1 && moving.size(0) == 0;
   require(is_beside(moving, x, ScalarType::Bool) &&
               (all || (moving.dim() == 2 && moving.size(0) == in.scene.scenes && moving.size(1) == in.bodies())),
@@ -205,7 +205,7 @@ struct RigidReverseTensors {
 // What a reverse solves with, of a forward with these groups; `in` learns how it is stored.
 template <class T>
 void require_factor(contact::RigidInputs<T>& in, const Tensor& factor, const Tensor& x) {
-  if (!in.together() && factor.dim() == 4) in.room = factor.size(3) / contact::kUnknowns;
+  if (!in.together() && factor.dim() == 4) in.capacity = factor.size(3) / contact::kUnknowns;
   require(is_beside(factor, x, ScalarType::Double) && factor.numel() == in.scene.scenes * in.matrix_size() &&
               (in.scene.scenes == 0 || in.together() == (in.groups == nullptr)),
           "diffvbd::contact_rigid: expected factor and groups as contact_rigid_system returns them");

@@ -36,13 +36,13 @@ contact::TranslationInputs<T> translation_inputs(const TranslationTensors& t) {
     require(in.floor.num_planes <= contact::kMostPlanes && is_index(t.lowest, t.x) &&
                 t.lowest.numel() == b * bodies * in.floor.num_planes,
             "diffvbd::contact_translation: expected the lowest vertices of at most 8 planes");
-    in.lowest = data<const int32_t>(t.lowest);
+    in.support_vertex = data<const int32_t>(t.lowest);
   }
   in.move = data<const T>(t.move);
   const auto mass = batched<T>("mass", t.mass, t.x, b, v);
   in.mass = mass.data;
   in.mass_scene = mass.scene;
-  in.held = data<const bool>(t.held);
+  in.pinned = data<const bool>(t.held);
   in.body_order = data<const int32_t>(t.body_order);
   in.body_ptr = data<const int32_t>(t.body_ptr);
   in.island = data<const int32_t>(t.island);
@@ -77,11 +77,11 @@ contact::AdvanceInputs<T> advance_inputs(const AdvanceTensors& t) {
   require_like("collider_next", t.collider_next, t.x, b * colliders * 3);
   require_like("room", t.room, t.x, b * v);
   in.collider = data<const T>(t.collider), in.collider_next = data<const T>(t.collider_next);
-  in.held = data<const bool>(t.held), in.body = data<const int32_t>(t.body), in.room = data<const T>(t.room);
+  in.pinned = data<const bool>(t.held), in.body = data<const int32_t>(t.body), in.trust_radius = data<const T>(t.room);
   if (t.own_room.numel() > 0) {
     require_vectors(t.own_center, t.x);
     require_like("own_room", t.own_room, t.x, b * v);
-    in.own_center = data<const T>(t.own_center), in.own_room = data<const T>(t.own_room);
+    in.deformation_center = data<const T>(t.own_center), in.deformation_radius = data<const T>(t.own_room);
   }
   in.listed = pair_list(t.pairs, t.ptr, t.entry, t.x, v + colliders);
   require_like("constants", t.constants, t.x, t.pairs.size(0) * contact::kConstants);
@@ -93,7 +93,7 @@ contact::AdvanceInputs<T> advance_inputs(const AdvanceTensors& t) {
 }
 
 template <class T>
-contact::NarrowInputs<T> narrow_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider,
+contact::GapInputs<T> narrow_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider,
                                        const Tensor& room, const Tensor& pairs, const Tensor& constants,
                                        const Tensor& ptr) {
   require_vectors(x, x);
@@ -104,8 +104,8 @@ contact::NarrowInputs<T> narrow_inputs(const Tensor& x, const Tensor& origin, co
               ptr.numel() == b * (v + colliders) + 1,
           "diffvbd::contact_narrow: expected pairs and ptr made by contact_detect for this batch");
   require_like("constants", constants, x, pairs.size(0) * contact::kConstants);
-  contact::NarrowInputs<T> in{};
-  in.x = data<const T>(x), in.collider = data<const T>(collider), in.room = data<const T>(room);
+  contact::GapInputs<T> in{};
+  in.x = data<const T>(x), in.collider = data<const T>(collider), in.trust_radius = data<const T>(room);
   in.origin = batched_or_null<T>("origin", origin, x, b, 3 * v).data;
   in.pairs = data<const int32_t>(pairs), in.constants = data<const T>(constants);
   in.vertices = static_cast<int32_t>(v), in.colliders = static_cast<int32_t>(colliders);
@@ -124,7 +124,7 @@ struct KeptLists {
         ptr(make({ptr_of_all.numel()}, ScalarType::Int)),
         entry(make({4 * capacity}, ScalarType::Int)) {}
   template <class T>
-  contact::Kept<T> pointers() const {
+  contact::CompactList<T> pointers() const {
     return {data<int64_t>(rows),  data<int32_t>(pairs), data<int32_t>(ptr),
             data<int32_t>(entry), data<T>(constants),   pairs.size(0)};
   }
@@ -132,7 +132,7 @@ struct KeptLists {
 };
 
 template <class T>
-contact::KeepInputs<T> keep_inputs(const Tensor& keep, const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+contact::CompactInputs<T> keep_inputs(const Tensor& keep, const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
                                    const Tensor& entry) {
   require(pairs.dim() == 2 && pairs.size(1) == contact::kPairRow && is_index(pairs, constants) &&
               is_index(ptr, constants) && is_index(entry, constants) && ptr.numel() > 0 &&

@@ -55,7 +55,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   require_countable(b * n + 1, "contact: too large, expected at most 2^31 corner points in all scenes");
   out.x = data<const T>(x), out.origin = origin.numel() > 0 ? data<const T>(origin) : nullptr;
   out.collider = data<const T>(collider), out.collider_next = data<const T>(collider_next);
-  out.rest = data<const T>(rest), out.radius = data<const T>(radius), out.held = data<const bool>(held);
+  out.rest = data<const T>(rest), out.radius = data<const T>(radius), out.pinned = data<const bool>(held);
   out.scenes = b;
   out.vertices = static_cast<int32_t>(v), out.corners = static_cast<int32_t>(n);
   out.num_triangles = static_cast<int32_t>(triangles.size(0)), out.num_edges = static_cast<int32_t>(edges.size(0));
@@ -76,7 +76,7 @@ void set_reach(contact::Surfaces<T>& surfaces, const Tensor& x, const Tensor& ro
                 "contact: expected room like x, of shape [B, mesh_bodies + 1]");
   require_shape(own_room, x, x.scalar_type(), {surfaces.scenes, int64_t{surfaces.mesh_bodies} + 1},
                 "contact: expected own_room like x, of shape [B, mesh_bodies + 1]");
-  surfaces.room = data<const T>(room), surfaces.own_room = data<const T>(own_room),
+  surfaces.trust_radius = data<const T>(room), surfaces.deformation_radius = data<const T>(own_room),
   surfaces.dhat = static_cast<T>(dhat);
 }
 
@@ -118,11 +118,11 @@ contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, co
   out.collider = data<const T>(collider), out.collider_next = data<const T>(collider_next);
   out.radius = data<const T>(radius), out.planes = data<const int32_t>(planes), out.body = data<const int32_t>(body);
   out.body_order = data<const int32_t>(body_order), out.body_ptr = data<const int32_t>(body_ptr);
-  out.held = data<const bool>(held);
+  out.pinned = data<const bool>(held);
   out.scenes = b, out.vertices = static_cast<int32_t>(v), out.corners = static_cast<int32_t>(n);
   out.num_planes = static_cast<int32_t>(planes.size(0)), out.mesh_bodies = static_cast<int32_t>(mesh_bodies);
   require_shape(room, x, real, {b, mesh_bodies + 1}, "contact_islands: expected room like x, of shape [B, NB + 1]");
-  out.room = data<const T>(room), out.half = static_cast<T>(dhat / 2);
+  out.trust_radius = data<const T>(room), out.half = static_cast<T>(dhat / 2);
   out.any_direction = any_direction;
   return out;
 }

@@ -25,7 +25,7 @@ contact::MotionInputs<T> motion_inputs(const MotionTensors& t) {
   in.x = data<const T>(t.x), in.move = data<const T>(t.move);
   in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v);
   in.mass = batched<T>("mass", t.mass, t.x, b, v);
-  in.held = data<const bool>(t.held);
+  in.pinned = data<const bool>(t.held);
   in.order = data<const int32_t>(t.order), in.ptr = data<const int32_t>(t.ptr);
   in.scenes = b;
   in.vertices = static_cast<int32_t>(v), in.bodies = static_cast<int32_t>(t.ptr.numel() - 1);
@@ -37,10 +37,10 @@ contact::MotionInputs<T> motion_inputs(const MotionTensors& t, const Tensor& fal
   auto in = motion_inputs<T>(t);
   require(is_beside(held_bodies, t.x, ScalarType::Bool) && held_bodies.numel() == in.bodies,
           "diffvbd::contact_motion: expected held_bodies bool [bodies]");
-  in.held_bodies = data<const bool>(held_bodies);
+  in.pinned_bodies = data<const bool>(held_bodies);
   if (fall.numel() > 0) {
     require_like("fall", fall, t.x, t.x.numel());
-    in.fall = data<const T>(fall);
+    in.gravity_move = data<const T>(fall);
   }
   return in;
 }
@@ -71,23 +71,23 @@ inline int64_t planes_of(const Tensor& floor) {
 }
 
 template <class T>
-contact::RoomInputs<T> room_inputs(const contact::MotionInputs<T>& motion, const contact::IslandInputs<T>& islands,
+contact::RadiusInputs<T> room_inputs(const contact::MotionInputs<T>& motion, const contact::IslandInputs<T>& islands,
                                    const Tensor& x, const RoomTensors& t, const RoomNumbers& numbers) {
   const int64_t b = motion.scenes, bodies = motion.bodies;
   require_like("rigid", t.rigid, x, x.numel());
-  require_like("ways", t.ways, x, contact::kWays * b * bodies);
+  require_like("ways", t.ways, x, contact::kDisplacements * b * bodies);
   require_like("sums", t.sums, x, 4 * b * bodies);
   for (const Tensor* room : {&t.most, &t.most_alone, &t.most_own, &t.least_own}) {
     require_like("rooms of bodies", *room, x, bodies);
   }
-  contact::RoomInputs<T> in{};
+  contact::RadiusInputs<T> in{};
   in.motion = motion, in.islands = islands;
-  in.rigid = data<const T>(t.rigid), in.ways = data<const T>(t.ways), in.sums = data<const T>(t.sums);
+  in.rigid = data<const T>(t.rigid), in.displacements = data<const T>(t.ways), in.sums = data<const T>(t.sums);
   in.most = data<const T>(t.most), in.most_alone = data<const T>(t.most_alone);
   in.most_own = data<const T>(t.most_own), in.least_own = data<const T>(t.least_own);
   in.floor_planes = static_cast<int32_t>(planes_of(t.floor));
   in.floor = batched_or_null<T>("floor", t.floor, x, b, int64_t{in.floor_planes} * contact::kPlaneScalars);
-  in.share = static_cast<T>(numbers.share), in.least = static_cast<T>(numbers.least);
+  in.fraction = static_cast<T>(numbers.share), in.least = static_cast<T>(numbers.least);
   in.dhat = static_cast<T>(numbers.dhat), in.self_contact = numbers.self_contact;
   return in;
 }
@@ -104,15 +104,15 @@ struct RoomResults {
         over(make({b, bodies})),
         work(make({b * (planes * contact::kPlaneScalars + 1 + 3 * bodies)})) {}
   template <class T>
-  contact::RoomWork<T> pointers(const contact::RoomInputs<T>& in) const {
+  contact::RadiusWork<T> pointers(const contact::RadiusInputs<T>& in) const {
     const int64_t scenes = in.motion.scenes, rows = scenes * in.motion.bodies;
-    contact::RoomWork<T> out{};
+    contact::RadiusWork<T> out{};
     T* at = data<T>(work);
     const auto take = [&](T*& pointer, int64_t count) { pointer = at, at += count; };
     take(out.planes, scenes * in.planes() * contact::kPlaneScalars), take(out.pushed, scenes);
     take(out.stopped, rows), take(out.bent, rows), take(out.most, rows);
     out.island = data<int32_t>(island);
-    out.room = data<T>(room), out.own_room = data<T>(own_room), out.over = data<T>(over);
+    out.trust_radius = data<T>(room), out.deformation_radius = data<T>(own_room), out.over = data<T>(over);
     return out;
   }
   std::tuple<Tensor, Tensor, Tensor, Tensor> tensors() const { return {island, room, own_room, over}; }

@@ -9,10 +9,10 @@
 namespace diffvbd {
 
 template <class T>
-coarse::RiseInputs<T> rise_inputs(const RigidFields& f, const Tensor& to, const Tensor& material, const Tensor& rest,
+coarse::IncreaseInputs<T> rise_inputs(const RigidFields& f, const Tensor& to, const Tensor& material, const Tensor& rest,
                                   const Tensor& corner, const Tensor& block_ptr, const std::vector<int64_t>& data_count,
                                   double time_step) {
-  coarse::RiseInputs<T> in{};
+  coarse::IncreaseInputs<T> in{};
   in.bodies = rigid_inputs<T>(f, data_count, time_step, false);
   require_like("to", to, f.x, f.x.numel());
   require(is_index(corner, f.x) && corner.dim() == 3 && corner.size(1) == 4 && corner.size(2) == coarse::kBlockTets &&

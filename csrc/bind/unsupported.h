@@ -14,8 +14,8 @@ struct UnsupportedTensors {
 };
 
 template <class T>
-contact::UnsupportedInputs<T> unsupported_inputs(const UnsupportedTensors& t, double time_step) {
-  contact::UnsupportedInputs<T> in{};
+contact::ResidualInputs<T> unsupported_inputs(const UnsupportedTensors& t, double time_step) {
+  contact::ResidualInputs<T> in{};
   require_positions(t.x);
   const int64_t b = t.x.size(0), v = t.x.size(1), bodies = t.body_ptr.numel() - 1;
   require(
@@ -30,8 +30,8 @@ contact::UnsupportedInputs<T> unsupported_inputs(const UnsupportedTensors& t, do
   in.scene.scenes = b;
   in.scene.vertices = static_cast<int32_t>(v), in.scene.bodies = static_cast<int32_t>(bodies);
   in.scene.time_step = time_step;
-  in.held_bodies = data<const bool>(t.held_bodies);
-  in.lift = batched<T>("lift", t.lift, t.x, b, 3 * v);
+  in.pinned_bodies = data<const bool>(t.held_bodies);
+  in.h2_a = batched<T>("lift", t.lift, t.x, b, 3 * v);
   require(t.force.dim() == 3 && t.force.size(0) == b && t.force.size(1) >= v && t.force.size(2) == 3 &&
               is_like(t.force, t.x),
           "diffvbd::contact_unsupported: expected force like x, [scenes, corner points, 3]");
@@ -49,7 +49,7 @@ contact::UnsupportedInputs<T> unsupported_inputs(const UnsupportedTensors& t, do
 struct UnsupportedBars {
   Tensor x, lift, force, mass, planes;
   template <class T, class Empty, class Zeros>
-  UnsupportedBars(const contact::UnsupportedInputs<T>& in, bool wants_planes, const Empty& empty, Zeros&& zeros)
+  UnsupportedBars(const contact::ResidualInputs<T>& in, bool wants_planes, const Empty& empty, Zeros&& zeros)
       : x(empty({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, 3})),
         lift(empty({in.scene.scenes, in.scene.vertices, 3})),
         force(zeros({in.scene.scenes, in.corners, 3})),
@@ -58,7 +58,7 @@ struct UnsupportedBars {
             zeros({wants_planes ? in.scene.scenes : 0, in.scene.bodies, int64_t{in.planes} * contact::kPlaneScalars})) {
   }
   template <class T>
-  contact::UnsupportedAdjoints<T> pointers() const {
+  contact::ResidualAdjoints<T> pointers() const {
     const auto or_null = [](const Tensor& t) { return t.numel() > 0 ? data<T>(t) : nullptr; };
     return {or_null(x), data<T>(lift), data<T>(force), data<T>(mass), or_null(planes)};
   }

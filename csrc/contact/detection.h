@@ -153,12 +153,12 @@ DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t e
   } while (i != end);
 }
 
-// Which pairs of primitives detection considers, and what it says of one: corners, gap, constants, key. Shared by the
-// search on CPU and CUDA, which differ in how they walk the trees (tree.h).
+// The pairs of primitives that detection considers: corners, gap, constants, key. Shared by CPU and CUDA, whose
+// traversals differ.
 
 // Part of the rest distance that a pair of one body keeps as the reach of its barrier, and the length, relative to the
 // pair's longest edge at rest, up to which the two sides count as one place of the material.
-constexpr double kRestPart = 0.9, kSamePlace = 1e-9;
+constexpr double kRestFraction = 0.9, kSamePlace = 1e-9;
 // Squared sine below which edges are mollified (Li et al. 2020), with the lengths at rest.
 constexpr double kMollified = 1e-3;
 
@@ -169,14 +169,15 @@ struct Surfaces {
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
   const int32_t *triangles, *edges, *points, *planes, *body;
-  const bool* held;
+  const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
   int32_t mesh_bodies;  // labels from here on are colliders
   bool self_contact, between_bodies;
   T dhat;
-  const T* room;      // [B, mesh_bodies + 1]  how far a body's vertices may go beside their island [m], and the largest
-  const T* own_room;  // [B, mesh_bodies + 1]  and beside what a shift and a turn of their body do
+  const T*
+      trust_radius;  // [B, mesh_bodies + 1]  radius of a body's vertices relative to their island [m], and the largest
+  const T* deformation_radius;  // [B, mesh_bodies + 1]  the same relative to the rigid motion of the body
 
   DIFFVBD_FN int64_t key_base() const {
     const int32_t a = num_triangles < num_edges ? num_edges : num_triangles;
@@ -209,11 +210,6 @@ struct Detected {
   T* smallest;            // [B]  smallest gap [m]
 };
 
-template <class T>
-DIFFVBD_FN Vec3<T> point_at(const T* p, int64_t i) {
-  return {p[3 * i], p[3 * i + 1], p[3 * i + 2]};
-}
-
 // A corner point of a scene, at x + o.
 template <class T>
 struct Place {
@@ -223,14 +219,13 @@ struct Place {
 template <class T>
 DIFFVBD_FN Place<T> place(const Surfaces<T>& in, const T* collider, int64_t scene, int32_t i) {
   if (i >= in.vertices) {
-    return {point_at(collider, scene * (in.corners - in.vertices) + i - in.vertices), zero3<T>()};
+    return {vector_at(collider + 3 * (scene * (in.corners - in.vertices) + i - in.vertices)), zero3<T>()};
   }
   const int64_t row = scene * in.vertices + i;
-  return {point_at(in.x, row), in.origin == nullptr ? zero3<T>() : point_at(in.origin, row)};
+  return {vector_at(in.x + 3 * row), in.origin == nullptr ? zero3<T>() : vector_at(in.origin + 3 * row)};
 }
 
 // --- boxes
-// ------------------------------------------------------------------------------------------------------------
 
 // The point that boxes of a scene are relative to: its first surface point, wherever that is finite.
 template <class T>
@@ -274,24 +269,24 @@ DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, const int32_t* v, int n, int
 
 // How far a corner point may go before its pairs must be found again [m], by its body.
 template <class T>
-DIFFVBD_FN T room_of(const Surfaces<T>& in, int64_t scene, int32_t body) {
-  return body < in.mesh_bodies ? in.room[scene * (in.mesh_bodies + 1) + body] : T(0);
+DIFFVBD_FN T trust_radius_of(const Surfaces<T>& in, int64_t scene, int32_t body) {
+  return body < in.mesh_bodies ? in.trust_radius[scene * (in.mesh_bodies + 1) + body] : T(0);
 }
 // Up to which gap two sides of one body, with a barrier of this reach, are looked for; of all for body mesh_bodies.
 template <class T>
 DIFFVBD_FN T own_reach_of(const Surfaces<T>& in, int64_t scene, int32_t body, T dhat) {
-  return dhat + T(2) * in.own_room[scene * (in.mesh_bodies + 1) + body];
+  return dhat + T(2) * in.deformation_radius[scene * (in.mesh_bodies + 1) + body];
 }
 // Largest gap that may be found in a scene.
 template <class T>
 DIFFVBD_FN T reach_of(const Surfaces<T>& in, int64_t scene) {
-  const T other = in.dhat + T(2) * in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T other = in.dhat + T(2) * in.trust_radius[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
   const T own = own_reach_of(in, scene, in.mesh_bodies, in.dhat);
   return own < other ? other : own;
 }
 
-// Squared distances of boxes up to which a pair of a primitive of some group may be listed. Bodies that want to go far
-// have much room: what is near none of them is not to be looked for as far.
+// Squared distances of boxes up to which a pair of a primitive of some group may be listed. Bodies that move far have
+// large radii: others need no long search.
 template <class T>
 struct Reach {
   const Surfaces<T>& in;
@@ -306,19 +301,18 @@ struct Reach {
   DIFFVBD_FN float to(int32_t other) const {
     if (group < 0 || other < 0) return any;
     if (group == other && group < in.mesh_bodies) return squared(own_reach_of(in, scene, group, in.dhat));
-    return squared(in.dhat + room_of(in, scene, group) + room_of(in, scene, other));
+    return squared(in.dhat + trust_radius_of(in, scene, group) + trust_radius_of(in, scene, other));
   }
 };
 template <class T>
 DIFFVBD_FN Reach<T> squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
-  const T most = in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T most = in.trust_radius[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
   const T own = own_reach_of(in, scene, group >= 0 && group < in.mesh_bodies ? group : in.mesh_bodies, in.dhat);
-  const T other = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
+  const T other = in.dhat + most + (group >= 0 ? trust_radius_of(in, scene, group) : most);
   return {in, scene, group, Reach<T>::squared(other < own ? own : other)};
 }
 
 // --- pairs
-// ------------------------------------------------------------------------------------------------------------
 
 struct Candidate {
   int64_t scene;
@@ -357,16 +351,16 @@ DIFFVBD_FN Candidate candidate_of_key(const Surfaces<T>& in, uint64_t key) {
 template <class T>
 DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
   const int second = c.second();
-  bool held = in.held[c.v[0]];
+  bool pinned = in.pinned[c.v[0]];
   if (c.kind != kPointPlane) {
     for (int i = 0; i < second; ++i) {
       for (int j = second; j < 4; ++j) {
         if (c.v[i] == c.v[j]) return false;
       }
     }
-    for (int k = 1; k < 4; ++k) held = held && in.held[c.v[k]];
+    for (int k = 1; k < 4; ++k) pinned = pinned && in.pinned[c.v[k]];
   }
-  return !held && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
+  return !pinned && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
 }
 
 // Corner positions relative to the first corner, with those of colliders given.
@@ -383,9 +377,9 @@ DIFFVBD_FN Corners<T> corners_with(const Surfaces<T>& in, const Candidate& c, co
 }
 template <class T>
 DIFFVBD_FN Corners<T> corners_at_rest(const Surfaces<T>& in, const Candidate& c) {
-  const Vec3<T> first = point_at(in.rest, c.v[0]);
+  const Vec3<T> first = vector_at(in.rest + 3 * c.v[0]);
   Corners<T> out;
-  for (int k = 0; k < 4; ++k) out.x[k] = point_at(in.rest, c.v[k]) - first;
+  for (int k = 0; k < 4; ++k) out.x[k] = vector_at(in.rest + 3 * c.v[k]) - first;
   return out;
 }
 
@@ -431,12 +425,12 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   if (c.kind == kPointTriangle && longest < squared_length(1, 3)) longest = squared_length(1, 3);
   const T at_rest = separation(c.kind, rest);
   out.admitted = at_rest > T(kSamePlace) * square_root(longest);
-  if (at_rest < in.dhat) out.dhat = T(kRestPart) * at_rest;
+  if (at_rest < in.dhat) out.dhat = T(kRestFraction) * at_rest;
   return out;
 }
 
-// The gap of a pair, where its collider begins, and its smallest. A plane is taken where it ends, or where it begins if
-// it ends behind the point: the start lets both go. Where it moves away it has pushed and rubbed where it came from.
+// The gap of a pair, where its collider begins, and its smallest. A plane counts where it ends, or where it begins if
+// it ends behind the point: the start moves both. A plane that moves away has acted where it came from.
 template <class T>
 struct PairGap {
   T gap, begins, least;
@@ -465,11 +459,10 @@ template <class T>
 DIFFVBD_FN bool is_listed(const Surfaces<T>& in, const Candidate& c, T gap, T dhat) {
   const int32_t first = in.body[c.v[0]], second = in.body[c.v[c.second()]];
   if (first == second && first < in.mesh_bodies) return gap < own_reach_of(in, c.scene, first, dhat);
-  return gap - room_of(in, c.scene, first) - room_of(in, c.scene, second) < dhat;
+  return gap - trust_radius_of(in, c.scene, first) - trust_radius_of(in, c.scene, second) < dhat;
 }
 
 // --- results
-// ----------------------------------------------------------------------------------------------------------
 
 constexpr uint64_t kNoKey = ~uint64_t{0};  // of no pair
 
@@ -488,7 +481,7 @@ DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int64_t scene, int32_t i,
   if (plane && at.d - offset_of(in, c) <= T(0)) at = point_plane(corners_with(in, c, in.collider));
   for (int k = 0; k < 4; ++k) corners[k] = c.v[k], values[k] = at.w[k];
   corners[4] = c.kind;
-  values[4] = at.n.x, values[5] = at.n.y, values[6] = at.n.z;
+  put(values + 4, at.n);
   values[7] = at.d - offset_of(in, c);
 }
 

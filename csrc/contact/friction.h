@@ -1,6 +1,5 @@
-// Lagged friction and damping of pairs: about the normal, the weights and the normal force of the start of the step.
-// What they add to the block of a corner, what they take from that start, and the adjoints of both (docs/method.md,
-// section 12).
+// Lagged friction and damping of pairs, about the normal, the weights and the normal force at the start of the step:
+// their part of the block of a corner, what they take from that start, and the adjoints (docs/method.md, section 12).
 #pragma once
 
 #include "../core/views.h"
@@ -41,7 +40,8 @@ template <class T>
 DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, T together, const Vec3<T>& m, T h, T eps, Vec3<T>& g, Sym3<T>& H) {
   const T w = a.w[i], along = dot(a.n, m);
   if (a.damping != T(0)) {
-    // the block damps both directions, the force approach alone: what rests must not depend on the sign of a rounding
+    // the block damps both directions, the force approach alone: a vertex at rest must not depend on the sign of a
+    // rounding
     const T c = h * a.damping * w;
     if (along < T(0)) g += (c * along) * a.n;
     add_outer(H, together * c * w, a.n);
@@ -65,7 +65,7 @@ DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, T together, const Vec3
   Vec3<T> m_bar = zero3<T>();
   bar.n = zero3<T>();
   for (int k = 0; k < 4; ++k) bar.w[k] = T(0);
-  if (!a.active()) {  // nothing but its two coefficients can tell: floors that nothing touches are many
+  if (!a.active()) {  // only its two coefficients have adjoints; most floors are untouched
     const Vec3<T> u = m - along * a.n;
     const FrictionRate<T> f(square_root(dot(u, u)), eps);
     bar.friction = -h * h * w * f.value * (dot(u, p) + w * dot(p - n_p * a.n, d_raw));
@@ -83,10 +83,10 @@ DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, T together, const Vec3
   bar.damping = -h * w * (approach + stiff) * n_p;
   const Vec3<T> u = m - along * a.n, p_t = p - n_p * a.n;
   const FrictionRate<T> f(square_root(dot(u, u)), eps);
-  const T size = h * h * a.friction * w, slid = dot(u, p), pushed = dot(p_t, d_raw), both = slid + w * pushed;
+  const T size = h * h * a.friction * w, motions = dot(u, p), pushed = dot(p_t, d_raw), both = motions + w * pushed;
   m_bar -= size * ((both * f.curvature) * u + f.value * p_t);
   bar.n += size * ((both * f.curvature * along) * u + f.value * (along * p + n_p * m + w * crossed));
-  bar.w[i] = bar.w[i] - h * h * a.friction * f.value * (slid + T(2) * w * pushed);
+  bar.w[i] = bar.w[i] - h * h * a.friction * f.value * (motions + T(2) * w * pushed);
   bar.friction = -h * h * w * f.value * both;
   return m_bar;
 }
@@ -121,11 +121,11 @@ DIFFVBD_FN void store_lag(const LagState<T>& a, T* to) {
   for (int i = 0; i < kLagScalars; ++i) to[i] = values[i];
 }
 
-// What share of its damping a pair has by its normal force (diffvbd/energies.py, damped_share), and its derivatives.
+// A pair's damping fraction by its normal force (diffvbd/energies.py, damped_share), and its derivatives.
 template <class T>
-struct DampedShare {
+struct DampingFraction {
   T value = T(0), by_force = T(0), by_kappa = T(0);
-  DIFFVBD_FN DampedShare(T force, T kappa, T dhat) {
+  DIFFVBD_FN DampingFraction(T force, T kappa, T dhat) {
     const T half = T(fade()) * dhat, whole = force + half * kappa;
     if (!(T(0) < whole)) return;  // without a barrier there is no damping
     value = force / whole;        // squares of `whole` would vanish in single precision
@@ -143,10 +143,12 @@ struct LagCoefficients {
 
 // What Lag reads of a pair: friction and damping by their coefficients, its normal and weights.
 template <class T>
-DIFFVBD_FN void store_rubbing(const LagState<T>& a, T friction, T damping, T kappa, T dhat, T* to) {
-  const LagState<T> rubs{
-      friction * a.force, damping * DampedShare<T>(a.force, kappa, dhat).value, a.n, {a.w[0], a.w[1], a.w[2], a.w[3]}};
-  store_lag(rubs, to);
+DIFFVBD_FN void store_lagged_friction(const LagState<T>& a, T friction, T damping, T kappa, T dhat, T* to) {
+  const LagState<T> friction_load{friction * a.force,
+                                  damping * DampingFraction<T>(a.force, kappa, dhat).value,
+                                  a.n,
+                                  {a.w[0], a.w[1], a.w[2], a.w[3]}};
+  store_lag(friction_load, to);
 }
 
 // bar: adjoint of what store_lag wrote. Twelve Dual evaluations, once a step.
@@ -173,40 +175,41 @@ DIFFVBD_FN void reverse_lag(int kind, const Corners<T>& c, const PairConstants<T
   }
 }
 
-// By what a pair's scene has as coefficients, too.
+// The same with the adjoints of the coefficients.
 template <class T>
-struct RubbingAdjoint {
+struct LaggedFrictionAdjoint {
   PairAdjoint<T> pair;
   T friction = T(0), damping = T(0);
 };
 
-// bar: adjoint of what store_rubbing() wrote. push: of the pair's force on each corner.
+// bar: adjoint of what store_lagged_friction() wrote. push: of the pair's force on each corner.
 template <class T>
-DIFFVBD_FN void reverse_rubbing(int kind, const Corners<T>& c, const PairConstants<T>& a, T kappa, T friction,
-                                T damping, const T* bar, const Vec3<T> (&push)[4], RubbingAdjoint<T>& out) {
+DIFFVBD_FN void reverse_lagged_friction(int kind, const Corners<T>& c, const PairConstants<T>& a, T kappa, T friction,
+                                        T damping, const T* bar, const Vec3<T> (&push)[4],
+                                        LaggedFrictionAdjoint<T>& out) {
   const LagState<T> now = lag_state(kind, c, a, kappa);
-  const DampedShare<T> share(now.force, kappa, a.dhat);
-  T own[kLagScalars] = {friction * bar[0] + damping * bar[1] * share.by_force, T(0)};
+  const DampingFraction<T> fraction(now.force, kappa, a.dhat);
+  T own[kLagScalars] = {friction * bar[0] + damping * bar[1] * fraction.by_force, T(0)};
   for (int i = 2; i < kLagScalars; ++i) own[i] = bar[i];
   for (int k = 0; k < 4; ++k) {
     const T along = dot(now.n, push[k]);
     const Vec3<T> by_n = now.force * now.w[k] * push[k];
     own[0] += now.w[k] * along, own[5 + k] += now.force * along;
-    own[2] += by_n.x, own[3] += by_n.y, own[4] += by_n.z;
+    add_to(own + 2, by_n);
   }
   reverse_lag(kind, c, a, kappa, own, out.pair);
   if (!(now.active > T(0))) return;
-  out.pair.kappa += damping * bar[1] * share.by_kappa;
-  out.friction = bar[0] * now.force, out.damping = bar[1] * share.value;
+  out.pair.kappa += damping * bar[1] * fraction.by_kappa;
+  out.friction = bar[0] * now.force, out.damping = bar[1] * fraction.value;
 }
 
 // Those adjoints of all pairs; null where there are none.
 template <class T>
-struct RubbingBars {
+struct LaggedFrictionBars {
   const T *lag, *push;  // [pairs, 9], [B, corners, 3]
   int64_t corners;
   DIFFVBD_FN void reverse(const LagCoefficients<T>& by, int64_t pair, const int32_t* record, const Corners<T>& c,
-                          const PairConstants<T>& a, T kappa, RubbingAdjoint<T>& out) const {
+                          const PairConstants<T>& a, T kappa, LaggedFrictionAdjoint<T>& out) const {
     const int64_t scene = record[5];
     T bar[kLagScalars] = {};
     Vec3<T> push_bar[4] = {};
@@ -215,7 +218,7 @@ struct RubbingBars {
       const T* own = push + 3 * (scene * corners + record[k]);
       push_bar[k] = {own[0], own[1], own[2]};
     }
-    reverse_rubbing(record[4], c, a, kappa, by.friction_of(scene), by.damping_of(scene), bar, push_bar, out);
+    reverse_lagged_friction(record[4], c, a, kappa, by.friction_of(scene), by.damping_of(scene), bar, push_bar, out);
   }
 };
 

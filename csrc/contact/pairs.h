@@ -1,7 +1,7 @@
-// What one pair adds to the block of one of its corners, and the adjoint of exactly that (docs/method.md, section 12).
-// `together`: how many corners of the pair move at once with this one, itself included. The block takes so many times
-// the pair's stiffness along its normal, so that together they do not overshoot.
-// The barrier has the gradient of e b(gap) and the part e b'' grad_gap grad_gap^T of its Hessian.
+// The barrier of a pair in the block of one of its corners, and the exact adjoint (docs/method.md, section 12): the
+// gradient of e b(gap), and of its Hessian e b'' grad_gap grad_gap^T. `together`: the number of corners that move at
+// once, this one included; the block takes so many times the stiffness along the normal, so that together they do not
+// overshoot.
 #pragma once
 
 #include "../energies/log_barrier.h"

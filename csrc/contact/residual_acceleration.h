@@ -1,5 +1,5 @@
-// What is left of each body's acceleration once the contact forces at the start of a step have borne their part of it,
-// and the adjoint of that (docs/method.md, section 18). In double, whatever the dtype of the scene.
+// The residual acceleration of each body, less the part that contact forces at the start of a step balance, and the
+// adjoint (docs/method.md, section 18). In double precision.
 #pragma once
 
 #include "../sweep/body.h"
@@ -10,19 +10,17 @@ namespace diffvbd::contact {
 using rigid::Vector;
 
 template <class T>
-struct UnsupportedInputs {
-  rigid::Inputs<T> scene;   // x, mass, the vertices of all bodies and the time step
-  Batched<const T> lift;    // [1 | B, V, 3]  h^2 times the acceleration [m]
-  const T* force;           // [B, N, 3]  of pairs at corner points [N], the vertices first
-  Batched<const T> floor;   // [1 | B, planes, kPlaneScalars]
-  const bool* held_bodies;  // [bodies]: a vertex of it is pinned; it hangs from that, and contact bears nothing
-  int64_t corners;          // N
+struct ResidualInputs {
+  rigid::Inputs<T> scene;     // x, mass, the vertices of all bodies and the time step
+  Batched<const T> h2_a;      // [1 | B, V, 3]  h^2 times the acceleration [m]
+  const T* force;             // [B, N, 3]  of pairs at corner points [N], the vertices first
+  Batched<const T> floor;     // [1 | B, planes, kPlaneScalars]
+  const bool* pinned_bodies;  // [bodies]: bodies with a pinned vertex, which contact does not support
+  int64_t corners;            // N
   int32_t planes;
 
   DIFFVBD_FN double square_of_step() const { return scene.time_step * scene.time_step; }
-  DIFFVBD_FN Vector lift_of(int64_t s, int32_t v) const {
-    return rigid::Body<T>::at(lift.data + s * lift.scene + 3 * int64_t{v});
-  }
+  DIFFVBD_FN Vector h2_a_of(int64_t s, int32_t v) const { return wide_at(h2_a.data + s * h2_a.scene + 3 * int64_t{v}); }
 };
 
 // One plane of a floor and one vertex. Its force is -kappa slope n.
@@ -31,7 +29,7 @@ struct FloorPush {
   double kappa, dhat, gap, slope, curvature;  // the latter of a barrier whose kappa is 1
 
   template <class T>
-  DIFFVBD_FN FloorPush(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, int32_t v, int32_t plane) {
+  DIFFVBD_FN FloorPush(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, int32_t plane) {
     const T* given = in.floor.data + b.scene * in.floor.scene + plane * kPlaneScalars;
     double record[kPlaneScalars];
     for (int i = 0; i < kPlaneScalars; ++i) record[i] = given[i];
@@ -46,8 +44,8 @@ struct FloorPush {
 
 // The force of pairs and of the floor on a vertex [N].
 template <class T>
-DIFFVBD_FN Vector force_on(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, int32_t v) {
-  Vector out = rigid::Body<T>::at(in.force + 3 * (b.scene * in.corners + v));
+DIFFVBD_FN Vector force_on(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v) {
+  Vector out = wide_at(in.force + 3 * (b.scene * in.corners + v));
   for (int32_t k = 0; k < in.planes; ++k) {
     const FloorPush push(in, b, v, k);
     out -= (push.kappa * push.slope) * push.n;
@@ -57,88 +55,85 @@ DIFFVBD_FN Vector force_on(const UnsupportedInputs<T>& in, const rigid::Body<T>&
 
 DIFFVBD_FN double largest_part(const Vector& a) { return larger(absolute(a.x), larger(absolute(a.y), absolute(a.z))); }
 
-constexpr int kSupportSums = 7;  // over the vertices of a body: mass times lift, force times h^2, mass
+constexpr int kSupportSums = 7;  // over the vertices of a body: mass times h^2 a, force times h^2, mass
 
 template <class T>
-DIFFVBD_FN void add_to_support(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, int32_t v, double* to) {
+DIFFVBD_FN void add_to_support(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, double* to) {
   const double m = b.mass(v);
-  const Vector lift = m * in.lift_of(b.scene, v), push = in.square_of_step() * force_on(in, b, v);
-  to[0] += lift.x, to[1] += lift.y, to[2] += lift.z;
-  to[3] += push.x, to[4] += push.y, to[5] += push.z;
+  const Vector h2_a = m * in.h2_a_of(b.scene, v), push = in.square_of_step() * force_on(in, b, v);
+  add_to(to, h2_a);
+  add_to(to + 3, push);
   to[6] += m;
 }
 
-// The lift of a body as a whole, that of contact alone, and the share of the latter which takes from the former what it
-// can: it neither pulls nor pushes beyond that.
+// h^2 a of a body as a whole, that of contact alone, and the fraction of the latter that best balances the former,
+// between 0 and 1.
 struct Support {
-  double inverse;       // of the mass
-  Vector own, borne;    // [m]
-  Vector ratio, unit;   // both over the largest part of borne, or as they are if it bears nothing
-  double square;        // of unit
-  double asked, share;  // before and after it is held between 0 and 1
+  double inverse;          // of the mass
+  Vector own, borne;       // [m]
+  Vector ratio, unit;      // both over the largest part of borne, or as they are if it bears nothing
+  double square;           // of unit
+  double asked, fraction;  // before and after it is clamped to 0 ... 1
   bool bears;
 
   DIFFVBD_FN Support(const double* sum, double rounding) {
     inverse = 1 / larger(std::numeric_limits<double>::min(), sum[6]);
-    own = inverse * Vector{sum[0], sum[1], sum[2]}, borne = inverse * Vector{sum[3], sum[4], sum[5]};
-    // what bears less than rounding of the body's own acceleration bears nothing: its square may be no number
+    own = inverse * vector_at(sum), borne = inverse * vector_at(sum + 3);
+    // a support below the rounding of the own acceleration counts as none: its square may vanish
     const double largest = largest_part(borne);
     bears = rounding * largest_part(own) < largest;
     const double size = bears ? largest : 1;
     ratio = {own.x / size, own.y / size, own.z / size}, unit = {borne.x / size, borne.y / size, borne.z / size};
     square = dot(unit, unit);
     asked = bears ? -dot(ratio, unit) / square : 0;
-    share = asked < 0 ? 0 : 1 < asked ? 1 : asked;
+    fraction = asked < 0 ? 0 : 1 < asked ? 1 : asked;
   }
 };
 
-// Loops and sums over the vertices of a body belong to a Team (rigid/body.h).
-
 // out [B, V, 3] [m]
 template <class T, class Team>
-DIFFVBD_FN void leave_unsupported(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, const Team& team, T* out) {
+DIFFVBD_FN void residual_acceleration(const ResidualInputs<T>& in, const rigid::Body<T>& b, const Team& team, T* out) {
   Vector taken{};
-  if (!in.held_bodies[b.body]) {
+  if (!in.pinned_bodies[b.body]) {
     double sum[kSupportSums];
     team.template sum<kSupportSums>(b.size(), sum,
                                     [&](int32_t i, double* to) { add_to_support(in, b, b.vertex(i), to); });
     const Support support(sum, std::numeric_limits<T>::epsilon());
-    taken = support.share * support.borne;
+    taken = support.fraction * support.borne;
   }
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
-    rigid::put(out + 3 * b.row(v), in.lift_of(b.scene, v) + taken);
+    put(out + 3 * b.row(v), in.h2_a_of(b.scene, v) + taken);
   });
 }
 
-// Adjoints of what is summed up, by that of what contact takes from every vertex.
+// Adjoints of the sums, by that of what contact takes from every vertex.
 struct SupportAdjoint {
-  Vector lift, push;
+  Vector h2_a, push;
   double mass;
 
   DIFFVBD_FN SupportAdjoint(const Support& s, const Vector& taken) {
-    Vector own{}, borne = s.share * taken;
+    Vector own{}, borne = s.fraction * taken;
     if (s.bears && 0 <= s.asked && s.asked <= 1) {
       const double along = dot(taken, s.unit) / s.square;
       own = -along * s.unit;
       borne -= along * (s.ratio + (2 * s.asked) * s.unit);
     }
-    lift = s.inverse * own, push = s.inverse * borne;
-    mass = -dot(lift, s.own) - dot(push, s.borne);
+    h2_a = s.inverse * own, push = s.inverse * borne;
+    mass = -dot(h2_a, s.own) - dot(push, s.borne);
   }
 };
 
-// x is null without a floor, planes where they want none. Force and planes are zero at first.
+// x is null without a floor, planes where not wanted. Force and planes are zero at first.
 template <class T>
-struct UnsupportedAdjoints {
-  T *x, *lift, *force, *mass;  // [B, V, 3], [B, V, 3], [B, N, 3], [B, V]
+struct ResidualAdjoints {
+  T *x, *h2_a, *force, *mass;  // [B, V, 3], [B, V, 3], [B, N, 3], [B, V]
   T* planes;                   // of each body [B, bodies, planes, kPlaneScalars]
 };
 
-// What a vertex sends to its position by the floor. push: adjoint of the force on it.
+// The adjoint of a position by the floor. push: adjoint of the force on the vertex.
 template <class T>
-DIFFVBD_FN Vector floor_adjoint(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, int32_t v,
-                                const Vector& push) {
+DIFFVBD_FN Vector floor_adjoint(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& push) {
   Vector out{};
   for (int32_t k = 0; k < in.planes; ++k) {
     const FloorPush at(in, b, v, k);
@@ -147,16 +142,16 @@ DIFFVBD_FN Vector floor_adjoint(const UnsupportedInputs<T>& in, const rigid::Bod
   return out;
 }
 
-// And to the data of one plane: normal, height, kappa and dhat; damping has no say.
+// And of the data of one plane: normal, height, kappa and dhat.
 constexpr int kPushedScalars = 6;
 template <class T>
-DIFFVBD_FN void add_plane_adjoint(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, int32_t v, int32_t plane,
+DIFFVBD_FN void add_plane_adjoint(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, int32_t plane,
                                   const Vector& push, double* to) {
   const FloorPush at(in, b, v, plane);
   const Vector x = b.position(v);
   const double along = dot(at.n, push), by_gap = -at.kappa * at.curvature * along;
   const Vector n = -(at.kappa * at.slope) * push + by_gap * (x + b.state(v, x).origin);
-  to[0] += n.x, to[1] += n.y, to[2] += n.z;
+  add_to(to, n);
   to[3] -= by_gap;
   to[4] -= at.slope * along;
   // the slope grows as gap and dhat do together
@@ -164,28 +159,28 @@ DIFFVBD_FN void add_plane_adjoint(const UnsupportedInputs<T>& in, const rigid::B
 }
 
 template <class T, class Team>
-DIFFVBD_FN void reverse_unsupported(const UnsupportedInputs<T>& in, const rigid::Body<T>& b, const Team& team,
-                                    const T* bar, const UnsupportedAdjoints<T>& out) {
-  Vector lift{}, push{};
+DIFFVBD_FN void reverse_residual_acceleration(const ResidualInputs<T>& in, const rigid::Body<T>& b, const Team& team,
+                                              const T* bar, const ResidualAdjoints<T>& out) {
+  Vector h2_a{}, push{};
   double mass = 0;
-  if (!in.held_bodies[b.body]) {
+  if (!in.pinned_bodies[b.body]) {
     double sum[kSupportSums + 3];
     team.template sum<kSupportSums + 3>(b.size(), sum, [&](int32_t i, double* to) {
       const int32_t v = b.vertex(i);
       add_to_support(in, b, v, to);
-      const Vector own = rigid::Body<T>::at(bar + 3 * b.row(v));
-      to[7] += own.x, to[8] += own.y, to[9] += own.z;
+      const Vector own = wide_at(bar + 3 * b.row(v));
+      add_to(to + 7, own);
     });
-    const SupportAdjoint sent(Support(sum, std::numeric_limits<T>::epsilon()), Vector{sum[7], sum[8], sum[9]});
-    lift = sent.lift, push = in.square_of_step() * sent.push, mass = sent.mass;
+    const SupportAdjoint scattered(Support(sum, std::numeric_limits<T>::epsilon()), vector_at(sum + 7));
+    h2_a = scattered.h2_a, push = in.square_of_step() * scattered.push, mass = scattered.mass;
   }
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v);
-    rigid::put(out.lift + 3 * row, rigid::Body<T>::at(bar + 3 * row) + b.mass(v) * lift);
-    rigid::put(out.force + 3 * (b.scene * in.corners + v), push);
-    out.mass[row] = T(mass + dot(in.lift_of(b.scene, v), lift));
-    if (out.x) rigid::put(out.x + 3 * row, floor_adjoint(in, b, v, push));
+    put(out.h2_a + 3 * row, wide_at(bar + 3 * row) + b.mass(v) * h2_a);
+    put(out.force + 3 * (b.scene * in.corners + v), push);
+    out.mass[row] = T(mass + dot(in.h2_a_of(b.scene, v), h2_a));
+    if (out.x) put(out.x + 3 * row, floor_adjoint(in, b, v, push));
   });
   for (int32_t k = 0; out.planes && k < in.planes; ++k) {
     double sum[kPushedScalars];

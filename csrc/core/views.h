@@ -59,7 +59,7 @@ DIFFVBD_FN constexpr int weight_index(int a, int b) {
 // Index data of one mesh in sweep order, all int32. Vertices of a color lie side by side, in blocks of `kLanes`; the
 // last block of a color is filled with phantom vertices. Inactive vertices (pinned, isolated) fill the blocks after the
 // last color. A position is block kLanes + lane. A slot is one incident tet for each lane of a block; a lane with fewer
-// tets is padded by pairs of itself. The reverse sends what an update adds to a neighbour along edges: a row for each
+// tets is padded by pairs of itself. The reverse scatters adjoints to neighbours along edges: a row for each
 // ordered pair (active vertex, neighbour), written by the vertex, read by the neighbour when its own turn comes.
 constexpr int kLanes = 8;
 constexpr int kRow = 4;  // scalars in a row: x, y, z and one unused; indices come multiplied by it

@@ -137,11 +137,11 @@ struct BoxRows {
   int count;
 };
 // Numbers of the boxes that overlap another [lower, upper corner] and share no vertex with an edge; returns how many.
-using MeetKernel = int (*)(const BoxRows&, const float* box, const int32_t* ends, int32_t* out);
+using OverlapKernel = int (*)(const BoxRows&, const float* box, const int32_t* ends, int32_t* out);
 
 inline namespace DIFFVBD_SET {
 
-inline int meet_boxes(const BoxRows& in, const float* box, const int32_t* ends, int32_t* out) {
+inline int overlap_boxes(const BoxRows& in, const float* box, const int32_t* ends, int32_t* out) {
   using Floats = float __attribute__((vector_size(4 * kBoxLanes)));
   using Bits = int32_t __attribute__((vector_size(4 * kBoxLanes)));
   using Bytes = int8_t __attribute__((vector_size(kBoxLanes)));

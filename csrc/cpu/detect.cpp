@@ -1,4 +1,5 @@
-// Bounding-volume trees on the CPU (contact/tree.h), one scene after the other in the same memory.
+// Detection and intersections on the CPU. Trees (contact/detection.h) are built for one scene after the other in the
+// same memory.
 #include "detect.h"
 
 #include <torch/csrc/stable/ops.h>
@@ -48,14 +49,6 @@ inline int bits_of(uint64_t below) {
   int bits = 0;
   while (bits < 64 && below >> bits != 0) ++bits;
   return bits;
-}
-
-// f(i) for all i < n; within a parallel region, one thread does it all.
-template <class F>
-void for_each(int64_t n, const F& f) {
-  torch::stable::parallel_for(0, n, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) f(i);
-  });
 }
 
 // Boxes of all corner points of a scene.
@@ -335,7 +328,6 @@ void store_list(const Surfaces<T>& in, const std::vector<uint64_t>& keys, const 
   template void store_list<T>(const Surfaces<T>&, const std::vector<uint64_t>&, const Detected<T>&);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
 
 namespace {
 
@@ -379,7 +371,7 @@ class NearTriangles {
     stride_ = stride;
   }
 
-  const MeetKernel meet_ = meet_kernel();
+  const OverlapKernel meet_ = overlap_kernel();
   int stride_ = 0, count_ = 0;
   std::vector<float> sides_;
   std::vector<int32_t> corners_, items_, near_;

@@ -45,7 +45,7 @@ class SceneIslands {
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
       bodies_[i] = nothing<T>();
       for (int32_t k = in_.body_ptr[i]; k < in_.body_ptr[i + 1]; ++k) {
-        bodies_[i].add(vertex_share(in_, scene_, in_.body_order[k]));
+        bodies_[i].add(vertex_sum(in_, scene_, in_.body_order[k]));
       }
     }
   }
@@ -141,27 +141,20 @@ template <class T>
 void segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                  int64_t segments, int64_t c, T* out) {
   const int64_t grain = pieces_per_thread(segments > 0 ? items / segments : 0);
-  torch::stable::parallel_for(0, scenes * segments, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t scene = i / segments, s = i - scene * segments;
-      add_rows(values + scene * items * c, order + ptr[s], ptr[s + 1] - ptr[s], c, out + i * c);
-    }
-  });
+  const auto sum = [&](int64_t i) {
+    const int64_t scene = i / segments, s = i - scene * segments;
+    add_rows(values + scene * items * c, order + ptr[s], ptr[s + 1] - ptr[s], c, out + i * c);
+  };
+  for_each(scenes * segments, sum, grain);
 }
-
-#define DIFFVBD_INSTANTIATE(T)                                     \
-  template void find_islands<T>(const IslandInputs<T>&, int32_t*); \
-  template void segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, T*);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
 
 using namespace contact;
 
 template <class T>
-void find_motion(const MotionInputs<T>& in, T* rigid, T* ways, T* sums) {
-  for_bodies<MovingBody>(
-      in, [&](const MovingBody<T>& b, const Threads& team) { contact::find_motion(b, team, rigid, ways, sums); });
+void find_motion(const MotionInputs<T>& in, T* rigid, T* displacements, T* sums) {
+  for_bodies<MovingBody>(in, [&](const MovingBody<T>& b, const Threads& team) {
+    contact::find_motion(b, team, rigid, displacements, sums);
+  });
 }
 
 template <class T>
@@ -170,19 +163,19 @@ void reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a) {
 }
 
 template <class T>
-void coast(const MotionInputs<T>& in, double chord, T* coasted) {
-  for_bodies<MovingBody>(in,
-                         [&](const MovingBody<T>& b, const Threads& team) { contact::coast(b, team, chord, coasted); });
-}
-
-template <class T>
-void reverse_coast(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a) {
+void extrapolate(const MotionInputs<T>& in, double lookback, T* extrapolated) {
   for_bodies<MovingBody>(
-      in, [&](const MovingBody<T>& b, const Threads& team) { contact::reverse_coast(b, team, chord, a); });
+      in, [&](const MovingBody<T>& b, const Threads& team) { contact::extrapolate(b, team, lookback, extrapolated); });
 }
 
 template <class T>
-void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
+void reverse_extrapolate(const MotionInputs<T>& in, double lookback, const MotionAdjoints<T>& a) {
+  for_bodies<MovingBody>(
+      in, [&](const MovingBody<T>& b, const Threads& team) { contact::reverse_extrapolate(b, team, lookback, a); });
+}
+
+template <class T>
+void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
   const int64_t scenes = in.motion.scenes;
   const auto each = [&](const auto& f) {
     for (int64_t i = 0; i < scenes * in.motion.bodies; ++i) {
@@ -190,31 +183,32 @@ void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
     }
   };
   const Threads one(false);
-  in.islands.room = work.room;
+  in.islands.trust_radius = work.trust_radius;
   for (int64_t scene = 0; scene < scenes; ++scene) prepare_scene(in, scene, one, work);
   for_bodies<MovingBody>(in.motion,
                          [&](const MovingBody<T>& b, const Threads& team) { wish_of_body(in, b, team, work); });
   bool looks = false;
   each([&](int64_t scene, int32_t body) { looks = looks || asks_more(in, work, scene, body); });
   if (looks) find_islands(in.islands, work.island);
-  each([&](int64_t scene, int32_t body) { room_among_others(in, work, scene, body, looks); });
+  each([&](int64_t scene, int32_t body) { radius_among_others(in, work, scene, body, looks); });
   find_islands(in.islands, work.island);
-  for (int round = 0; round < kRoomRounds; ++round) {
-    for_bodies<MovingBody>(in.motion,
-                           [&](const MovingBody<T>& b, const Threads& team) { room_beside_island(in, b, team, work); });
+  for (int round = 0; round < kRadiusRounds; ++round) {
+    for_bodies<MovingBody>(
+        in.motion, [&](const MovingBody<T>& b, const Threads& team) { radius_beside_island(in, b, team, work); });
     find_islands(in.islands, work.island);
   }
-  for (int64_t scene = 0; scene < scenes; ++scene) end_rooms(in, scene, one, work);
+  for (int64_t scene = 0; scene < scenes; ++scene) finish_radii(in, scene, one, work);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                              \
-  template void find_motion<T>(const MotionInputs<T>&, T*, T*, T*);                         \
-  template void reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&);        \
-  template void coast<T>(const MotionInputs<T>&, double, T*);                               \
-  template void reverse_coast<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&); \
-  template void find_rooms<T>(RoomInputs<T>, const RoomWork<T>&);
+#define DIFFVBD_INSTANTIATE(T)                                                                                    \
+  template void find_islands<T>(const IslandInputs<T>&, int32_t*);                                                \
+  template void segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, T*); \
+  template void find_motion<T>(const MotionInputs<T>&, T*, T*, T*);                                               \
+  template void reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&);                              \
+  template void extrapolate<T>(const MotionInputs<T>&, double, T*);                                               \
+  template void reverse_extrapolate<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&);                 \
+  template void find_trust_radii<T>(RadiusInputs<T>, const RadiusWork<T>&);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
 
 }  // namespace diffvbd

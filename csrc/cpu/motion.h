@@ -1,4 +1,4 @@
-// Motion and rooms of bodies on the CPU.
+// Motions, islands and trust-region radii of bodies on the CPU, and sums over segments.
 #pragma once
 
 #include "../contact/islands.h"
@@ -9,21 +9,19 @@ namespace diffvbd {
 
 // Results as contact/motion.h has them.
 template <class T>
-void find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums);
+void find_motion(const contact::MotionInputs<T>& in, T* rigid, T* displacements, T* sums);
 template <class T>
 void reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a);
 
-// As contact/coast.h has it; a.rigid: the adjoint of `coasted`.
+// Results as in contact/motion.h; a.rigid: the adjoint of `extrapolated`.
 template <class T>
-void coast(const contact::MotionInputs<T>& in, double chord, T* coasted);
+void extrapolate(const contact::MotionInputs<T>& in, double lookback, T* extrapolated);
 template <class T>
-void reverse_coast(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a);
+void reverse_extrapolate(const contact::MotionInputs<T>& in, double lookback, const contact::MotionAdjoints<T>& a);
 
 // Fills all that `work` points to.
 template <class T>
-void find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work);
-
-// Islands of bodies in contact, and sums over segments, on the CPU.
+void find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work);
 
 // island [B, mesh_bodies]: the smallest body of each body's island, or -1 where the island must stay
 template <class T>

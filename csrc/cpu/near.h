@@ -20,7 +20,7 @@ struct PairSite {
   bool is_first(int k) const { return k < contact::sides(kind); }
 };
 
-// Rows of four scalars of all corner points of a scene: positions, where the part started, and origins.
+// Rows of four scalars of all corner points of a scene: positions, starts of the substep, and origins.
 template <class T>
 class PairRows {
  public:
@@ -37,14 +37,13 @@ class PairRows {
       std::fill(color_.begin() + plan.color_block[c], color_.begin() + plan.color_block[c + 1], c);
     }
     for (int v = 0; v < in.num_vertices; ++v) {
-      put(center_.get() + 4 * position[v], in.center_of(scene, v));
+      set_row(center_.get() + 4 * position[v], in.center_of(scene, v));
       if (in.origin.data) {
-        put(origin_.get() + 4 * position[v],
-            contact::vector_at(in.origin.data + scene * in.origin.scene + int64_t{3} * v));
+        set_row(origin_.get() + 4 * position[v], vector_at(in.origin.data + scene * in.origin.scene + int64_t{3} * v));
       }
     }
     for (int64_t i = 0; i < in.corners - in.num_vertices; ++i) {
-      put(collider_.get() + 4 * i, contact::vector_at(in.collider.data + scene * in.collider.scene + 3 * i));
+      set_row(collider_.get() + 4 * i, vector_at(in.collider.data + scene * in.collider.scene + 3 * i));
     }
   }
 
@@ -70,9 +69,7 @@ class PairRows {
     if (!origin_.get()) return nullptr;
     return at < 0 ? zero_.get() : origin_.get() + at;
   }
-  Vec3<T> moved(int32_t at) const {
-    return at < 0 ? zero3<T>() : contact::vector_at(x_ + at) - contact::vector_at(center_.get() + at);
-  }
+  Vec3<T> moved(int32_t at) const { return at < 0 ? zero3<T>() : vector_at(x_ + at) - vector_at(center_.get() + at); }
   // As Source::is_far() says of the pair.
   bool is_far(const PairSite& site, const T* constants) const {
     return contact::is_above(
@@ -80,7 +77,7 @@ class PairRows {
   }
 
  private:
-  static void put(T* row, const Vec3<T>& a) { row[0] = a.x, row[1] = a.y, row[2] = a.z, row[3] = T(0); }
+  static void set_row(T* row, const Vec3<T>& a) { put(row, a), row[3] = T(0); }
 
   const contact::ContactInputs<T>& in_;
   const int32_t* position_;
@@ -163,10 +160,10 @@ class PairBatches {
 // Which listed pairs can matter in a sweep, kept from one color to the next: most of a list is out of reach of what its
 // vertices do, and to look at each pair of it in every color takes longer than the updates themselves.
 //
-// A vertex keeps an anchor: a motion since the start of the part, a radius around it that its motion stays within, and
-// the longest update that it may try. By those of its corners a pair is far if its gap exceeds dhat and what updates
-// may close: the passes would leave it out at every visit. A vertex that leaves its radius takes a new anchor and looks
-// at its far pairs anew. What is near stays near, until settle().
+// A vertex keeps an anchor: a motion since the start of the substep, a radius around it that its motion stays within,
+// and the longest update that it may try. By those of its corners a pair is far if its gap exceeds dhat and what
+// updates may close: the passes would leave it out at every visit. A vertex that leaves its radius takes a new anchor
+// and looks at its far pairs anew. What is near stays near, until settle().
 
 // What was found of a near entry when it was last looked at.
 enum PairState : uint8_t {
@@ -185,7 +182,7 @@ class NearPairs {
     int count;
   };
 
-  // motion(v): of corner point v since the start of the part
+  // motion(v): of corner point v since the start of the substep
   template <class Motion>
   NearPairs(const contact::ContactInputs<T>& in, int64_t scene, const PairRows<T>& rows, const Motion& motion)
       : in_(in),
@@ -218,10 +215,8 @@ class NearPairs {
   }
 
   int64_t pairs() const { return static_cast<int64_t>(near_.size()); }
-  // Of the pairs [begin, end) those that are near; the lists of all corner points are stale then.
-  void sort(int64_t begin, int64_t end) {
-    for (int64_t p = begin; p < end; ++p) near_[p] = !is_far(first_pair_ + p);
-  }
+  // Whether a pair is near; the lists of all corner points are stale then.
+  void sort(int64_t p) { near_[p] = !is_far(first_pair_ + p); }
   // A new anchor with a smaller radius, before all pairs are sorted again.
   void settle(int v, const Vec3<T>& motion) {
     anchors_[v] = {motion, T(kLeft) * anchors_[v].radius, T(kLeft) * anchors_[v].length};
@@ -237,7 +232,7 @@ class NearPairs {
     return out;
   }
 
-  // Vertex v goes from one motion to another, or a part of the way, in an update of this length, guard included; 0 in
+  // Vertex v goes from one motion to another, or a part of it, in an update of this length, guard included; 0 in
   // the reverse. Its pairs are looked at in search(), once all vertices of its color have said so.
   void go(int v, const Vec3<T>& from, const Vec3<T>& to, T length) {
     Anchor& a = anchors_[v];
@@ -329,8 +324,8 @@ class NearPairs {
       of_side = of_side < a[k]->radius ? a[k]->radius : of_side;
       length = length < a[k]->length ? a[k]->length : length;
     }
-    const T room = contact::PairHints<T>(constants).gap - length - T(1 + kRounded) * (radius[0] + radius[1]);
-    if (!(T(0) < room)) return false;
+    const T slack = contact::PairHints<T>(constants).gap - length - T(1 + kRounded) * (radius[0] + radius[1]);
+    if (!(T(0) < slack)) return false;
     for (int i = 0; i < first; ++i) {
       for (int j = first; j < 4; ++j) {
         const Vec3<T> d = a[i]->motion - a[j]->motion;
@@ -338,7 +333,7 @@ class NearPairs {
         most = most < square ? square : most;
       }
     }
-    return T(1 + 4 * kRounded) * most < room * room;
+    return T(1 + 4 * kRounded) * most < slack * slack;
   }
 
   const contact::ContactInputs<T>& in_;

@@ -5,6 +5,8 @@
 #include <limits>
 #include <stdexcept>
 
+#include "../contact/detection.h"
+
 namespace diffvbd {
 
 Stars build_stars(const int64_t* tets, int64_t num_tets, int64_t num_vertices) {
@@ -80,15 +82,6 @@ std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, 
 
 namespace {
 
-uint64_t spread_bits(uint64_t a) {
-  a &= 0x1fffff;
-  a = (a | a << 32) & 0x1f00000000ffffull;
-  a = (a | a << 16) & 0x1f0000ff0000ffull;
-  a = (a | a << 8) & 0x100f00f00f00f00full;
-  a = (a | a << 4) & 0x10c30c30c30c30c3ull;
-  return (a | a << 2) & 0x1249249249249249ull;
-}
-
 std::vector<int32_t> morton_order(const double* points, int64_t n) {
   std::array<double, 3> low, scale;
   for (int c = 0; c < 3; ++c) {
@@ -101,7 +94,7 @@ std::vector<int32_t> morton_order(const double* points, int64_t n) {
   for (int64_t v = 0; v < n; ++v) {
     uint64_t key = 0;
     for (int c = 0; c < 3; ++c) {
-      key |= spread_bits(static_cast<uint64_t>((points[3 * v + c] - low[c]) * scale[c])) << c;
+      key |= contact::spread_bits(static_cast<uint64_t>((points[3 * v + c] - low[c]) * scale[c])) << c;
     }
     keys[v] = {key, static_cast<int32_t>(v)};
   }
@@ -181,17 +174,10 @@ Layout lay_out(const double* points, const Stars& stars, const Adjacency& graph,
 
 // Header and blocks, which both plans share; `extra` scalars follow.
 std::vector<int32_t> start_buffer(const Layout& layout, int64_t vertices, int64_t tets, int64_t extra) {
-  std::vector<int32_t> out = {static_cast<int32_t>(vertices),
-                              static_cast<int32_t>(tets),
-                              layout.active,
-                              layout.colors,
-                              layout.blocks,
-                              layout.slots,
-                              layout.edge_slots,
-                              layout.incoming_slots,
-                              0,
-                              0,
-                              0};
+  const auto n = static_cast<int32_t>(vertices), t = static_cast<int32_t>(tets);
+  std::vector<int32_t> out = {
+      n, t, layout.active, layout.colors, layout.blocks, layout.slots, layout.edge_slots, layout.incoming_slots};
+  out.resize(kPlanHeader);
   for (const auto* list : {&layout.color_block, &layout.block_slot, &layout.block_rank, &layout.block_edge,
                            &layout.block_incoming, &layout.order}) {
     out.insert(out.end(), list->begin(), list->end());

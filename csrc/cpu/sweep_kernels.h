@@ -35,7 +35,7 @@ __attribute__((flatten)) void forward_color(const Plan& plan, const SceneView<T>
 
 template <class T, int mask>
 constexpr SweepKernel<T> forward_variant() {
-  if constexpr (is_compiled(mask)) return forward_color<T, with_rare(mask)>;
+  if constexpr (is_compiled(mask)) return forward_color<T, with_optional(mask)>;
   return nullptr;
 }
 template <class T, int... n>
@@ -93,7 +93,7 @@ __attribute__((flatten)) void reverse_color(const Plan& plan, const SceneView<T>
 
 template <class T, int mask>
 constexpr SweepKernel<T> reverse_variant() {
-  if constexpr (is_compiled(mask)) return reverse_color<T, with_rare(mask)>;
+  if constexpr (is_compiled(mask)) return reverse_color<T, with_optional(mask)>;
   return nullptr;
 }
 template <class T, int... n>
@@ -126,8 +126,8 @@ CoarseKernels<T> coarse(int energies) {
 
 // Boxes are single precision: of the scalars one has the kernel, and it costs the other no room for inlining.
 template <class T>
-MeetKernel meet() {
-  if constexpr (std::is_same_v<T, float>) return meet_boxes;
+OverlapKernel meet() {
+  if constexpr (std::is_same_v<T, float>) return overlap_boxes;
   return nullptr;
 }
 

@@ -1,4 +1,4 @@
-// When work is worth one more thread.
+// Threads of the CPU backend: loops over items, teams of bodies, and a team that stays together for a step.
 #pragma once
 
 #include <torch/csrc/stable/ops.h>
@@ -11,7 +11,7 @@
 #include <thread>
 #include <vector>
 
-#include "../subspace/rigid.h"
+#include "../sweep/body.h"
 
 namespace diffvbd {
 
@@ -21,8 +21,15 @@ constexpr int64_t kGrain = 4096;
 // Pieces of this many cheap items each that a thread must be given.
 constexpr int64_t pieces_per_thread(int64_t items) { return items < kGrain ? kGrain / (items > 0 ? items : 1) : 1; }
 
-// Bodies side by side, or the vertices of a large one: the loops and sums of csrc/rigid and csrc/start on the CPU.
+// f(i) for all i < n, of which a thread is given at least `grain`; within a parallel region, one thread does it all.
+template <class F>
+void for_each(int64_t n, const F& f, int64_t grain = kGrain) {
+  torch::stable::parallel_for(0, n, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) f(i);
+  });
+}
 
+// The team of one body on the CPU: its vertices in turn, or those of a large body on several threads.
 // Sums go by chunks of a fixed size, so that they have the same bits for any number of threads.
 class Threads {
  public:
@@ -107,9 +114,7 @@ void for_bodies(const In& in, const F& f) {
   if (items < static_cast<int64_t>(torch::stable::get_num_threads())) {
     for (int64_t i = 0; i < items; ++i) one(i, true);
   } else {
-    torch::stable::parallel_for(0, items, pieces_per_thread(vertices), [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) one(i, false);
-    });
+    for_each(items, [&](int64_t i) { one(i, false); }, pieces_per_thread(vertices));
   }
 }
 
@@ -130,7 +135,7 @@ void for_vertices(const rigid::Inputs<T>& in, const F& f) {
 
 class Team {
  public:
-  explicit Team(int64_t shares) : shares_(shares) {}
+  explicit Team(int64_t fractions) : shares_(fractions) {}
 
   // The part of [begin, end) that belongs to shares [first, last) of the work.
   struct Member {
@@ -143,6 +148,13 @@ class Team {
       const int64_t a = begin + n * first / team->shares_, b = begin + n * last / team->shares_;
       if (a < b) f(a, b);
     }
+    // The same for f(i) of each item.
+    template <class F>
+    void each_item(int64_t n, const F& f) const {
+      each(0, n, [&](int64_t a, int64_t b) {
+        for (int64_t i = a; i < b; ++i) f(i);
+      });
+    }
     // Returns when all members have arrived.
     void barrier() {
       if (last - first == team->shares_) return;
@@ -151,6 +163,15 @@ class Team {
       for (int spins = 0; team->arrived_.load(std::memory_order_acquire) < phase * team->shares_; ++spins) {
         if (spins > kSpins) std::this_thread::yield();
       }
+    }
+    // Both, and then a barrier.
+    template <class F>
+    void each_sync(int64_t begin, int64_t end, const F& f) {
+      each(begin, end, f), barrier();
+    }
+    template <class F>
+    void items_sync(int64_t n, const F& f) {
+      each_item(n, f), barrier();
     }
   };
 
@@ -175,8 +196,8 @@ class Team {
   enum Decision { kUndecided, kTogether, kAlone };
 
   // Whether all shares run at the same time; every thread gets the same answer.
-  bool assemble(int64_t shares) {
-    if (present_.fetch_add(shares) + shares == shares_) {
+  bool assemble(int64_t fractions) {
+    if (present_.fetch_add(fractions) + fractions == shares_) {
       int expected = kUndecided;
       decision_.compare_exchange_strong(expected, kTogether);
     }

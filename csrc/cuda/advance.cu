@@ -17,7 +17,7 @@ constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question tha
 // Out of line: whoever asks gets the same bits.
 template <class T>
 __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
-  return try_pair(in, s, pair, round);
+  return test_pair(in, s, pair, round);
 }
 template <class T>
 __device__ __noinline__ bool passes_quickly(const AdvanceInputs<T>& in, const AdvanceState<T>& s, PairPlane<T>& plane,
@@ -100,7 +100,7 @@ struct NearPairs {
     for (int k = static_cast<int>(threadIdx.x); place(k) < pairs.end; k += kThreads) {
       const int64_t i = place(k);
       const bool open = s.first || is_open(in, s, in.listed.pairs + kPairRow * i);
-      if (open && !stays_far_at_any_share(in, s, i)) near[place(atomicAdd(count, 1))] = static_cast<int32_t>(i);
+      if (open && !stays_far_at_any_fraction(in, s, i)) near[place(atomicAdd(count, 1))] = static_cast<int32_t>(i);
     }
     __syncthreads();
     for (int k = static_cast<int>(threadIdx.x); k < *count; k += kThreads) plane[place(k)].forget();
@@ -184,7 +184,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
     bool open = false;
     team.each(units, [&](int64_t i) {
       end_move(s, i);
-      open = open || s.share[i] < T(1);
+      open = open || s.fraction[i] < T(1);
     });
     if (!team.any(open)) break;
   }
@@ -219,9 +219,9 @@ __global__ void __launch_bounds__(kThreads, 2)
 
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    narrow_kernel(const __grid_constant__ NarrowInputs<T> in, int64_t pairs, T* constants) {
+    narrow_kernel(const __grid_constant__ GapInputs<T> in, int64_t pairs, T* constants) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < pairs) narrow_pair(in, i, constants + kConstants * i);
+  if (i < pairs) refresh_gap(in, i, constants + kConstants * i);
 }
 
 // Bytes of each part of the workspace, rounded up to what any type needs.
@@ -281,7 +281,7 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
 }
 
 template <class T>
-cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
+cudaError_t refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
   if (pairs == 0) return cudaSuccess;
   const auto blocks = static_cast<unsigned>((pairs + kThreads - 1) / kThreads);
   narrow_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);
@@ -289,7 +289,7 @@ cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaS
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                       \
-  template cudaError_t narrow<T>(const NarrowInputs<T>&, int64_t, T*, cudaStream_t); \
+  template cudaError_t refresh_gaps<T>(const GapInputs<T>&, int64_t, T*, cudaStream_t); \
   template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&, int64_t);     \
   template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)

@@ -19,6 +19,6 @@ cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* sh
 
 // constants [pairs, 8] (contact/narrow.h).
 template <class T>
-cudaError_t narrow(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
+cudaError_t refresh_gaps(const contact::GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

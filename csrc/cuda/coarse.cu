@@ -368,7 +368,7 @@ cudaError_t Corrections<T>::reverse(int k, int wanted) const {
 template <class T>
 cudaError_t Corrections<T>::press() const {
   const View<T> a{s, *in.coarse, w};
-  if (!a.c.pressed) return cudaSuccess;
+  if (!a.c.has_vertex_blocks) return cudaSuccess;
   if (auto error = launch(press_rows<T>, s.scenes * a.c.plan.listed, kRowThreads, stream, a, in)) return error;
   return pressed_inverse(a.c, s.base, s.scenes, s.positions, w.press, w.matrix, w.inverse, stream);
 }

@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kContactThreads = kWarpsPerBlock * kSlice;
 // Threads for a vertex: of a color, of a color with few vertices, and for a corner point.
-constexpr int kShare = 8, kWide = 32, kCornerShare = 8;
+constexpr int kGapFraction = 8, kWide = 32, kCornerShare = 8;
 
 // Which vertices of the blocks [begin, end) a warp has, where it is one of `roles` for them.
 template <int share>
@@ -73,7 +73,7 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
 
 template <class T>
 __device__ __forceinline__ void add_row(T* rows, int64_t row, const Vec3<T>& a) {
-  contact::add_at(rows + kRow * row, a);
+  add_to(rows + kRow * row, a);
 }
 
 template <int share, class T>
@@ -88,7 +88,7 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
   if (!__any_sync(kWholeWarp, pairs.touches())) return;
   T now[3];
   take_sent(c, pairs, now);
-  if (pairs.touches() && at.lane == 0) add_row(s.w.x_bar, part.row(s, at), contact::vector_at(now));
+  if (pairs.touches() && at.lane == 0) add_row(s.w.x_bar, part.row(s, at), vector_at(now));
 }
 
 template <int share, class T>
@@ -121,7 +121,7 @@ __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __g
   const bool there = local < s.scenes;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();
   if (there) {
-    contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kCornerShare), kCornerShare,
+    contact::gather_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kCornerShare), kCornerShare,
                         now, prev);
   }
   sum_share<kCornerShare, T>(now, prev);
@@ -132,7 +132,7 @@ __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __g
     T* to = collider_bar + 3 * (scene * (in.corners - in.num_vertices) + corner - in.num_vertices);
     to[0] = now.x, to[1] = now.y, to[2] = now.z;
   }
-  contact::add_at(slots.prev + 3 * (scene * in.corners + corner), prev);
+  add_to(slots.prev + 3 * (scene * in.corners + corner), prev);
 }
 
 template <class T>
@@ -141,13 +141,13 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
   const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   const int64_t local = i / in.corners, corner = i - local * in.corners, scene = s.base + local;
   if (local >= s.scenes) return;
-  const Vec3<T> own = contact::vector_at(prev + 3 * (scene * in.corners + corner));
+  const Vec3<T> own = vector_at(prev + 3 * (scene * in.corners + corner));
   if (corner >= in.num_vertices) {
     T* to = out.collider_prev + 3 * (scene * (in.corners - in.num_vertices) + corner - in.num_vertices);
     to[0] = own.x, to[1] = own.y, to[2] = own.z;
     return;
   }
-  contact::add_at(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
+  add_to(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
 }
 
 constexpr int kSumThreads = 1024;
@@ -212,20 +212,20 @@ cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t 
 }
 template <class T>
 cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool follows) const {
-  return over(assemble_contact<kShare, T>, begin, end, kShare, follows, sweep);
+  return over(assemble_contact<kGapFraction, T>, begin, end, kGapFraction, follows, sweep);
 }
 template <class T>
 cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool follows) const {
-  return over(limit_contact<kShare, T>, begin, end, kShare, follows, sweep);
+  return over(limit_contact<kGapFraction, T>, begin, end, kGapFraction, follows, sweep);
 }
 template <class T>
 cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool follows) const {
-  return over(prepare_contact<kShare, T>, begin, end, kShare, follows);
+  return over(prepare_contact<kGapFraction, T>, begin, end, kGapFraction, follows);
 }
 template <class T>
 cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool follows) const {
   if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, follows, kRoles);
-  return over(reverse_contact<kShare, T>, begin, end, kShare, follows, 1);
+  return over(reverse_contact<kGapFraction, T>, begin, end, kGapFraction, follows, 1);
 }
 template <class T>
 cudaError_t ContactPasses<T>::collect(const StepAdjoints<T>& out) const {

@@ -55,7 +55,7 @@ cudaError_t rubbing(const contact::ContactInputs<T>& in, const contact::LagCoeff
                     int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
 template <class T>
 cudaError_t rubbing_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                             const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
+                             const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
                              T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -75,7 +75,7 @@ __global__ void rubbing_forward(const __grid_constant__ ContactInputs<T> in, con
   const LagPair<T> at(in, x, pair);
   const int64_t scene = at.record[5];
   const auto state = contact::lag_state(at.record[4], at.corners, at.constants, at.kappa);
-  contact::store_rubbing(state, by.friction_of(scene), by.damping_of(scene), at.kappa, at.constants.dhat,
+  contact::store_lagged_friction(state, by.friction_of(scene), by.damping_of(scene), at.kappa, at.constants.dhat,
                          values + contact::kLagScalars * pair);
   Vec3<T> force[4];
   for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
@@ -84,12 +84,12 @@ __global__ void rubbing_forward(const __grid_constant__ ContactInputs<T> in, con
 
 template <class T>
 __global__ void rubbing_reverse(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
-                                const contact::RubbingBars<T> given, const T* x, int64_t scenes, int64_t pairs,
+                                const contact::LaggedFrictionBars<T> given, const T* x, int64_t scenes, int64_t pairs,
                                 T* slots) {
   const int64_t pair = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (pair >= pairs || 4 * pair >= in.listed.ptr[scenes * in.corners]) return;
   const LagPair<T> at(in, x, pair);
-  contact::RubbingAdjoint<T> out;
+  contact::LaggedFrictionAdjoint<T> out;
   given.reverse(by, pair, at.record, at.corners, at.constants, at.kappa, out);
   store_slots(out.pair.x, {out.pair.kappa, out.friction, out.damping}, slots + kLagSlots * pair);
 }
@@ -102,7 +102,7 @@ __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t
   const auto lane = static_cast<int>(i % kSlice);
   Vec3<T> sum = zero3<T>();
   for (int e = in.listed.ptr[row] + lane; e < in.listed.ptr[row + 1]; e += kSlice) {
-    sum += contact::vector_at(slots + int64_t{4} * in.listed.entry[e]);
+    sum += vector_at(slots + int64_t{4} * in.listed.entry[e]);
   }
   sum_share<kSlice, T>(sum);
   if (lane != 0) return;
@@ -152,7 +152,7 @@ cudaError_t rubbing(const ContactInputs<T>& in, const contact::LagCoefficients<T
 
 template <class T>
 cudaError_t rubbing_backward(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                             const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
+                             const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
                              T* points, T* kappa, T* friction, T* damping, cudaStream_t stream) {
   if (auto error = launch_contact(rubbing_reverse<T>, pairs, stream, in, by, given, x, scenes, pairs, slots)) {
     return error;
@@ -172,4 +172,4 @@ cudaError_t rubbing_backward(const ContactInputs<T>& in, const contact::LagCoeff
                                                  int64_t, T*, T*, T*, cudaStream_t);                              \
   template cudaError_t diffvbd::cuda::rubbing_backward<T>(                                                        \
       const diffvbd::contact::ContactInputs<T>&, const diffvbd::contact::LagCoefficients<T>&,                     \
-      const diffvbd::contact::RubbingBars<T>&, const T*, int64_t, int64_t, T*, T*, T*, T*, T*, cudaStream_t);
+      const diffvbd::contact::LaggedFrictionBars<T>&, const T*, int64_t, int64_t, T*, T*, T*, T*, T*, cudaStream_t);

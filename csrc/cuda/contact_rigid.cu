@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kOne)
 // Whether groups of more than kFew bodies may move.
 template <class T>
 bool has_many(const RigidInputs<T>& in) {
-  return !in.together() && in.room > kFew;
+  return !in.together() && in.capacity > kFew;
 }
 
 constexpr int64_t kRowsOfBlock = 16384;  // of a scene whose block lists them
@@ -70,7 +70,7 @@ int64_t floors_of(const RigidInputs<T>& in) {
 template <class T>
 int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   const int64_t scenes = in.scene.scenes, bodies = scenes * in.bodies(), rows = room.rows();
-  int64_t bytes = 3 * aligned(2 * rows * sizeof(int32_t)) + aligned(room.listed * kPressDoubles * sizeof(double)) +
+  int64_t bytes = 3 * aligned(2 * rows * sizeof(int32_t)) + aligned(room.listed * kForceDoubles * sizeof(double)) +
                   aligned(bodies * kUnknowns * sizeof(double)) + aligned(counters(bodies) * sizeof(int32_t));
   if (!in.together()) bytes += aligned(groups_bytes(scenes, in.bodies()));
   if (has_many(in)) {
@@ -93,7 +93,7 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   };
   GroupMemory memory{};
   memory.sides = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
-  memory.press = static_cast<double*>(take(room.listed * kPressDoubles * sizeof(double)));
+  memory.press = static_cast<double*>(take(room.listed * kForceDoubles * sizeof(double)));
   memory.steps = static_cast<double*>(take(bodies * kUnknowns * sizeof(double)));
   memory.found = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
   memory.rows = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));

@@ -18,7 +18,7 @@ __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1
 // Bytes of a part of a workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
-// Scalars of a lagged pair in the memory of a correction: a Rubbing, the slip, and of a PairPress what is not zero.
+// Scalars of a lagged pair in the memory of a correction: a LaggedFriction, the slip, and of a PairForce what is not zero.
 enum RubScalar : int {
   kNormal = 0,
   kSlipBefore = 3,
@@ -35,7 +35,7 @@ enum RubScalar : int {
 // Memory of a correction. Of rows the listed pairs are the first, then the lagged.
 struct GroupMemory {
   int32_t* sides;         // [rows, 2]: bodies, -1 where nothing moves
-  double *press, *steps;  // [listed, kPressDoubles], [B, bodies, 6]
+  double *press, *steps;  // [listed, kForceDoubles], [B, bodies, 6]
   double* rubbing;        // [kRubScalars, lagged]: threads next to each other read pairs that are
   double* bases;          // as the factors
   // twice the row of a pair that acts, and the side that a body has of it, for all bodies of a group in a row: those of

@@ -77,7 +77,7 @@ struct GroupSystem {
     each(size(), [&](int32_t i) { unknown(motion, i) = 0; });
     each_body([&](int32_t b) {
       const Whole whole = whole_of(body(b), Warp());
-      if (Warp().leads()) rigid::put(center + 3 * member(b), whole.center);
+      if (Warp().leads()) put(center + 3 * member(b), whole.center);
     });
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
   }
@@ -95,7 +95,7 @@ struct GroupSystem {
     const Body<T> own = body(b);
     const Warp warp;
     const Whole whole = whole_of(own, warp);
-    if (warp.leads()) rigid::put(center + 3 * own.body, whole.center);
+    if (warp.leads()) put(center + 3 * own.body, whole.center);
     warp.meet();
     const bool free = in.free[own.body] && 0 < whole.mass;
     double total[32] = {};  // and the sum of m r^2
@@ -104,7 +104,7 @@ struct GroupSystem {
       const Vector arm = own.position(v) - whole.center;
       Vector g{};
       Sym3<double> H{};
-      vertex_press(in, own, v, g, H);
+      vertex_force(in, own, v, g, H);
       total[kOwn] += own.mass(v) * dot(arm, arm);
       rigid::add_vertex(arm, g, H, total, total + kUnknowns);
     }
@@ -136,7 +136,7 @@ struct GroupSystem {
       const Vector arm = own.position(v) - c;
       Vector g{};
       Sym3<double> H{};
-      add_floor_slip(in, own, v, place % in.planes, moved_by(motion + kUnknowns * own.body, arm), g, H);
+      add_plane_friction(in, own, v, place % in.planes, moved_by(motion + kUnknowns * own.body, arm), g, H);
       rigid::add_vertex(arm, g, H, out, out + kUnknowns);
     }
   }
@@ -150,7 +150,7 @@ struct GroupSystem {
     double own[32] = {};
     if constexpr (rubs) add_floors(b, own);
     for (int32_t e = from + lane; e < to; e += 32) {
-      const PairPress a = press_of<rubs>(rows[e] >> 1);
+      const PairForce a = press_of<rubs>(rows[e] >> 1);
       const int side = rows[e] & 1;
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
@@ -168,7 +168,7 @@ struct GroupSystem {
       for (int32_t e = from + lane; e < to; e += 32) {
         const int32_t entry = rows[e];
         if (sides[entry ^ 1] != number) continue;
-        const PairPress a = press_of<rubs>(entry >> 1);
+        const PairForce a = press_of<rubs>(entry >> 1);
         const int side = entry & 1;
 #pragma unroll
         for (int j = 0; j < kUnknowns; ++j) {
@@ -190,9 +190,9 @@ struct GroupSystem {
     }
   }
   template <bool rubs>
-  __device__ PairPress press_of(int64_t row) const {
-    if constexpr (!rubs) return load_press(press + kPressDoubles * row, sides + 2 * row);
-    PairPress a = sides_of_rub(row);
+  __device__ PairForce press_of(int64_t row) const {
+    if constexpr (!rubs) return load_force(press + kForceDoubles * row, sides + 2 * row);
+    PairForce a = sides_of_rub(row);
     a.force = rub_vector(kForce, row);
     const auto s = [&](int k) { return rub(kStiffness + k, row); };
     a.stiffness = {s(0), s(1), s(2), s(3), s(4), s(5)};
@@ -205,8 +205,8 @@ struct GroupSystem {
     rub(k, row) = a.x, rub(k + 1, row) = a.y, rub(k + 2, row) = a.z;
   }
   // Where its sides are.
-  __device__ PairPress sides_of_rub(int64_t row) const {
-    PairPress a;
+  __device__ PairForce sides_of_rub(int64_t row) const {
+    PairForce a;
     for (int side = 0; side < 2; ++side) {
       a.body[side] = sides[2 * row + side];
       a.weight[side] = rub(kWeight + side, row), a.at[side] = rub_vector(kAt + 3 * side, row);
@@ -236,8 +236,8 @@ struct GroupSystem {
     each_body([&](int32_t b) { add_pairs<false>(b, base, gradient); });
     if (in.lag) {
       each_row([&](int64_t row) {
-        PairPress a;
-        Rubbing rubs;
+        PairForce a;
+        LaggedFriction rubs;
         lagged_sides(in, row - room.listed, CornerPoints<T>{in, false}, -1, a, rubs);  // it acts, or had no row
         put_rub(kNormal, row, rubs.n), put_rub(kSlipBefore, row, rubs.u);
         rub(kLoad, row) = rubs.size, rub(kDamping, row) = rubs.damping, rub(kApproach, row) = rubs.approach;
@@ -253,11 +253,11 @@ struct GroupSystem {
   __device__ void add_friction() const {
     if (in.lag)
       each_row([&](int64_t row) {
-        PairPress a = sides_of_rub(row);
-        const Rubbing own = {rub_vector(kNormal, row), rub_vector(kSlipBefore, row), rub(kLoad, row),
+        PairForce a = sides_of_rub(row);
+        const LaggedFriction own = {rub_vector(kNormal, row), rub_vector(kSlipBefore, row), rub(kLoad, row),
                              rub(kDamping, row), rub(kApproach, row)};
-        contact::rub(own, way_of(a, {center, motion}), in.friction_eps, a);
-        put_rub(kForce, row, a.force), put_rub(kSlip, row, a.slip);
+        contact::lagged_friction_force(own, displacement_of(a, {center, motion}), in.friction_eps, a);
+        put_rub(kForce, row, a.force), put_rub(kSlip, row, a.tangential);
         const Sym3<double>& s = a.stiffness;
         const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz};
         for (int k = 0; k < 6; ++k) rub(kStiffness + k, row) = entries[k];
@@ -316,8 +316,8 @@ struct GroupSystem {
   __device__ void each_line(const F& f) const {
     if (in.lag) {
       each_row([&](int64_t row) {
-        const Vector n = rub_vector(kNormal, row), way = way_of(sides_of_rub(row), {center, steps});
-        f(SlipLine(rub_vector(kSlip, row), way - dot(n, way) * n, rub(kLoad, row), in.friction_eps));
+        const Vector n = rub_vector(kNormal, row), way = displacement_of(sides_of_rub(row), {center, steps});
+        f(FrictionLine(rub_vector(kSlip, row), way - dot(n, way) * n, rub(kLoad, row), in.friction_eps));
       });
     }
     if (in.planes == 0) return;
@@ -327,23 +327,23 @@ struct GroupSystem {
         const int32_t place = floors_of(own)[i], v = own.vertex(place / in.planes);
         const Vector arm = own.position(v) - center_of(b);
         const int64_t at = int64_t{kUnknowns} * own.body;
-        f(slip_line(in, own, v, place % in.planes, arm, motion + at, steps + at));
+        f(friction_line(in, own, v, place % in.planes, arm, motion + at, steps + at));
       }
     });
   }
   __device__ double share(double fall) const {
-    SlipLine kept[kLines];
+    FrictionLine kept[kLines];
     int lines = 0;
-    each_line([&](const SlipLine& a) {
+    each_line([&](const FrictionLine& a) {
       if (lines < kLines) kept[lines] = a;
       ++lines;
     });
-    return slip_share(fall, [&](double tried) {
+    return friction_fraction(fall, [&](double tried) {
       double total[1] = {0};
       for (int l = 0; l < lines && l < kLines; ++l) total[0] += kept[l].excess(tried, in.friction_eps);
       if (lines > kLines) {
         int seen = 0;
-        each_line([&](const SlipLine& line) {
+        each_line([&](const FrictionLine& line) {
           if (seen++ >= kLines) total[0] += line.excess(tried, in.friction_eps);
         });
       }
@@ -354,8 +354,8 @@ struct GroupSystem {
 
   __device__ void solve(Pivots& pivots) const {
     Settling state = kOnItsWay;  // the same for all threads
-    const bool slips = in.rubs(scene);
-    for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
+    const bool slips = in.has_friction_in(scene);
+    for (int iteration = 0; iteration < kFrictionIterations && state != kDone; ++iteration) {
       each_body([&](int32_t b) { copy_column(b); });
       each(size(), [&](int32_t i) { step[i] = gradient[i]; });
       __syncthreads();

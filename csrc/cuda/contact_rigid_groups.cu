@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(kTeam)
   const auto first = static_cast<int32_t>(blockIdx.x % n);
   const Groups groups = in.groups_of(scene);
   const int32_t count = groups.count(first), size = kUnknowns * count;
-  if (count <= kFew || count > in.room) return;
+  if (count <= kFew || count > in.capacity) return;
   const int64_t at = in.matrix_size() * scene + groups.matrix(first);
   const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
   // shared, as there are not enough registers for it

@@ -147,7 +147,7 @@ __global__ void __launch_bounds__(kThreads)
             [&](int32_t i) { join_pair(in, t, i < repels ? repelling + i : rubbing + i - repels, i < repels); });
   cluster.meet();
   const int32_t near = t.nears[scene];
-  for (int attempt = -1; attempt < kTries; ++attempt) {  // -1: where they are
+  for (int attempt = -1; attempt < kTrials; ++attempt) {  // -1: where they are
     const bool moved = 0 <= attempt;
     double* const to = (moved ? t.after : t.before) + unit;
     if (moved) {
@@ -217,14 +217,14 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   const auto counts = [&](int64_t count) { return reinterpret_cast<Count*>(take(count * sizeof(Count))); };
   const auto whole = [&](int64_t count) { return reinterpret_cast<int32_t*>(take(count * sizeof(int32_t))); };
   Tried<T> t{};
-  t.center = center, t.motion = motion, t.share = out.share, t.move = move;
+  t.center = center, t.motion = motion, t.share = out.fraction, t.move = move;
   t.low = numbers(units), t.next = numbers(units), t.way = numbers(units), t.size = numbers(units);
   t.before = numbers(units), t.after = numbers(units);
   t.largest = counts(units), t.rise = counts(units), t.whole = counts(units);
   t.value = numbers(rows), t.press = numbers(room.rows());
   t.lead = whole(units), t.together = whole(units), t.touching = whole(2 * room.listed), t.touches = whole(scenes);
   t.near = whole(room.listed), t.nears = whole(scenes);
-  t.state.share = reinterpret_cast<T*>(take(units * sizeof(T)));
+  t.state.fraction = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.blocked = take(units), t.state.stamp = take(units);
   t.decided = take(units), t.stopped = take(units), t.done = take(scenes);
@@ -248,7 +248,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
     }
   };
   look(false, t.before);
-  for (int attempt = 0; attempt < kTries; ++attempt) {
+  for (int attempt = 0; attempt < kTrials; ++attempt) {
     displace_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, t, nullptr);
     look(true, t.after);
     decide_kernel<T><<<static_cast<unsigned>(scenes), kOne, 0, stream>>>(in, t, attempt);

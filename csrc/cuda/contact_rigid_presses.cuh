@@ -70,8 +70,8 @@ struct Barriers {
   const int32_t* sides;
   const double* presses;
   static constexpr bool rubs = false;
-  __device__ PairPress operator()(int64_t row, int) const {
-    return load_press(presses + kPressDoubles * row, sides + 2 * row);
+  __device__ PairForce operator()(int64_t row, int) const {
+    return load_force(presses + kForceDoubles * row, sides + 2 * row);
   }
 };
 // Friction and damping of lagged ones, for a side that may be solved for alone.
@@ -79,11 +79,11 @@ template <class T>
 struct Rubs {
   const RigidInputs<T>& in;
   int64_t listed;
-  Slid slid;
+  BodyMotions slid;
   static constexpr bool rubs = true;
-  __device__ PairPress operator()(int64_t row, int side) const {
-    PairPress a;
-    lagged_press(in, row - listed, CornerPoints<T>{in, false}, slid, a, side);
+  __device__ PairForce operator()(int64_t row, int side) const {
+    PairForce a;
+    lagged_force(in, row - listed, CornerPoints<T>{in, false}, slid, a, side);
     return a;
   }
 };

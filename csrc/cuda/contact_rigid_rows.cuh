@@ -33,16 +33,16 @@ __device__ void each_side(const RigidInputs<T>& in, const PairRoom& room, const 
 template <class T>
 __device__ void press_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
   const CornerPoints<T> at{in, false};
-  PairPress a;
+  PairForce a;
   const int64_t scene = scene_of_row(in, room, row);
   bool acts = false;
   if (in.together() && !in.moves(scene, in.groups_of(scene), 0)) {
     // nobody is solved for: a captured step makes all of its corrections, of which most move nothing
   } else if (row < room.listed) {
-    acts = barrier_press(in, row, at, a);
-    if (acts) store_press(a, memory.press + kPressDoubles * row);
+    acts = barrier_force(in, row, at, a);
+    if (acts) store_force(a, memory.press + kForceDoubles * row);
   } else {
-    acts = lagged_press(in, row - room.listed, at, Slid{}, a, -1);
+    acts = lagged_force(in, row - room.listed, at, BodyMotions{}, a, -1);
   }
   for (int side = 0; side < 2; ++side) memory.sides[2 * row + side] = acts ? a.body[side] : -1;
 }

@@ -39,7 +39,7 @@ __device__ void begin_body(const RigidInputs<T>& in, const Tried<T>& t, int64_t 
   t.way[unit] = t.size[unit] = 0;
   t.lead[unit] = static_cast<int32_t>(unit % in.bodies());
   t.decided[unit] = 0;
-  t.state.share[unit] = T(0), t.state.now[unit] = T(1);
+  t.state.fraction[unit] = T(0), t.state.now[unit] = T(1);
   t.state.blocked[unit] = t.state.stamp[unit] = 0;
 }
 
@@ -66,7 +66,7 @@ __device__ void find_way(const RigidInputs<T>& in, const Tried<T>& t, int64_t ro
   const Vertex<T> at(in, row);
   const Body<T> body{in.scene, at.scene, at.body};
   const Farthest own = farthest_of(in, body, at.v, t.center + 3 * at.unit, t.motion + kUnknowns * at.unit);
-  raise_to(t.way + at.unit, own.way), raise_to(t.size + at.unit, own.size);
+  raise_to(t.way + at.unit, own.displacement), raise_to(t.size + at.unit, own.size);
 }
 
 // Which pairs may press, and who decides together: their order does not matter.
@@ -76,7 +76,7 @@ __device__ void join_pair(const RigidInputs<T>& in, const Tried<T>& t, int64_t p
   const int64_t scene = record[5], first = scene * in.bodies();
   if (repels) {
     t.press[pair] = 0;
-    if (!may_press(in, pair, t.way + first, t.size + first)) return;
+    if (!may_touch(in, pair, t.way + first, t.size + first)) return;
     if (owner_of(in, record) >= 0)
       t.near[in.first_listed(scene) + atomicAdd(t.nears + scene, 1)] = static_cast<int32_t>(pair);
   } else if (!Lag<T>(in.lag + kLagScalars * pair).active()) {
@@ -90,8 +90,8 @@ template <class T>
 __device__ void displace(const RigidInputs<T>& in, const Tried<T>& t, int64_t row, T* x) {
   const Vertex<T> at(in, row);
   if (!x && t.decided[at.unit]) return;
-  const Vector r = Body<T>::at(in.scene.x + 3 * row) - vector_of(t.center + 3 * at.unit);
-  rigid::put(t.move + 3 * row, displaced(t.motion + kUnknowns * at.unit, t.share[at.unit], r));
+  const Vector r = wide_at(in.scene.x + 3 * row) - vector_of(t.center + 3 * at.unit);
+  put(t.move + 3 * row, displaced(t.motion + kUnknowns * at.unit, t.share[at.unit], r));
   if (!x) {
     t.motions[row] = motion_of(in.gate, t.state, at.scene, at.v);
     return;
@@ -121,10 +121,10 @@ __device__ void try_pair_of(const RigidInputs<T>& in, const Tried<T>& t, int64_t
   const int32_t owner = owner_of(in, record);
   if (owner < 0 || t.decided[record[5] * int64_t{in.bodies()} + owner]) return;
   const CornerPoints<T> at{in, moved};
-  PairPress a;
-  const bool acts = repels ? barrier_press(in, pair, at, a) : lagged_press(in, pair, at, Slid{}, a, -1);
+  PairForce a;
+  const bool acts = repels ? barrier_force(in, pair, at, a) : lagged_force(in, pair, at, BodyMotions{}, a, -1);
   value = acts ? a.value : 0;
-  if (moved && repels) try_pair(in.gate, t.state, pair, 0);
+  if (moved && repels) test_pair(in.gate, t.state, pair, 0);
   if (moved || !repels || !acts || a.body[0] < 0 || a.body[1] < 0) return;
   const int64_t scene = record[5];
   int32_t* to = t.touching + 2 * (in.first_listed(scene) + atomicAdd(t.touches + scene, 1));
@@ -242,7 +242,7 @@ __device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scen
   });
   __syncthreads();
   bool open = false;
-  const bool last = attempt + 1 == kTries;
+  const bool last = attempt + 1 == kTrials;
   each_open([&](int64_t k, int64_t of) {
     const bool fits = !own.stopped[of], finite = own.largest[of] < bits_of(CUDART_INF);
     const auto before = static_cast<long long>(own.whole[of]), rise = static_cast<long long>(own.rise[of]);
@@ -281,10 +281,10 @@ __device__ void end_scene(const RigidInputs<T>& in, const double* motion, const 
   const int64_t first = in.bodies() * scene, last = first + in.bodies();
   bool some = false;
   for (int64_t unit = first + threadIdx.x; unit < last; unit += blockDim.x) {
-    some = end_tries(in, motion, unit, out) || some;
+    some = finish_trials(in, motion, unit, out) || some;
   }
   if (__syncthreads_or(some)) return;
-  for (int64_t unit = first + threadIdx.x; unit < last; unit += blockDim.x) out.held[unit] = false;
+  for (int64_t unit = first + threadIdx.x; unit < last; unit += blockDim.x) out.blocked[unit] = false;
 }
 
 }  // namespace

@@ -42,7 +42,7 @@ struct TapeRows {
 template <class T>
 struct UserRows {
   const T* x;
-  __device__ __forceinline__ Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+  __device__ __forceinline__ Vec3<T> operator()(int v) const { return vector_at(x + int64_t{3} * v); }
 };
 
 }  // namespace

@@ -108,11 +108,11 @@ struct PairsOf {
     sums.store(to);
   }
 
-  __device__ __forceinline__ contact::OwnRoom<T> room() const {
-    return vertex < 0 ? contact::OwnRoom<T>{} : contact::OwnRoom<T>(source, vertex);
+  __device__ __forceinline__ contact::TrustRegion<T> room() const {
+    return vertex < 0 ? contact::TrustRegion<T>{} : contact::TrustRegion<T>(source, vertex);
   }
   // The exponent of the limit of an update that goes from where the vertex was by d.
-  __device__ __forceinline__ int limit(const contact::OwnRoom<T>& own, const Vec3<T>& from, const Vec3<T>& d) {
+  __device__ __forceinline__ int limit(const contact::TrustRegion<T>& own, const Vec3<T>& from, const Vec3<T>& d) {
     int exponent = 0;
     T length = T(0), guard = T(0);
     if (vertex >= 0) exponent = own.limit(from, d), length = contact::length_of(d), guard = own.guard(from);
@@ -131,7 +131,7 @@ struct PairsOf {
       __syncwarp();
       exponent = memory.exponents[at.group];
     };
-    const T reach = contact::limit_of<T>(least) * length / T(contact::kBothShare) + guard;
+    const T reach = contact::limit_of<T>(least) * length / T(contact::kBothGapFraction) + guard;
     if (remembers && __all_sync(kWholeWarp, kept <= kKept && reach < clear)) {
       const auto thread = static_cast<int>(threadIdx.x % kSlice);
       for (int first = 0; first < kept; first += kSlice) {
@@ -203,13 +203,13 @@ __device__ __forceinline__ void take_sent(const ContactView<T>& c, const PairsOf
   const int64_t scene = pairs.source.scene;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();
   if (pairs.touches()) {
-    contact::take_pairs(c.in, c.slots, scene, pairs.vertex, pairs.at.lane, pairs.share, now, prev);
+    contact::gather_pairs(c.in, c.slots, scene, pairs.vertex, pairs.at.lane, pairs.share, now, prev);
   }
   __syncwarp();
   pairs.at.template sum<T>(now, prev);
   if (pairs.vertex < 0 || pairs.at.lane != 0) return;
   bar[0] = now.x, bar[1] = now.y, bar[2] = now.z;
-  if (pairs.touches()) contact::add_at(c.slots.prev + 3 * (scene * c.in.corners + pairs.vertex), prev);
+  if (pairs.touches()) add_to(c.slots.prev + 3 * (scene * c.in.corners + pairs.vertex), prev);
 }
 
 // The adjoint of what the pairs of a warp's vertices have added to their blocks, into the slots of the pairs.
@@ -227,7 +227,7 @@ __device__ __forceinline__ void send_pairs(const StepView<T>& s, const ContactVi
   Vec3<T> p = zero3<T>(), d_raw = zero3<T>();
   if (touches) {
     const T* turn = s.w.turn + 6 * row;
-    p = contact::vector_at(turn), d_raw = contact::vector_at(turn + 3);
+    p = vector_at(turn), d_raw = vector_at(turn + 3);
   }
   // f(vertex, p, d_raw) of whose entry has been found
   const auto reverse = [&](const Found& found, const auto& f) {
@@ -261,8 +261,8 @@ __device__ __forceinline__ void send_pairs(const StepView<T>& s, const ContactVi
   __syncwarp();
   at.template sum<T>(own);
   if (!touches || at.lane != 0) return;
-  contact::add_at(s.w.x_bar + kRow * row, own);
-  contact::add_at(c.slots.prev + 3 * (pairs.source.scene * in.corners + pairs.vertex), -own);
+  add_to(s.w.x_bar + kRow * row, own);
+  add_to(c.slots.prev + 3 * (pairs.source.scene * in.corners + pairs.vertex), -own);
 }
 
 template <class T>

@@ -8,8 +8,8 @@
 namespace diffvbd::cuda {
 
 template <class T>
-int64_t keep_bytes(const contact::KeepInputs<T>& in);
+int64_t keep_bytes(const contact::CompactInputs<T>& in);
 template <class T>
-cudaError_t keep(const contact::KeepInputs<T>& in, const contact::Kept<T>& out, void* workspace, cudaStream_t stream);
+cudaError_t keep(const contact::CompactInputs<T>& in, const contact::CompactList<T>& out, void* workspace, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

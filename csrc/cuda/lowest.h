@@ -9,6 +9,6 @@ namespace diffvbd::cuda {
 
 // own, out: [B, bodies, planes]
 template <class T>
-cudaError_t lowest_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out, cudaStream_t stream);
+cudaError_t lowest_vertices(const contact::SupportVertexInputs<T>& in, int32_t* own, int32_t* out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -15,13 +15,13 @@ cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::Mo
                            cudaStream_t stream);
 
 template <class T>
-cudaError_t coast(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
+cudaError_t extrapolate(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
 template <class T>
-cudaError_t reverse_coast(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
+cudaError_t reverse_extrapolate(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
                           cudaStream_t stream);
 
 // islands: memory of islands_workspace_bytes().
 template <class T>
-cudaError_t find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work, void* islands, cudaStream_t stream);
+cudaError_t find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work, void* islands, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -38,14 +38,14 @@ cudaError_t act_on_vertices(const Act& act, cudaStream_t stream) {
 #define DIFFVBD_INSTANTIATE(on, Act)                                          \
   template cudaError_t act_on_##on(const contact::Act<float>&, cudaStream_t); \
   template cudaError_t act_on_##on(const contact::Act<double>&, cudaStream_t);
-DIFFVBD_INSTANTIATE(bodies, AboveFloorWays)
+DIFFVBD_INSTANTIATE(bodies, AboveFloorDisplacements)
 DIFFVBD_INSTANTIATE(bodies, ReverseAboveFloor)
 DIFFVBD_INSTANTIATE(bodies, Frames)
 DIFFVBD_INSTANTIATE(bodies, Bends)
-DIFFVBD_INSTANTIATE(bodies, HeldUp)
+DIFFVBD_INSTANTIATE(bodies, BlockedBodies)
 DIFFVBD_INSTANTIATE(vertices, Wishes)
-DIFFVBD_INSTANTIATE(vertices, Holds)
-DIFFVBD_INSTANTIATE(vertices, Falls)
+DIFFVBD_INSTANTIATE(vertices, Freeze)
+DIFFVBD_INSTANTIATE(vertices, GravityMoves)
 DIFFVBD_INSTANTIATE(vertices, Starts)
 DIFFVBD_INSTANTIATE(vertices, ReverseStarts)
 #undef DIFFVBD_INSTANTIATE

@@ -17,7 +17,7 @@ constexpr int kColumn = kSlice + 1;  // distance of a column's entries: one more
 // Two kernels do a step: one of usual sets for all scenes, and one for those that it has marked.
 template <int mask>
 struct UsualVariant {
-  using Set = Usual<EnergySet<mask>>;
+  using Set = WellConditioned<EnergySet<mask>>;
 };
 template <int mask>
 struct RareVariant {
@@ -25,13 +25,13 @@ struct RareVariant {
 };
 template <class Set>
 constexpr bool marks() {
-  return Set::usual;
+  return Set::well_conditioned;
 }
 // A bit for each thread of the warp: whether it has its scene to do.
 template <class Set>
 __device__ __forceinline__ unsigned scenes_to_do(const uint8_t* rare, int64_t scene, int64_t scenes) {
   bool mine = scene < scenes;
-  if constexpr (!Set::usual) mine = mine && rare[scene] != 0;
+  if constexpr (!Set::well_conditioned) mine = mine && rare[scene] != 0;
   return __ballot_sync(kWholeWarp, mine);
 }
 

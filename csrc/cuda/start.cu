@@ -45,7 +45,7 @@ __global__ void reverse_vertices(const __grid_constant__ contact::TranslationInp
                                  T* move_bar, T* mass_bar) {
   const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= in.scenes * in.vertices) return;
-  contact::reverse_vertex_share(in, rate, mean, row / in.vertices, static_cast<int32_t>(row % in.vertices), move_bar,
+  contact::reverse_vertex_mean(in, rate, mean, row / in.vertices, static_cast<int32_t>(row % in.vertices), move_bar,
                                 mass_bar);
 }
 

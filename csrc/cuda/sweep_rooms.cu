@@ -3,8 +3,8 @@
 namespace diffvbd::cuda {
 namespace {
 
-using contact::SweepRoomInputs;
-using contact::SweepWays;
+using contact::SweepRadiusInputs;
+using contact::SweepDisplacements;
 
 constexpr int kThreads = 128;
 
@@ -19,19 +19,19 @@ __device__ void reduce_block(E* part, const F& keep) {
 
 // A block for each body of each scene.
 template <class T>
-__global__ void __launch_bounds__(kThreads) wish_kernel(const __grid_constant__ SweepRoomInputs<T> in, T* wishes) {
-  __shared__ SweepWays<T> part[kThreads];
+__global__ void __launch_bounds__(kThreads) wish_kernel(const __grid_constant__ SweepRadiusInputs<T> in, T* wishes) {
+  __shared__ SweepDisplacements<T> part[kThreads];
   const int64_t row = blockIdx.x;
   part[threadIdx.x] =
-      contact::ways_of_body(in, row / in.bodies, row % in.bodies, static_cast<int32_t>(threadIdx.x), kThreads);
-  reduce_block(part, [](SweepWays<T>& own, const SweepWays<T>& other) { own.keep(other); });
+      contact::displacements_of_body(in, row / in.bodies, row % in.bodies, static_cast<int32_t>(threadIdx.x), kThreads);
+  reduce_block(part, [](SweepDisplacements<T>& own, const SweepDisplacements<T>& other) { own.keep(other); });
   if (threadIdx.x == 0) wishes[row] = contact::wish_of_body(in, part[0], row);
 }
 
 // A block for each scene.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    most_kernel(const __grid_constant__ SweepRoomInputs<T> in, const T* wishes, T* most) {
+    most_kernel(const __grid_constant__ SweepRadiusInputs<T> in, const T* wishes, T* most) {
   __shared__ T part[kThreads];
   part[threadIdx.x] =
       contact::most_of_scene(in, wishes, int64_t{blockIdx.x}, static_cast<int32_t>(threadIdx.x), kThreads);
@@ -41,17 +41,17 @@ __global__ void __launch_bounds__(kThreads)
 
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    room_kernel(const __grid_constant__ SweepRoomInputs<T> in, const T* most, T* rooms) {
+    room_kernel(const __grid_constant__ SweepRadiusInputs<T> in, const T* most, T* rooms) {
   const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= in.scenes * in.vertices) return;
   const int64_t scene = row / in.vertices;
-  rooms[row] = contact::sweep_room(in, most[scene], scene, row % in.vertices);
+  rooms[row] = contact::sweep_radius(in, most[scene], scene, row % in.vertices);
 }
 
 }  // namespace
 
 template <class T>
-cudaError_t sweep_rooms(const SweepRoomInputs<T>& in, T* wishes, T* most, T* rooms, cudaStream_t stream) {
+cudaError_t sweep_rooms(const SweepRadiusInputs<T>& in, T* wishes, T* most, T* rooms, cudaStream_t stream) {
   const int64_t vertices = in.scenes * in.vertices;
   if (vertices == 0) return cudaSuccess;
   wish_kernel<T><<<static_cast<unsigned>(in.scenes * in.bodies), kThreads, 0, stream>>>(in, wishes);
@@ -60,7 +60,7 @@ cudaError_t sweep_rooms(const SweepRoomInputs<T>& in, T* wishes, T* most, T* roo
   return cudaGetLastError();
 }
 
-template cudaError_t sweep_rooms<float>(const SweepRoomInputs<float>&, float*, float*, float*, cudaStream_t);
-template cudaError_t sweep_rooms<double>(const SweepRoomInputs<double>&, double*, double*, double*, cudaStream_t);
+template cudaError_t sweep_rooms<float>(const SweepRadiusInputs<float>&, float*, float*, float*, cudaStream_t);
+template cudaError_t sweep_rooms<double>(const SweepRadiusInputs<double>&, double*, double*, double*, cudaStream_t);
 
 }  // namespace diffvbd::cuda

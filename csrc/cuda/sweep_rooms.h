@@ -9,6 +9,6 @@ namespace diffvbd::cuda {
 
 // rooms [B, V]; wishes [B, bodies] and most [B] are for the kernels
 template <class T>
-cudaError_t sweep_rooms(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* rooms, cudaStream_t stream);
+cudaError_t sweep_rooms(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* rooms, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

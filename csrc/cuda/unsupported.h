@@ -9,9 +9,9 @@ namespace diffvbd::cuda {
 
 // out [B, V, 3]
 template <class T>
-cudaError_t unsupported(const contact::UnsupportedInputs<T>& in, T* out, cudaStream_t stream);
+cudaError_t unsupported(const contact::ResidualInputs<T>& in, T* out, cudaStream_t stream);
 template <class T>
-cudaError_t unsupported_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
-                                 const contact::UnsupportedAdjoints<T>& out, cudaStream_t stream);
+cudaError_t unsupported_backward(const contact::ResidualInputs<T>& in, const T* bar,
+                                 const contact::ResidualAdjoints<T>& out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -26,7 +26,7 @@ struct Plan {
   const int32_t *row_ptr, *row;                  // [functions + 1], [entries]  the positions of a function
   const int32_t* block_ptr;                      // [bodies + 1]  blocks of kLanes tets of a body
   const int32_t* part_ptr;                       // [bodies + 1]  parts of a body: sums over its tets are made of theirs
-  const int32_t *part_body, *part_begin;         // [parts], [parts + 1]  blocks of a part
+  const int32_t *release_body, *part_begin;      // [parts], [parts + 1]  blocks of a part
   const int32_t* corner;                         // [tet_blocks, 4, kLanes]  positions times kRow
   const int32_t* tet;             // [tet_blocks, kLanes]  any at padding, which has one corner four times
   const int32_t* group_ptr;       // [bodies + 1]  groups of a body
@@ -64,7 +64,7 @@ DIFFVBD_FN Plan view_plan(const int64_t* sizes, const int32_t* p, int64_t& used)
   out.row = take(out.entries);
   out.block_ptr = take(out.bodies + 1);
   out.part_ptr = take(out.bodies + 1);
-  out.part_body = take(out.parts);
+  out.release_body = take(out.parts);
   out.part_begin = take(out.parts + 1);
   out.corner = take(int64_t{4} * out.tet_blocks * kLanes);
   out.tet = take(int64_t{out.tet_blocks} * kLanes);
@@ -92,14 +92,15 @@ struct Inputs {
   Plan plan;
   const T *weight, *row_weight;  // [entries] each, by position and by function
   Batched<const T> rest;         // [B, tet_blocks, kRestScalars, kLanes]
-  Batched<const T> factor;       // [B, 9 cells]  L of A = L L^T of each body, n x n; on CUDA the inverse; if pressed A
-  Batched<const T> mass;         // [B, mass_ptr[bodies]]
+  Batched<const T>
+      factor;             // [B, 9 cells]  L of A = L L^T of each body, n x n; on CUDA the inverse; A with vertex blocks
+  Batched<const T> mass;  // [B, mass_ptr[bodies]]
   int corrections;
   T* tape;        // [B, corrections, tape_size()]
   T* matrix_bar;  // [B, 9 mass_ptr[bodies]], reverse only; null where not wanted
 
   bool keeps_positions;
-  bool pressed;  // whether energies of vertices act: each correction then adds their blocks to A
+  bool has_vertex_blocks;  // whether energies of vertices act: each correction then adds their blocks to A
 
   // of a correction: the coarse vector, the length of each body and, where gaps must come back to the bit, what it read
   DIFFVBD_FN int64_t tape_size() const {
@@ -118,10 +119,10 @@ DIFFVBD_FN bool corrects_before(int k, int sweeps, int every, int begun) {
   return sweeps + begun <= 1 ? k == sweeps : after >= 0 && k < sweeps && after % every == 0;
 }
 
-// How far a body goes along a correction: the longest of a few lengths that lowers the potential enough.
+// --- the length of a correction: the longest of a few that lowers the potential enough
 
 constexpr int kDegree = TetLayout::line_degree;
-constexpr double kDecrease = 1e-4;  // share of what the slope promises
+constexpr double kDecrease = 1e-4;  // of the decrease that the slope promises
 constexpr int kFailures = 2;        // lengths of 0 after which a body's corrections are over
 
 // The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes.
@@ -148,18 +149,17 @@ DIFFVBD_FN double length(const Change& change, double slope, const More& more) {
   for (int trial = 0; trial < kFractions; ++trial) {
     const double s = fraction_of(trial);
     double size = change.size(s);
-    const double rise = change.at(s) + more(s, size);
-    if (rise <= kDecrease * s * slope + kRounding * double(std::numeric_limits<T>::epsilon()) * size) return s;
+    const double increase = change.at(s) + more(s, size);
+    if (increase <= kDecrease * s * slope + kRounding * double(std::numeric_limits<T>::epsilon()) * size) return s;
   }
   return 0;
 }
 
-// How the potential of a body changes along a correction, and how far the body goes. Loops and sums belong to a Team
-// (rigid/body.h).
+// --- the potential of a body along a correction, and the length of the step. Sums belong to a Team (sweep/body.h).
 
 using rigid::Vector;
 
-// One body of one scene. In: StepInputs of a backend; x, way: rows of its positions.
+// One body of one scene. In: StepInputs of a backend; x, displacement: rows of its positions.
 template <class T, class In>
 struct Line {
   const In& in;
@@ -167,7 +167,7 @@ struct Line {
   const int64_t* data_start;  // of each energy among the data of a scene
   int64_t scene;
   int32_t body;
-  const T *x, *way;
+  const T *x, *displacement;
 
   DIFFVBD_FN int32_t size() const { return c.plan.list_ptr[body + 1] - c.plan.list_ptr[body]; }
   DIFFVBD_FN int32_t vertex(int32_t i) const { return c.plan.list[c.plan.list_ptr[body] + i]; }
@@ -178,7 +178,7 @@ struct Line {
   DIFFVBD_FN double inertia(int32_t i) const {
     const int64_t v = vertex(i);
     const double mass = in.mass.data[scene * in.mass.scene + v];
-    return mass * dot(at(x + row(i)) - at(in.y.data + scene * in.y.scene + 3 * v), at(way + row(i)));
+    return mass * dot(at(x + row(i)) - at(in.y.data + scene * in.y.scene + 3 * v), at(displacement + row(i)));
   }
 
   DIFFVBD_FN VertexState<double> state(int32_t i) const {
@@ -206,26 +206,26 @@ struct Line {
         VertexEnergies{});
   }
 
-  // By how much the energies of vertex i alone rise: infinite where one of them does not admit the motion. Adds their
-  // sizes to `size`.
+  // The increase of the energies of vertex i: infinite where one of them does not admit the motion. Adds their sizes to
+  // `size`.
   DIFFVBD_FN double energies(int32_t i, double s, double& size) const {
     const VertexState<double> before = state(i);
     VertexState<double> after = before;
-    after.x += s * at(way + row(i));
-    double rise = 0;
+    after.x += s * at(displacement + row(i));
+    double increase = 0;
     bool admitted = true;
     each_energy(i, [&](auto energy, const double* data, int count) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
-        admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastShare);
-        rise += E::change(before, s * at(way + row(i)), data, count, size);
+        admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastGapFraction);
+        increase += E::change(before, s * at(displacement + row(i)), data, count, size);
       } else {
         const double now = E::value(before, data, count), then = E::value(after, data, count);
-        rise += then - now;
+        increase += then - now;
         size += std::abs(now) + std::abs(then);
       }
     });
-    return admitted ? rise : std::numeric_limits<double>::infinity();
+    return admitted ? increase : std::numeric_limits<double>::infinity();
   }
 
   // What they add to the block of vertex i.
@@ -282,13 +282,13 @@ DIFFVBD_FN double decide(const Line<T, In>& line, const T* a, const T* restricte
   });
 }
 
-// What the rise of the potential of all bodies is made of (rigid/rise.h).
+// --- the increase of the potential of all bodies (subspace/rigid.h)
 
 constexpr int kBlockTets = 8;  // of a block of MovingBodies; at padding one vertex four times
 
 template <class T>
-struct RiseInputs {
-  rigid::Inputs<T> bodies;            // x is where the ways begin,
+struct IncreaseInputs {
+  rigid::Inputs<T> bodies;            // x is where the displacements begin,
   const T* to;                        // [B, V, 3] and this where they end
   const int32_t *corner, *block_ptr;  // [blocks, 4, kBlockTets] four times a vertex; [bodies + 1]
   Batched<const T> rest, material;    // of the tets by block, [blocks, 7 | 2, kBlockTets]

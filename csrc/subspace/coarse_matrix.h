@@ -218,8 +218,8 @@ void assemble_vjp(const MatrixInputs<T>& in, int64_t scene, int body, const T* b
   }
 }
 
-// What the matrices of a coarse space are made of, from the functions W of each body: the stiffness of a group at rest,
-// sum over its tets of W^T K W, and the masses W^T M W; and their transposes (docs/method.md, section 15).
+// --- the sums of these matrices, from the functions W of each body: the stiffness of a group at rest, sum over its
+// tets of W^T K W, and the masses W^T M W; and their transposes (docs/method.md, section 15)
 
 template <class T>
 struct StiffnessInputs {

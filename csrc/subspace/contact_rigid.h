@@ -1,5 +1,8 @@
-// Groups of bodies whose rigid motions are solved for together (docs/method.md, section 18): those that touch, unless
-// they are too many: then each of them is left alone. Scenes of few bodies are one group.
+// The rigid correction of bodies that touch (docs/method.md, section 18): groups, the gradient and the matrix of the
+// incremental potential over a turn and a shift of every body, friction along a step, and the trial fractions of the
+// Newton step. In double precision.
+// Groups of bodies are solved for together: those that touch, unless they are too many; then each is a group by itself.
+// Scenes of few bodies are one group.
 #pragma once
 
 #include <cstdint>
@@ -14,28 +17,28 @@ namespace diffvbd::contact {
 constexpr int kUnknowns = 6;                // of a body: a turn and a shift
 constexpr int kFew = 3;                     // bodies of scenes that are one group
 constexpr int kMostCoupled = 64;            // bodies of a group
-constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: room for matrices
+constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: memory of matrices
 constexpr int kGroupRows = 4;               // member, first, rank and count
-constexpr int32_t kLeft = -1;               // as the count of a group: a body of too many that touch
+constexpr int32_t kLeft = -1;               // count of a group: a body of too many that touch
 
-// Bodies of a group at most.
+// The most bodies of a group.
 DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
   if (bodies == 0) return 0;
   const int64_t most = kGroupMemory / bodies < kMostCoupled ? kGroupMemory / bodies : kMostCoupled;
   return most < 1 ? 1 : most < bodies ? most : bodies;
 }
 
-// Those of a scene. Bodies have places, those of a group in a row: of no more than kFew in the order of their numbers,
-// else in that of their elimination, if they are solved for.
+// The groups of a scene. Bodies have places, those of a group in a row: up to kFew in the order of their numbers, more
+// in the order of elimination.
 struct Groups {
   int32_t bodies;
-  int64_t room;  // bodies of a group that the memory of its matrix has room for: none is solved for that has more
+  int64_t capacity;     // bodies of a group that fit the memory of its matrix: larger groups do not move
   const int32_t* rows;  // [4, bodies], or null: all are one group
 
   DIFFVBD_FN int32_t member(int32_t place) const { return rows ? rows[place] : place; }
   DIFFVBD_FN int32_t first(int32_t body) const { return rows ? rows[bodies + body] : 0; }
   DIFFVBD_FN int32_t rank(int32_t body) const { return rows ? rows[2 * bodies + body] : body; }
-  // Of the group that begins at a place, or 0.
+  // The size of the group that begins at a place, or 0.
   DIFFVBD_FN int32_t count(int32_t place) const {
     if (!rows) return place == 0 ? bodies : 0;
     return is_left(place) ? 1 : rows[3 * bodies + place];
@@ -43,59 +46,55 @@ struct Groups {
   // Whether the body there is alone because those that touch are too many.
   DIFFVBD_FN bool is_left(int32_t place) const { return rows && rows[3 * bodies + place] == kLeft; }
   DIFFVBD_FN bool joined(int32_t a, int32_t b) const { return first(a) == first(b); }
-  // Where in the memory of its scene the matrix of the group is that begins at a place.
-  DIFFVBD_FN int64_t matrix(int32_t place) const { return rows ? kUnknowns * kUnknowns * room * place : 0; }
+  // The offset of the matrix of the group that begins at a place.
+  DIFFVBD_FN int64_t matrix(int32_t place) const { return rows ? kUnknowns * kUnknowns * capacity * place : 0; }
 };
-
-// The rigid correction of bodies that touch (docs/method.md, section 18): what vertices and pairs add to the gradient
-// and the matrix of the step's potential over a turn and a shift of every body, and which share of the Newton step each
-// body may take. In double, whatever the dtype of the scene.
 
 using rigid::Vector;
 
-constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2, that keeps its system definite
+constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2: keeps its system definite
 
 template <class T>
 struct RigidInputs {
   rigid::Inputs<T> scene;  // x, x_prev, y, mass, energies, and the vertices of all bodies
-  AdvanceInputs<T> gate;   // pairs that repel, rooms; `move` is what is tried
+  AdvanceInputs<T> gate;   // pairs with a barrier, radii; `move` is the trial displacement
   PairList lagged;
   const T* lag;                       // [pairs, 9] or null
   const T* collider_prev;             // [B, Vc, 3]
   Batched<const T> kappa, floor_lag;  // floor_lag [1 | B, V, planes, 4]
   const bool* free;                   // [bodies]: nothing of it is pinned
-  const int32_t* groups;              // [B, 4, bodies], or null where they do not matter or all are one
-  int64_t room;                       // bodies of a group that the memory of its matrix has room for
-  const bool* moving;                 // [B, bodies]: those that do, or null, if all do
+  const int32_t* groups;              // [B, 4, bodies], or null: one group, or not needed
+  int64_t capacity;                   // bodies of a group that fit the memory of its matrix
+  const bool* moving;                 // [B, bodies], or null: all move
   int32_t planes;
   double friction_eps;
   bool has_friction;
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
   // Lists are of all scenes, but what a scene does must not depend on others.
-  DIFFVBD_FN bool rubs(int64_t s) const {
+  DIFFVBD_FN bool has_friction_in(int64_t s) const {
     return has_friction && (planes > 0 || first_lagged(s) < first_lagged(s + 1));
   }
   // Whether all bodies of a scene are one group.
   DIFFVBD_FN bool together() const { return scene.bodies <= kFew; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {
-    return {scene.bodies, room, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
+    return {scene.bodies, capacity, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
   }
-  // Whether the group that begins at a place moves: one of it is to, and there is room for its matrix.
+  // Whether the group that begins at a place moves: some body of it is to, and its matrix fits.
   DIFFVBD_FN bool moves(int64_t s, const Groups& g, int32_t place) const {
     const int32_t count = g.count(place);
     bool any = !moving;
     for (int32_t i = 0; i < count && !any; ++i) any = moving[s * scene.bodies + g.member(place + i)];
-    return any && count <= room;
+    return any && count <= capacity;
   }
   // Scalars of the matrices of a scene.
-  DIFFVBD_FN int64_t matrix_size() const { return kUnknowns * kUnknowns * scene.bodies * room; }
+  DIFFVBD_FN int64_t matrix_size() const { return kUnknowns * kUnknowns * scene.bodies * capacity; }
   DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
 };
 
-// Of a scene of few, which is one group: the bodies that are to move, and those that touch them, by way of others or
-// not. touching [n, n]: of two, either way.
+// The bodies of a scene of few that are to move, and those that touch them, directly or not. touching [n, n]: of two,
+// either order.
 DIFFVBD_FN void find_moving(int32_t n, const bool* moving, const uint8_t* touching, bool* out) {
   for (int32_t k = 0; k < n; ++k) out[k] = moving[k];
   for (int32_t round = 1; round < n; ++round) {
@@ -112,51 +111,50 @@ DIFFVBD_FN int32_t moving_body(const RigidInputs<T>& in, int32_t corner) {
   return body < in.bodies() && in.free[body] ? body : -1;
 }
 
-// Whether a listed pair has a say in rigid motions: a body's own keep their distance.
+// Whether a listed pair depends on rigid motions: the pairs within a body do not.
 template <class T>
 DIFFVBD_FN bool is_between(const RigidInputs<T>& in, int64_t pair) {
   const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
   return in.gate.body[record[0]] != in.gate.body[record[sides(record[4])]];
 }
 
-// Where corner points are: of the mesh at x, or where they would go.
+// Positions of corner points: at x, or after the trial displacement.
 template <class T>
 struct CornerPoints {
   const RigidInputs<T>& in;
   bool moved;
   DIFFVBD_FN Vector relative(int64_t scene, int32_t v) const {  // to origin
     if (v >= in.gate.vertices) {
-      return rigid::Body<T>::at(in.gate.collider +
-                                3 * (scene * (in.gate.corners - in.gate.vertices) + v - in.gate.vertices));
+      return wide_at(in.gate.collider + 3 * (scene * (in.gate.corners - in.gate.vertices) + v - in.gate.vertices));
     }
     const int64_t row = 3 * (scene * in.gate.vertices + v);
-    const Vector x = rigid::Body<T>::at(in.scene.x + row);
-    return moved ? x + rigid::Body<T>::at(in.gate.move + row) : x;
+    const Vector x = wide_at(in.scene.x + row);
+    return moved ? x + wide_at(in.gate.move + row) : x;
   }
   DIFFVBD_FN Vector operator()(int64_t scene, int32_t v) const {
     const Vector x = relative(scene, v);
     if (v >= in.gate.vertices || !in.scene.origin.data) return x;
-    return x + rigid::Body<T>::at(in.scene.origin.data + scene * in.scene.origin.scene + 3 * int64_t{v});
+    return x + wide_at(in.scene.origin.data + scene * in.scene.origin.scene + 3 * int64_t{v});
   }
 };
 
-// How far a point at r from the center goes by a motion, to the first order.
+// The displacement of a point at r from the center by a motion, to first order.
 DIFFVBD_FN Vector moved_by(const double* motion, const Vector& r) {
-  return cross(Vector{motion[0], motion[1], motion[2]}, r) + Vector{motion[3], motion[4], motion[5]};
+  return cross(vector_at(motion), r) + vector_at(motion + 3);
 }
 
-// What one pair adds: gradient and its derivative by the motion of the first side relative to the second, and what the
-// mollifier adds at corners. Moments are about the origin of x.
-struct PairPress {
-  int32_t body[2];  // what moves on either side, or -1; a pair within one body has it on the first
+// A pair's gradient and its derivative by the motion of the first side relative to the second, and the mollifier's part
+// at corners. Moments are about the origin of x.
+struct PairForce {
+  int32_t body[2];  // moving body on either side, or -1; a pair within one body has it on the first
   Vector force;
   Sym3<double> stiffness;
   double weight[2];
   Vector at[2], pull[2], torque[2];
   double value;
-  Vector slip;     // where friction is linear about
-  double rubs;     // h^2 times its load [N], over `doubled`
-  double doubled;  // 2 where sides are not of one group: each takes twice its body's motion; else 1
+  Vector tangential;     // tangential displacement that friction is linear about
+  double friction_load;  // h^2 times its load [N], over `doubled`
+  double doubled;        // 2 where sides are not of one group: each takes twice its body's motion; else 1
 
   // Of one of two sides. Chosen by comparison: an index that is not known when this is compiled would move the arrays
   // from registers to memory.
@@ -165,7 +163,7 @@ struct PairPress {
     return {side == 0 ? a[0].x : a[1].x, side == 0 ? a[0].y : a[1].y, side == 0 ? a[0].z : a[1].z};
   }
   DIFFVBD_FN Vector arm(int side, const Vector& center) const { return of(side, at) - of(side, weight) * center; }
-  // What the body of a side does to the pair by its k-th unknown, about its center.
+  // The motion of the pair by the k-th unknown of a side's body, about its center.
   DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
     const Vector e = {double(k % 3 == 0), double(k % 3 == 1), double(k % 3 == 2)};
     return k < 3 ? cross(e, arm(side, center)) : of(side, weight) * e;
@@ -180,9 +178,9 @@ struct PairPress {
     return dot(map(side, k, center), force) + (k % 3 == 0 ? own.x : k % 3 == 1 ? own.y : own.z);
   }
 };
-constexpr int kPressDoubles = 29;  // of a PairPress without its bodies, its value and its friction
+constexpr int kForceDoubles = 29;  // of a PairForce without its bodies, its value and its friction
 
-DIFFVBD_FN void store_press(const PairPress& a, double* to) {
+DIFFVBD_FN void store_force(const PairForce& a, double* to) {
   int i = 0;
   const auto put = [&](const Vector& v) { to[i] = v.x, to[i + 1] = v.y, to[i + 2] = v.z, i += 3; };
   put(a.force);
@@ -191,8 +189,8 @@ DIFFVBD_FN void store_press(const PairPress& a, double* to) {
   for (const double entry : entries) to[i++] = entry;
   for (int side = 0; side < 2; ++side) put(a.at[side]), put(a.pull[side]), put(a.torque[side]);
 }
-DIFFVBD_FN PairPress load_press(const double* from, const int32_t* body) {
-  PairPress a;
+DIFFVBD_FN PairForce load_force(const double* from, const int32_t* body) {
+  PairForce a;
   int i = 0;
   const auto get = [&] { return i += 3, Vector{from[i - 3], from[i - 2], from[i - 1]}; };
   a.body[0] = body[0], a.body[1] = body[1];
@@ -207,27 +205,27 @@ DIFFVBD_FN PairPress load_press(const double* from, const int32_t* body) {
 
 // Whether both sides of a pair move, but not as one group.
 template <class T>
-DIFFVBD_FN bool is_apart(const RigidInputs<T>& in, int64_t scene, const PairPress& a) {
+DIFFVBD_FN bool is_apart(const RigidInputs<T>& in, int64_t scene, const PairForce& a) {
   return a.body[0] >= 0 && a.body[1] >= 0 && !in.groups_of(scene).joined(a.body[0], a.body[1]);
 }
-// Then each bears what both would: so that no step is too long.
+// Then each side has twice the stiffness: no step is too long.
 template <class T>
-DIFFVBD_FN double borne(const RigidInputs<T>& in, int64_t scene, const PairPress& a) {
+DIFFVBD_FN double borne(const RigidInputs<T>& in, int64_t scene, const PairForce& a) {
   return is_apart(in, scene, a) ? 2 : 1;
 }
 
 template <class T>
-DIFFVBD_FN void sides_of(const RigidInputs<T>& in, const int32_t* record, PairPress& out) {
+DIFFVBD_FN void sides_of(const RigidInputs<T>& in, const int32_t* record, PairForce& out) {
   out.body[0] = moving_body(in, record[0]);
   out.body[1] = moving_body(in, record[sides(record[4])]);
   for (int side = 0; side < 2; ++side) {
     out.weight[side] = 0;
     out.at[side] = out.pull[side] = out.torque[side] = Vector{};
   }
-  out.rubs = 0;
+  out.friction_load = 0;
 }
 
-// Calls f(side, k) for the corners of a pair, of which the first side has so many; as each_across().
+// Calls f(side, k) for the corners of a pair whose first side has `first`; as each_across().
 template <class F>
 DIFFVBD_FN void each_corner(int first, const F& f) {
   for (int side = 0; side < 2; ++side) {
@@ -237,15 +235,15 @@ DIFFVBD_FN void each_corner(int first, const F& f) {
   }
 }
 
-// The barrier of a listed pair between bodies; false where it does not push, or moves with one body.
+// The barrier of a listed pair between bodies; false where it does not act, or moves with one body.
 template <class T, class At>
-DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& at, PairPress& out) {
+DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& at, PairForce& out) {
   const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
   const T* constants = in.gate.constants + kConstants * pair;
   const int64_t scene = record[5];
   const int first = sides(record[4]);
   const double listed = PairHints<T>(constants).gap, dhat = PairConstants<T>(constants).dhat;
-  if (listed == std::numeric_limits<double>::infinity() || !is_between(in, pair)) return false;  // contact/narrow.h
+  if (listed == std::numeric_limits<double>::infinity() || !is_between(in, pair)) return false;  // pair_list.h
   sides_of(in, record, out);
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   // a gap shrinks by no more than its corners have moved since it was taken
@@ -256,13 +254,13 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
     relative[k] = at.relative(scene, record[k]);
     known = known && record[k] < in.gate.vertices;
     if (!known) continue;
-    const Vector d = relative[k] - rigid::Body<T>::at(in.gate.center + 3 * (scene * in.gate.vertices + record[k]));
+    const Vector d = relative[k] - wide_at(in.gate.center + 3 * (scene * in.gate.vertices + record[k]));
     one = k < first && one < dot(d, d) ? dot(d, d) : one;
     other = k >= first && other < dot(d, d) ? dot(d, d) : other;
   }
   if (known) {
-    const double room = (listed - dhat) * (1 - 1e-6);
-    if (0 < room && one < 0.25 * room * room && other < 0.25 * room * room) return false;
+    const double slack = (listed - dhat) * (1 - 1e-6);
+    if (0 < slack && one < 0.25 * slack * slack && other < 0.25 * slack * slack) return false;
   }
   Corners<double> c;
   Vector points[4];
@@ -294,13 +292,13 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
 }
 
 // f0 of smoothed friction, whose slope over |u| is FrictionRate.
-DIFFVBD_FN double slip_value(double length, double eps) {
+DIFFVBD_FN double friction_value(double length, double eps) {
   return length < eps ? length * length * (1 / eps - length / (3 * eps * eps)) + eps / 3 : length;
 }
 
-// Gradient and block of what acts on a vertex alone, at where it is, without friction.
+// Gradient and block of a vertex at its position, without pairs and friction.
 template <class T>
-DIFFVBD_FN void vertex_press(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, Vector& g, Sym3<double>& H) {
+DIFFVBD_FN void vertex_force(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, Vector& g, Sym3<double>& H) {
   const double mass = b.mass(v);
   const Vector x = b.position(v);
   const VertexState<double> s = b.state(v, x);
@@ -311,54 +309,54 @@ DIFFVBD_FN void vertex_press(const RigidInputs<T>& in, const rigid::Body<T>& b, 
 }
 
 // Friction of a vertex on one plane of a floor.
-struct FloorSlip {
-  Vector n, slip;  // since the start of the step
-  double size;     // h^2 times the load [N]
+struct FloorFriction {
+  Vector n, tangential;  // since the start of the step
+  double size;           // h^2 times the load [N]
 };
 template <class T>
 DIFFVBD_FN const T* floor_lag(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane) {
   return in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + plane) * 4;
 }
-// Whether a plane bears a vertex: most planes do not, and where there is no load there is no friction.
+// Whether a plane has a normal force on a vertex: most planes do not.
 template <class T>
 DIFFVBD_FN bool bears(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane) {
   return *floor_lag(in, b, v, plane) != T(0);
 }
 template <class T>
-DIFFVBD_FN FloorSlip floor_slip(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
-                                const Vector& moved) {
+DIFFVBD_FN FloorFriction floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
+                                        const Vector& moved) {
   const T* lag = floor_lag(in, b, v, plane);
-  const Vector n = rigid::Body<T>::at(lag + 1), x = b.position(v), travel = x - b.state(v, x).x_prev + moved;
+  const Vector n = wide_at(lag + 1), x = b.position(v), travel = x - b.state(v, x).x_prev + moved;
   const double h = in.scene.time_step;
   return {n, travel - dot(n, travel) * n, h * h * double(lag[0])};
 }
 
-// Adds that of a plane, linear about where the vertex would be after `way`.
+// Adds friction on a plane, linear about the position after `displacement`.
 template <class T>
-DIFFVBD_FN void add_floor_slip(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
-                               const Vector& way, Vector& g, Sym3<double>& H) {
-  const FloorSlip a = floor_slip(in, b, v, plane, way);
-  const FrictionRate<double> f(square_root(dot(a.slip, a.slip)), in.friction_eps);
-  const Vector along = way - dot(a.n, way) * a.n;
-  g += a.size * (f.value * (a.slip - along) - (f.curvature * dot(a.slip, along)) * a.slip);
+DIFFVBD_FN void add_plane_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
+                                   const Vector& displacement, Vector& g, Sym3<double>& H) {
+  const FloorFriction a = floor_friction(in, b, v, plane, displacement);
+  const FrictionRate<double> f(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
+  const Vector along = displacement - dot(a.n, displacement) * a.n;
+  g += a.size * (f.value * (a.tangential - along) - (f.curvature * dot(a.tangential, along)) * a.tangential);
   add_diagonal(H, a.size * f.value);
   add_outer(H, -a.size * f.value, a.n);
-  add_outer(H, a.size * f.curvature, a.slip);
+  add_outer(H, a.size * f.curvature, a.tangential);
 }
-// And of all.
+// And on all planes.
 template <class T>
-DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& way,
-                                   Vector& g, Sym3<double>& H) {
+DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v,
+                                   const Vector& displacement, Vector& g, Sym3<double>& H) {
   for (int k = 0; k < in.planes; ++k) {
-    if (bears(in, b, v, k)) add_floor_slip(in, b, v, k, way, g, H);
+    if (bears(in, b, v, k)) add_plane_friction(in, b, v, k, displacement, g, H);
   }
 }
 
-// How many roundings of its position a vertex may come away from its target before its potential has risen. In flight
-// the potential is nothing but such roundings.
+// Roundings of its position by which a vertex may leave its target before its potential counts as increased: in free
+// flight the potential is nothing else.
 constexpr double kValueUlps = 8;
 
-// The potential of a vertex where it is, or where it would go, less what rounding may have added on the way.
+// The potential of a vertex, now or after the trial displacement, less its rounding.
 template <class T>
 DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, bool moved) {
   const Vector x = CornerPoints<T>{in, moved}.relative(b.scene, v), off = x - b.target(v);
@@ -368,21 +366,21 @@ DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b
       v, [&](auto energy, int, const double* data, int count) { value += decltype(energy)::value(s, data, count); });
   for (int k = 0; k < in.planes; ++k) {
     if (!bears(in, b, v, k)) continue;
-    const FloorSlip a = floor_slip(in, b, v, k, x - b.position(v));
-    value += a.size * slip_value(square_root(dot(a.slip, a.slip)), in.friction_eps);
+    const FloorFriction a = floor_friction(in, b, v, k, x - b.position(v));
+    value += a.size * friction_value(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
   }
   const double rounding = kValueUlps * std::numeric_limits<T>::epsilon() * size_of(x);
   return moved ? value - b.mass(v) * rounding * rounding : value;
 }
 
-// How far a turn and a shift take a point at r from the center.
-DIFFVBD_FN Vector displaced(const double* motion, double share, const Vector& r) {
-  const Vector w = share * Vector{motion[0], motion[1], motion[2]}, turned = cross(w, r);
+// The displacement of a point at r from the center by a turn and a shift.
+DIFFVBD_FN Vector displaced(const double* motion, double fraction, const Vector& r) {
+  const Vector w = fraction * vector_at(motion), turned = cross(w, r);
   const rigid::Angles s(w);
-  return s.a * turned + s.b * cross(w, turned) + share * Vector{motion[3], motion[4], motion[5]};
+  return s.a * turned + s.b * cross(w, turned) + fraction * vector_at(motion + 3);
 }
 
-// The Newton step of a body, where `solution` is of its gradient; none where a matrix was not positive definite.
+// The Newton step of a body from the solution for its gradient; zero where the matrix was not positive definite.
 DIFFVBD_FN void keep_finite(double* solution) {
   bool finite = true;
   for (int i = 0; i < kUnknowns; ++i)
@@ -390,45 +388,44 @@ DIFFVBD_FN void keep_finite(double* solution) {
   for (int i = 0; i < kUnknowns; ++i) solution[i] = finite ? -solution[i] : 0.0;
 }
 
-// What lagged friction and damping of pairs add to the rigid correction (docs/method.md, section 18).
+// --- lagged friction and damping of pairs
 
 // Where a corner point was at the start of the step, relative to origin.
 template <class T>
 DIFFVBD_FN Vector before(const RigidInputs<T>& in, int64_t scene, int32_t v) {
   const int32_t mesh = in.gate.vertices;
-  return rigid::Body<T>::at(v < mesh ? in.scene.x_prev.data + scene * in.scene.x_prev.scene + 3 * int64_t{v}
-                                     : in.collider_prev + 3 * (scene * (in.gate.corners - mesh) + v - mesh));
+  return wide_at(v < mesh ? in.scene.x_prev.data + scene * in.scene.x_prev.scene + 3 * int64_t{v}
+                          : in.collider_prev + 3 * (scene * (in.gate.corners - mesh) + v - mesh));
 }
 
-// Motions of all bodies of a scene, about which friction is linear; about none where they are null.
-struct Slid {
+// Motions of all bodies of a scene, about which friction is linear; null: no motion.
+struct BodyMotions {
   const double *center, *motion;  // [bodies, 3], [bodies, 6]
 };
 
-// What the sides of a pair that rubs do by such motions, one relative to the other.
-DIFFVBD_FN Vector way_of(const PairPress& a, const Slid& slid) {
-  Vector way{};
+// The relative displacement of the sides of a lagged pair by such motions.
+DIFFVBD_FN Vector displacement_of(const PairForce& a, const BodyMotions& motions) {
+  Vector displacement{};
   for (int side = 0; side < 2; ++side) {
     const int32_t body = a.body[side];
     if (body < 0) continue;
-    way += a.doubled * a.moved(side, rigid::Body<double>::at(slid.center + 3 * body), slid.motion + kUnknowns * body);
+    displacement += a.doubled * a.moved(side, wide_at(motions.center + 3 * body), motions.motion + kUnknowns * body);
   }
-  return way;
+  return displacement;
 }
 
-// Of lagged friction and damping what does not depend on how bodies go.
-struct Rubbing {
-  Vector n, u;                     // u: slip since the start of the step
-  double size, damping, approach;  // h^2 times the load [N]; h times the coefficient; how much closer sides have come
+// The part of lagged friction and damping that does not depend on the motions.
+struct LaggedFriction {
+  Vector n, u;                     // u: tangential displacement since the start of the step
+  double size, damping, approach;  // h^2 times the normal force [N]; h times the coefficient; approach of the sides
 };
 
-// The sides of a lagged pair, and what it does there; false where it does nothing. It acts along a gap, so that it
-// turns a body even by itself. Where sides are not of one group, `alone` says which is meant. It has half of the
-// potential, at twice its motion: the potential is convex, so that what lowers both halves lowers the whole. -1: both
-// are.
+// The sides of a lagged pair and its state; false where it does not act. It acts along a gap, and so turns even a body
+// by itself. Where the sides are of two groups, `alone` selects one: it has half of the potential at twice its motion,
+// and the potential is convex, so that lowering both halves lowers the whole. alone = -1: both.
 template <class T, class At>
-DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& at, int alone, PairPress& out,
-                             Rubbing& rubbing) {
+DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& at, int alone, PairForce& out,
+                             LaggedFriction& lagged_state) {
   const int32_t* record = in.lagged.pairs + kPairRow * pair;
   const Lag<T> lag(in.lag + kLagScalars * pair);
   if (!lag.active()) return false;
@@ -450,46 +447,46 @@ DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& a
     out.weight[side] += lag.w[k];
     out.at[side] += double(lag.w[k]) * x;
   });
-  rubbing.n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
-  const double h = in.scene.time_step, along = dot(rubbing.n, m);
-  rubbing.u = m - along * rubbing.n;
-  rubbing.size = h * h * double(lag.friction), rubbing.damping = h * double(lag.damping);
-  rubbing.approach = along < 0 ? along : 0;
+  lagged_state.n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
+  const double h = in.scene.time_step, along = dot(lagged_state.n, m);
+  lagged_state.u = m - along * lagged_state.n;
+  lagged_state.size = h * h * double(lag.friction), lagged_state.damping = h * double(lag.damping);
+  lagged_state.approach = along < 0 ? along : 0;
   return true;
 }
 
-// What it presses. The gradient is that of a matrix which holds where bodies have gone, by `way`: there both are exact.
-DIFFVBD_FN void rub(const Rubbing& a, const Vector& way, double eps, PairPress& out) {
-  out.slip = a.u + (way - dot(a.n, way) * a.n);
-  const double length = square_root(dot(out.slip, out.slip));
+// Its force. Gradient and matrix are exact after the relative displacement.
+DIFFVBD_FN void lagged_friction_force(const LaggedFriction& a, const Vector& displacement, double eps, PairForce& out) {
+  out.tangential = a.u + (displacement - dot(a.n, displacement) * a.n);
+  const double length = square_root(dot(out.tangential, out.tangential));
   const FrictionRate<double> f(length, eps);
-  out.rubs = a.size / out.doubled;
-  out.value = a.size * slip_value(length, eps) + 0.5 * a.damping * a.approach * a.approach;
-  out.force = a.size * (f.value * a.u - (f.curvature * dot(out.slip, way)) * out.slip) + (a.damping * a.approach) * a.n;
+  out.friction_load = a.size / out.doubled;
+  out.value = a.size * friction_value(length, eps) + 0.5 * a.damping * a.approach * a.approach;
+  out.force = a.size * (f.value * a.u - (f.curvature * dot(out.tangential, displacement)) * out.tangential) +
+              (a.damping * a.approach) * a.n;
   const double borne = out.doubled;
   out.stiffness = diagonal(borne * a.size * f.value);
   add_outer(out.stiffness, borne * (a.damping - a.size * f.value), a.n);
-  add_outer(out.stiffness, borne * a.size * f.curvature, out.slip);
+  add_outer(out.stiffness, borne * a.size * f.curvature, out.tangential);
 }
 
-// Both, where bodies have gone as `slid` says.
+// Both, about the given motions.
 template <class T, class At>
-DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out,
-                             int alone) {
-  Rubbing rubbing;
-  if (!lagged_sides(in, pair, at, alone, out, rubbing)) return false;
-  rub(rubbing, slid.motion ? way_of(out, slid) : Vector{}, in.friction_eps, out);
+DIFFVBD_FN bool lagged_force(const RigidInputs<T>& in, int64_t pair, const At& at, const BodyMotions& motions,
+                             PairForce& out, int alone) {
+  LaggedFriction lagged_state;
+  if (!lagged_sides(in, pair, at, alone, out, lagged_state)) return false;
+  lagged_friction_force(lagged_state, motions.motion ? displacement_of(out, motions) : Vector{}, in.friction_eps, out);
   return true;
 }
 
-// Friction in the rigid correction of bodies that touch (docs/method.md, section 18): all but friction is linear in the
-// motions of bodies, friction is taken as it is. Newton's method finds where they come to rest, with shorter steps
-// where a full one would take a slip past that.
+// --- friction along a step. All else is linear in the motions of bodies. Newton's method iterates on friction, with
+// shorter steps where a full one would reverse a tangential displacement.
 
-constexpr int kSlipIterations = 200;  // of Newton's method at most: mostly it settles within 10 to 30
-constexpr int kHalvings = 40;         // in the search for the length of a step, at most: down to eps over a long way
-constexpr double kOvershoot = 0.1;    // slope at the end of a step over that at its start, that is small
-constexpr double kSettled = 1e-9;     // of the whole, a step after which there is but one more
+constexpr int kFrictionIterations = 200;  // of Newton's method at most; most systems need 10 to 30
+constexpr int kHalvings = 40;             // in the search for the length of a step, at most
+constexpr double kOvershoot = 0.1;        // slope at the end of a step over that at its start that counts as small
+constexpr double kSettled = 1e-9;         // of the whole motion: one more step follows
 
 // FrictionRate's value for the square of a length, without the divisions that take most of the time of a search.
 DIFFVBD_FN double friction_rate(double square, double eps) {
@@ -504,170 +501,172 @@ DIFFVBD_FN double friction_rate(double square, double eps) {
   return (2 - square * inverse * over) * over;
 }
 
-// A slip u along a step c of Newton's method, as far as friction depends on it.
-struct SlipLine {
-  double start, along, way;  // u u, u c and c c
-  double size, rate, bend;   // what the step takes friction for: f1(|u|) / |u| at its start, and its derivative
+// A tangential displacement u along a step c of Newton's method, as far as friction depends on it.
+struct FrictionLine {
+  double start, along, step_square;  // u u, u c and c c
+  double size, rate, bend;           // linear model of friction: f1(|u|) / |u| at the start, and its derivative
 
-  SlipLine() = default;
-  DIFFVBD_FN SlipLine(const Vector& slip, const Vector& change, double load, double eps)
-      : start(dot(slip, slip)), along(dot(slip, change)), way(dot(change, change)), size(load) {
+  FrictionLine() = default;
+  DIFFVBD_FN FrictionLine(const Vector& tangential, const Vector& change, double load, double eps)
+      : start(dot(tangential, tangential)),
+        along(dot(tangential, change)),
+        step_square(dot(change, change)),
+        size(load) {
     const FrictionRate<double> first(square_root(start), eps);
     rate = first.value, bend = first.curvature * along;
   }
 
-  // The slope of the potential after a share of the step, over what that takes it for.
-  DIFFVBD_FN double excess(double share, double eps) const {
-    const double toward = along + share * way, square = start + share * (along + toward);
-    return size * ((friction_rate(square, eps) - rate) * toward - share * bend * along);
+  // The slope of the potential after a fraction of the step, beyond that of the linear model.
+  DIFFVBD_FN double excess(double fraction, double eps) const {
+    const double toward = along + fraction * step_square, square = start + fraction * (along + toward);
+    return size * ((friction_rate(square, eps) - rate) * toward - fraction * bend * along);
   }
 };
 
-// Of a lagged pair that rubs, and its press.
+// Of a lagged pair and its force.
 template <class T>
-DIFFVBD_FN SlipLine slip_line(const RigidInputs<T>& in, int64_t pair, const PairPress& a, const double* center,
-                              const double* step) {
+DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, int64_t pair, const PairForce& a, const double* center,
+                                      const double* step) {
   const Lag<T> lag(in.lag + kLagScalars * pair);
   const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
-  const Vector way = way_of(a, {center, step});
-  return {a.slip, way - dot(n, way) * n, a.rubs, in.friction_eps};
+  const Vector displacement = displacement_of(a, {center, step});
+  return {a.tangential, displacement - dot(n, displacement) * n, a.friction_load, in.friction_eps};
 }
 
 // Of a vertex at r from its body's center on one plane of a floor, with that body's motion so far and its step.
 template <class T>
-DIFFVBD_FN SlipLine slip_line(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane, const Vector& r,
-                              const double* motion, const double* step) {
-  const FloorSlip a = floor_slip(in, b, v, plane, moved_by(motion, r));
-  const Vector way = moved_by(step, r);
-  return {a.slip, way - dot(a.n, way) * a.n, a.size, in.friction_eps};
+DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
+                                      const Vector& r, const double* motion, const double* step) {
+  const FloorFriction a = floor_friction(in, b, v, plane, moved_by(motion, r));
+  const Vector displacement = moved_by(step, r);
+  return {a.tangential, displacement - dot(a.n, displacement) * a.n, a.size, in.friction_eps};
 }
 
-// The share of a step that is taken, after which the slope of the potential is small or negative. fall: twice by how
-// much the step lowers what it takes the potential for; `excess` of a share: that of all that slips.
+// The fraction of a step after which the slope of the potential is small or negative. decrease: twice the decrease of
+// the linear model along the step; excess(fraction): the sum over all lines.
 template <class Excess>
-DIFFVBD_FN double slip_share(double fall, const Excess& excess) {
-  if (!(kOvershoot * fall < excess(1.0))) return 1;
+DIFFVBD_FN double friction_fraction(double decrease, const Excess& excess) {
+  if (!(kOvershoot * decrease < excess(1.0))) return 1;
   double low = 0, high = 1;
   for (int i = 0; i < kHalvings; ++i) {
-    const double middle = 0.5 * (low + high), slope = excess(middle) - fall * (1 - middle);
-    if (absolute(slope) <= kOvershoot * fall) return middle;
+    const double middle = 0.5 * (low + high), slope = excess(middle) - decrease * (1 - middle);
+    if (absolute(slope) <= kOvershoot * decrease) return middle;
     (slope < 0 ? low : high) = middle;
   }
   return high;
 }
 
-// Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
-// and done.
+// State of a system: iterating, at the settled motion but without its matrix there, and done.
 enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
 
-// The share of a step that is taken. fall, whole: twice what the step and the motion after it are worth in potential.
+// The fraction of a step. decrease, whole: twice the potential of the step and of the motion after it.
 template <class Share>
-DIFFVBD_FN double settle(Settling& state, bool rubs, double fall, double whole, const Share& share) {
-  if (!rubs || state == kSettledAt) {
+DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, double whole, const Share& fraction) {
+  if (!has_friction || state == kSettledAt) {
     state = kDone;
     return 1;
   }
-  if (fall <= kSettled * kSettled * whole) {
+  if (decrease <= kSettled * kSettled * whole) {
     state = kSettledAt;
     return 1;
   }
-  return share(fall);
+  return fraction(decrease);
 }
 
-// Which share of its rigid motion each body may take: it is tried, and tried again shorter, until nothing holds it up
-// and the potential does not rise. Bodies decide this with those that they may come to press, and with no others
-// (docs/method.md, section 18).
+// --- trial fractions of the rigid motions: reduced until no body is blocked and the potential does not increase.
+// Bodies decide together with those that they may touch, and with no others.
 
-constexpr int kTries = 6;       // of motions, each shorter for some bodies, or none for them
-constexpr int kShorter = 3;     // of these: how often a body whose way is blocked tries a shorter one before it stays
-constexpr int kSpreads = 4;     // how often a shorter motion is handed on to the bodies that one touches
-constexpr double kRise = 1e-9;  // of the potential, that counts as none
-constexpr double kRounded = 1e-6;  // of a length, that rounding cannot reach
+constexpr int kTrials = 6;          // of motions, each reduced for some bodies
+constexpr int kShorter = 3;         // of these: reductions of a blocked body before it stays
+constexpr int kSpreads = 4;         // how often a reduction spreads to touching bodies
+constexpr double kIncrease = 1e-9;  // of the potential: counts as no increase
+constexpr double kRounded = 1e-6;   // of a length, that rounding cannot reach
 
-// The body that a pair counts for, which decides with all others that it moves: the first of them, or -1.
+// The body that a pair counts for: the first of those that it moves with, or -1.
 template <class T>
 DIFFVBD_FN int32_t owner_of(const RigidInputs<T>& in, const int32_t* record) {
   const int32_t first = moving_body(in, record[0]);
   return 0 <= first ? first : moving_body(in, record[sides(record[4])]);
 }
 
-// Whether the energies of a vertex admit what it tries.
+// Whether the energies of a vertex admit its trial.
 template <class T>
 DIFFVBD_FN bool admitted(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v) {
   const VertexState<double> s = b.state(v, CornerPoints<T>{in, true}.relative(b.scene, v));
   bool out = true;
   b.energies(v, [&](auto energy, int, const double* data, int count) {
     using E = decltype(energy);
-    if constexpr (E::has_filter) out = out && E::template admits<T>(s, b.position(v), data, count, rigid::kLeastShare);
+    if constexpr (E::has_filter)
+      out = out && E::template admits<T>(s, b.position(v), data, count, rigid::kLeastGapFraction);
   });
   return out;
 }
 
-// Of a vertex, whatever share of its motion its body takes: how far it may be from where gaps were taken, and the size
-// of its position, which rounding is measured by.
+// Bounds for any fraction of the motion of a vertex's body: its displacement since gaps were taken, and the size of its
+// position, the scale of rounding.
 struct Farthest {
-  double way, size;
+  double displacement, size;
 };
 template <class T>
 DIFFVBD_FN Farthest farthest_of(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const double* center,
                                 const double* motion) {
-  const Vector x = b.position(v), arm = x - rigid::Body<double>::at(center);
-  const Vector since = x - rigid::Body<T>::at(in.gate.center + 3 * b.row(v));
-  const Vector turn = rigid::Body<double>::at(motion), shift = rigid::Body<double>::at(motion + 3);
+  const Vector x = b.position(v), arm = x - wide_at(center);
+  const Vector since = x - wide_at(in.gate.center + 3 * b.row(v));
+  const Vector turn = wide_at(motion), shift = wide_at(motion + 3);
   const auto length = [](const Vector& a) { return square_root(dot(a, a)); };
-  const Vec3<T> at = point_at(in.gate.x, b.row(v));
-  const Vec3<T> from = in.gate.origin ? point_at(in.gate.origin, b.row(v)) : zero3<T>();
-  const double way = length(since) + length(shift) + length(turn) * length(arm);
-  return {(1 + kRounded) * way, size_of(at + from)};
+  const Vec3<T> at = vector_at(in.gate.x + 3 * b.row(v));
+  const Vec3<T> from = in.gate.origin ? vector_at(in.gate.origin + 3 * b.row(v)) : zero3<T>();
+  const double displacement = length(since) + length(shift) + length(turn) * length(arm);
+  return {(1 + kRounded) * displacement, size_of(at + from)};
 }
 
-// Whether a listed pair may come within reach of its barrier, whatever share of its motion each body takes: a gap
-// shrinks by no more than its sides have moved since it was taken. way, size [bodies]: the farthest of their vertices.
+// Whether a listed pair may come within reach of its barrier for any fractions: a gap shrinks by no more than its sides
+// have moved. displacement, size [bodies]: the largest of their vertices.
 template <class T>
-DIFFVBD_FN bool may_press(const RigidInputs<T>& in, int64_t pair, const double* way, const double* size) {
+DIFFVBD_FN bool may_touch(const RigidInputs<T>& in, int64_t pair, const double* displacement, const double* size) {
   if (!is_between(in, pair)) return false;
   const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
   const T* constants = in.gate.constants + kConstants * pair;
   const int32_t a = in.gate.body[record[0]], b = in.gate.body[record[sides(record[4])]];
-  if (a >= in.bodies() || b >= in.bodies()) return true;  // its gap is not of the time of the centers
+  if (a >= in.bodies() || b >= in.bodies()) return true;  // its gap may be older
   const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
   const T larger = static_cast<T>(size[a] < size[b] ? size[b] : size[a]);
-  return !(way[a] + way[b] < (1 - kRounded) * (gap - guard_of_size(larger)));  // as stays_far()
+  return !(displacement[a] + displacement[b] < (1 - kRounded) * (gap - guard_of_size(larger)));  // as stays_far()
 }
 
-// Whether bodies may go as they try: all fit, and their potential does not rise.
+// Whether a trial is accepted: all bodies fit, and their potential does not increase.
 DIFFVBD_FN bool is_safe(double before, double after, bool fits) {
-  return fits && after <= before + kRise * absolute(before);
+  return fits && after <= before + kIncrease * absolute(before);
 }
-// The factor of what a body tries next, before it is handed on.
+// The factor of the next trial of a body, before reductions spread.
 DIFFVBD_FN double shortened(bool blocked, bool fits, int attempt) {
-  if (fits) return 0.5;  // the potential rises: all go half as far
+  if (fits) return 0.5;  // the potential increases: all are halved
   if (!blocked) return 1.0;
   return attempt == 0 ? 0.5 : attempt < kShorter ? 0.25 : 0.0;
 }
 
-// What came of the tries, of each body [B, bodies].
+// The result of the trials, of each body [B, bodies].
 template <class T>
 struct RigidOutcome {
-  double* share;  // of its motion that it took
-  bool* moved;    // whether it had one
-  // whether it was held up on its way, in a scene in which some of those have gone on: where these are now, others may
-  // go on, too
-  bool* held;
-  T* left;  // how much of its shift it did not take [m]
+  double* fraction;  // of its motion
+  bool* moved;       // whether it has a motion
+  // whether it was blocked, in a scene in which some blocked bodies have moved: others may move on now
+  bool* blocked;
+  T* left;  // the rest of its shift [m]
 };
-// Of a body whose share is known; returns whether it was held up after some of its way. `held` is to be confirmed.
+// Of a body with a known fraction; returns whether it was blocked after a part of its motion.
 template <class T>
-DIFFVBD_FN bool end_tries(const RigidInputs<T>& in, const double* motions, int64_t unit, const RigidOutcome<T>& out) {
+DIFFVBD_FN bool finish_trials(const RigidInputs<T>& in, const double* motions, int64_t unit,
+                              const RigidOutcome<T>& out) {
   const double* motion = motions + kUnknowns * unit;
   bool moved = false;
   for (int i = 0; i < kUnknowns; ++i) moved = moved || motion[i] != 0;
-  double& share = out.share[unit];
-  if (in.moving && !moved) share = 0;  // what stays passes nothing on
-  const Vector shift = rigid::Body<double>::at(motion + 3);
-  out.moved[unit] = moved, out.held[unit] = moved && share < 1;
-  out.left[unit] = T((1 - share) * square_root(dot(shift, shift)));
-  return out.held[unit] && 0 < share;
+  double& fraction = out.fraction[unit];
+  if (in.moving && !moved) fraction = 0;  // it passes no adjoint on
+  const Vector shift = wide_at(motion + 3);
+  out.moved[unit] = moved, out.blocked[unit] = moved && fraction < 1;
+  out.left[unit] = T((1 - fraction) * square_root(dot(shift, shift)));
+  return out.blocked[unit] && 0 < fraction;
 }
 
 }  // namespace diffvbd::contact

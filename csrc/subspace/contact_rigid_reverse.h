@@ -57,7 +57,7 @@ template <class T>
 DIFFVBD_FN void store_at_point(const double* sum, int64_t point, const PointWork<T>& out) {
   T* const to[] = {out.x, out.p, out.q, out.since};
   for (int k = 0; k < 4; ++k) {
-    if (to[k]) rigid::put(to[k] + 3 * point, Vector{sum[3 * k], sum[3 * k + 1], sum[3 * k + 2]});
+    if (to[k]) put(to[k] + 3 * point, Vector{sum[3 * k], sum[3 * k + 1], sum[3 * k + 2]});
   }
 }
 
@@ -65,7 +65,7 @@ DIFFVBD_FN void store_at_point(const double* sum, int64_t point, const PointWork
 struct PairMotions {
   Vector p[4], q[4];
   int sides, first;  // how many move by themselves; corners of the first
-  double share;      // of the stiffness that each bears
+  double fraction;   // of the stiffness that each bears
 
   DIFFVBD_FN bool is_of(int side, int corner) const { return sides == 1 || (corner < first) == (side == 0); }
 };
@@ -85,18 +85,18 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   PairMotions out;
   for (int k = 0; k < 4; ++k) {
     const int64_t row = 3 * (int64_t{record[5]} * in.gate.corners + record[k]);
-    out.p[k] = rigid::Body<T>::at(given.p + row), out.q[k] = rigid::Body<T>::at(given.q + row);
+    out.p[k] = wide_at(given.p + row), out.q[k] = wide_at(given.q + row);
   }
   out.first = sides(record[4]);
   const int32_t one = moving_body(in, record[0]), two = moving_body(in, record[out.first]);
   const bool apart = one >= 0 && two >= 0 && !in.groups_of(record[5]).joined(one, two);
-  out.sides = apart ? 2 : 1, out.share = apart ? 2 : 1;
+  out.sides = apart ? 2 : 1, out.fraction = apart ? 2 : 1;
   return out;
 }
 
 // Of a listed pair, gradient and matrix by the motion of its weighted corners, and what a mollifier adds at corners.
 template <class R>
-struct PressTerms {
+struct ForceTerms {
   Vec3<R> force, n, at_corner[4];
   R w[4], along;  // stiffness along the normal
 };
@@ -111,7 +111,7 @@ DIFFVBD_FN Vec3<R> weighted(const R* w, const Vector* moved, const PairMotions& 
 }
 
 template <class R>
-DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
+DIFFVBD_FN R virtual_work(const ForceTerms<R>& a, const PairMotions& m) {
   R out(0);
   for (int k = 0; k < 4; ++k) {
     const Vec3<R> p = {R(m.p[k].x), R(m.p[k].y), R(m.p[k].z)};
@@ -119,31 +119,31 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
   }
   for (int side = 0; side < m.sides; ++side) {
     const Vec3<R> p = weighted(a.w, m.p, m, side), q = weighted(a.w, m.q, m, side);
-    out = out + R(m.share) * a.along * dot(a.n, p) * dot(a.n, q);
+    out = out + R(m.fraction) * a.along * dot(a.n, p) * dot(a.n, q);
   }
   return out;
 }
 
 // Adds the derivatives by p and q, to each corner's row.
 template <class T>
-DIFFVBD_FN void add_by_motions(const PressTerms<double>& a, const PairMotions& m, T* rows) {
-  const auto pressed = [&](const Vector& u) { return (m.share * a.along * dot(a.n, u)) * a.n; };
+DIFFVBD_FN void add_by_motions(const ForceTerms<double>& a, const PairMotions& m, T* rows) {
+  const auto normal_force = [&](const Vector& u) { return (m.fraction * a.along * dot(a.n, u)) * a.n; };
   for (int side = 0; side < m.sides; ++side) {
-    const Vector by_p = pressed(weighted(a.w, m.q, m, side)), by_q = pressed(weighted(a.w, m.p, m, side));
+    const Vector by_p = normal_force(weighted(a.w, m.q, m, side)), by_q = normal_force(weighted(a.w, m.p, m, side));
     for (int k = 0; k < 4; ++k) {
       if (!m.is_of(side, k)) continue;
-      rigid::put(rows + kWorkScalars * k + 3, a.w[k] * (a.force + by_p) + a.at_corner[k]);
-      rigid::put(rows + kWorkScalars * k + 6, a.w[k] * by_q);
+      put(rows + kWorkScalars * k + 3, a.w[k] * (a.force + by_p) + a.at_corner[k]);
+      put(rows + kWorkScalars * k + 6, a.w[k] * by_q);
     }
   }
 }
 
 // size: h^2 kappa.
 template <class R, class T>
-DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
+DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
   const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
-  PressTerms<R> out{};
+  ForceTerms<R> out{};
   R e(1);
   if (is_mollified(kind, c, a.threshold)) {
     const Mollifier<R> m = mollifier(c, a.threshold);
@@ -155,7 +155,8 @@ DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const Pair
   return out;
 }
 
-// Twelve directions that a pair is derived by, one evaluation each, and what needs none: work that threads share out.
+// Twelve directions that a pair is derived by, one evaluation each, and a part without direction: work items of
+// threads.
 constexpr int kDirections = 12, kWorkParts = kDirections + 1;
 
 // Of a listed pair.
@@ -188,9 +189,9 @@ struct BarrierWork {
   }
 
   DIFFVBD_FN static bool pushes(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair) {
-    PairPress press;
+    PairForce term;
     return pair < in.first_listed(in.scene.scenes) && works(in, given, in.gate.listed.pairs + kPairRow * pair) &&
-           barrier_press(in, pair, CornerPoints<T>{in, false}, press);
+           barrier_force(in, pair, CornerPoints<T>{in, false}, term);
   }
 
   // Of the rows of the corners [4, 9], and adds the derivative by kappa, where the pair pushes.
@@ -208,11 +209,12 @@ struct BarrierWork {
 };
 
 // Of a lagged pair. With d how its weighted corners have moved since the start of the step, P and Q how they move by p
-// and q, n its normal, u the slip after Q, A = h damping, L = h^2 load and f1 of smoothed friction,
+// and q, n its normal, u the tangential displacement after Q, A = h damping, L = h^2 normal force and f1 of smoothed
+// friction,
 //
-//     W = A min(n . d, 0) n . P + share A (n . P) (n . Q) + L f1(|u|) / |u| u . P,
+//     W = A min(n . d, 0) n . P + s A (n . P) (n . Q) + L f1(|u|) / |u| u . P,
 //
-// with the last two for each side that moves by itself, of which each bears a share of 2. Positions at the start of the
+// with the last two for each side that moves by itself, where s = 2, else 1. Positions at the start of the
 // step take the derivatives by x with the other sign.
 template <class T>
 struct LaggedWork {
@@ -234,7 +236,7 @@ struct LaggedWork {
     load = lag.friction, damping = lag.damping;
     m = motions_of(in, given, record);
     // what does nothing joined no bodies; with any coefficient it would
-    if (load == 0 && damping == 0) m.sides = 1, m.share = 1;
+    if (load == 0 && damping == 0) m.sides = 1, m.fraction = 1;
     n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
     for (int k = 0; k < 4; ++k) {
       w[k] = lag.w[k];
@@ -249,30 +251,30 @@ struct LaggedWork {
     double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
     Vector by_n{}, by_d{};
     for (int side = 0; side < m.sides; ++side) {
-      const Vector P = weighted(w, m.p, m, side), Q = weighted(w, m.q, m, side), way = m.share * Q;
-      const Vector u = d - along * n + (way - dot(n, way) * n);
+      const Vector P = weighted(w, m.p, m, side), Q = weighted(w, m.q, m, side), displacement = m.fraction * Q;
+      const Vector u = d - along * n + (displacement - dot(n, displacement) * n);
       const FrictionRate<double> f(square_root(dot(u, u)), eps);
       const double nP = dot(n, P), nQ = dot(n, Q), slipping = dot(u, P);
       const Vector by_u = L * (f.value * P + (f.curvature * slipping) * u);
       const Vector by_way = by_u - dot(n, by_u) * n;
       by_d += by_u;
       by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
-      by_n +=
-          (A * approach) * P + (m.share * A) * (nQ * P + nP * Q) - (along + dot(n, way)) * by_u - dot(n, by_u) * way;
-      by_load += f.value * slipping, by_damping += approach * nP + m.share * nP * nQ;
-      const Vector by_p = (A * (approach + m.share * nQ)) * n + (L * f.value) * u;
-      const Vector by_q = m.share * ((A * nP) * n + by_way);
+      by_n += (A * approach) * P + (m.fraction * A) * (nQ * P + nP * Q) - (along + dot(n, displacement)) * by_u -
+              dot(n, by_u) * displacement;
+      by_load += f.value * slipping, by_damping += approach * nP + m.fraction * nP * nQ;
+      const Vector by_p = (A * (approach + m.fraction * nQ)) * n + (L * f.value) * u;
+      const Vector by_q = m.fraction * ((A * nP) * n + by_way);
       for (int k = 0; k < 4; ++k) {
         if (!m.is_of(side, k)) continue;
-        rigid::put(rows + kWorkScalars * k + 3, w[k] * by_p);
-        rigid::put(rows + kWorkScalars * k + 6, w[k] * by_q);
+        put(rows + kWorkScalars * k + 3, w[k] * by_p);
+        put(rows + kWorkScalars * k + 6, w[k] * by_q);
         by_w[k] += dot(by_p, m.p[k]) + dot(by_q, m.q[k]);
       }
     }
     by_d += by_along * n, by_n += by_along * d;
-    for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, w[k] * by_d);
+    for (int k = 0; k < 4; ++k) put(rows + kWorkScalars * k, w[k] * by_d);
     lag_bar[0] -= T(h * h * by_load), lag_bar[1] -= T(h * by_damping);
-    rigid::add_to(lag_bar + 2, -by_n);
+    add_to(lag_bar + 2, -by_n);
     for (int k = 0; k < 4; ++k) lag_bar[5 + k] -= T(by_w[k] + dot(by_d, since[k]));
   }
   DIFFVBD_FN static void store_none(T* rows) {
@@ -282,31 +284,31 @@ struct LaggedWork {
 
 // The adjoint of the rigid correction of bodies that touch, but for what pairs have in it (contact/rigid_backward.h).
 //
-// A correction moves vertices by displaced(share d, r), with H d = -g. The adjoint of d, l = H^-1 (adjoint of the way),
-// makes that of everything g and H read the adjoint of -W, where
+// A correction moves vertices by displaced(fraction d, r), with H d = -g. The adjoint of d, l = H^-1 (adjoint of the
+// displacement), makes that of everything g and H read the adjoint of -W, where
 //
 //     W = sum over vertices P . (g_v + H_v Q) + pairs + what keeps H definite,
 //
 // and P and Q are how a vertex moves by l and by d. docs/method.md, section 18.
 
-// What displaced() sends back to r, of an adjoint g of the way.
+// The adjoint of r in displaced(), of an adjoint g of the displacement.
 DIFFVBD_FN Vector arm_adjoint(const Vector& w, const rigid::Angles& s, const Vector& g) {
   const Vector turned = cross(w, g);
   return s.b * cross(w, turned) - s.a * turned;
 }
 
 // And to its motion: of all vertices of a body `sum` = sum g, and `turning` = sum g r^T.
-DIFFVBD_FN void motion_adjoint(const double* motion, double share, const Vector& sum, const rigid::Matrix& turning,
+DIFFVBD_FN void motion_adjoint(const double* motion, double fraction, const Vector& sum, const rigid::Matrix& turning,
                                double* out) {
-  const Vector w = share * Vector{motion[0], motion[1], motion[2]};
+  const Vector w = fraction * vector_at(motion);
   const rigid::Matrix turn = rigid::identity() + rigid::turned_by(w);
   const Vector turned = rigid::turn_vjp(w, turning * rigid::transposed(turn));
-  const Vector parts[] = {share * turned, share * sum};
-  for (int i = 0; i < 2; ++i) rigid::put(out + 3 * i, parts[i]);
+  const Vector parts[] = {fraction * turned, fraction * sum};
+  for (int i = 0; i < 2; ++i) put(out + 3 * i, parts[i]);
 }
 
-// f1(|u|) / |u| and its derivative over |u|, which are taken as constant below what rounding makes of rest.
-DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, double eps) {
+// f1(|u|) / |u| and its derivative over |u|, constant below the rounding of rest.
+DIFFVBD_FN FrictionRate<Dual<double>> friction_rate_of(const Vec3<Dual<double>>& u, double eps) {
   const Dual<double> square = dot(u, u);
   const double length = square_root(square.value);
   const Dual<double> known = kRestingMotion * eps < length ? square_root(square) : Dual<double>(length);
@@ -315,21 +317,22 @@ DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, dou
 
 // P . g of friction on one plane of a floor after Q. lag: load [N], normal; travel: since the start of the step.
 template <class R>
-DIFFVBD_FN R slip_work(const R* lag, const Vec3<R>& travel, const Vector& P, const Vector& Q, double h2, double eps) {
+DIFFVBD_FN R friction_work(const R* lag, const Vec3<R>& travel, const Vector& P, const Vector& Q, double h2,
+                           double eps) {
   const Vec3<R> n = {lag[1], lag[2], lag[3]}, p = {R(P.x), R(P.y), R(P.z)}, q = {R(Q.x), R(Q.y), R(Q.z)};
-  const Vec3<R> way = travel + q, u = way - dot(n, way) * n;
-  return R(h2) * lag[0] * slip_rate(u, eps).value * dot(p, u);
+  const Vec3<R> displacement = travel + q, u = displacement - dot(n, displacement) * n;
+  return R(h2) * lag[0] * friction_rate_of(u, eps).value * dot(p, u);
 }
 
 // Its derivatives: by travel, and by what is lagged [4].
-DIFFVBD_FN Vector slip_adjoint(const double* lag, const Vector& travel, const Vector& P, const Vector& Q, double h2,
-                               double eps, double* by_lag) {
+DIFFVBD_FN Vector friction_adjoint(const double* lag, const Vector& travel, const Vector& P, const Vector& Q, double h2,
+                                   double eps, double* by_lag) {
   const auto derived = [&](int direction) {
     Dual<double> turned[kFloorLag];
     for (int i = 0; i < kFloorLag; ++i) turned[i] = {lag[i], double(i + 3 == direction)};
-    const Vec3<Dual<double>> way = {
+    const Vec3<Dual<double>> displacement = {
         {travel.x, double(direction == 0)}, {travel.y, double(direction == 1)}, {travel.z, double(direction == 2)}};
-    return slip_work(turned, way, P, Q, h2, eps).derivative;
+    return friction_work(turned, displacement, P, Q, h2, eps).derivative;
   };
   for (int i = 0; i < kFloorLag; ++i) by_lag[i] = derived(3 + i);
   return {derived(0), derived(1), derived(2)};
@@ -337,7 +340,7 @@ DIFFVBD_FN Vector slip_adjoint(const double* lag, const Vector& travel, const Ve
 
 // The adjoint of -W seen from one vertex of a free body at r from its center.
 struct VertexAdjoint {
-  Vector x, x_prev, y;  // x: but for what the center of mass sends
+  Vector x, x_prev, y;  // x: without the part of the center of mass
   Vector arm;           // the part of x that goes by r
   double mass;
 };
@@ -353,7 +356,7 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
   const VertexState<double> s = b.state(v, x);
   Vector g;
   Sym3<double> H;
-  vertex_press(in, b, v, g, H);
+  vertex_force(in, b, v, g, H);
   add_floor_friction(in, b, v, Q, g, H);
   VertexAdjoint out{-mass * P, Vector{}, mass * P, Vector{}, -dot(P, x - b.target(v) + Q)};
   b.energies(v, [&](auto energy, int, const double* data, int count) {
@@ -363,7 +366,7 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
     const T* given = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * kFloorLag;
     double lag[kFloorLag], by_lag[kFloorLag];
     for (int i = 0; i < kFloorLag; ++i) lag[i] = given[i];
-    const Vector by_travel = slip_adjoint(lag, x - s.x_prev, P, Q, h * h, in.friction_eps, by_lag);
+    const Vector by_travel = friction_adjoint(lag, x - s.x_prev, P, Q, h * h, in.friction_eps, by_lag);
     out.x -= by_travel, out.x_prev += by_travel;
     for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
   }
@@ -373,8 +376,6 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
   out.mass -= kLeastInertia * (turns * dot(r, r) + shifts);
   return out;
 }
-
-// Loops and sums over the vertices of a body belong to a Team (rigid/body.h).
 
 struct Whole {
   double mass;
@@ -390,53 +391,53 @@ DIFFVBD_FN Whole whole_of(const rigid::Body<T>& b, const Team& team) {
     const Vector x = b.position(v);
     to[0] += m, to[1] += m * x.x, to[2] += m * x.y, to[3] += m * x.z;
   });
-  return {sum[0], 0 < sum[0] ? (1 / sum[0]) * Vector{sum[1], sum[2], sum[3]} : Vector{}};
+  return {sum[0], 0 < sum[0] ? (1 / sum[0]) * vector_at(sum + 1) : Vector{}};
 }
 
-// What the center of mass has been sent, c_bar, goes on to positions and masses.
+// The adjoint of the center of mass, c_bar, scattered to positions and masses.
 template <class T, class Team>
-DIFFVBD_FN void send_center(const rigid::Body<T>& b, const Team& team, const Whole& whole, const Vector& c_bar, T* x,
-                            T* mass) {
+DIFFVBD_FN void scatter_center(const rigid::Body<T>& b, const Team& team, const Whole& whole, const Vector& c_bar, T* x,
+                               T* mass) {
   if (!(0 < whole.mass)) return;
   const Vector common = (1 / whole.mass) * c_bar;
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
-    rigid::add_to(x + 3 * b.row(v), b.mass(v) * common);
+    add_to(x + 3 * b.row(v), b.mass(v) * common);
     mass[b.row(v)] += T(dot(b.position(v) - whole.center, common));
   });
 }
 
-// Of the adjoint of where a correction led, end_bar [B, V, 3]: of the way itself those of x and mass, and the adjoint
-// of the motion. All are written but mass, which is added to.
+// Of the adjoint of the corrected positions, end_bar [B, V, 3]: the direct adjoints of x and mass, and that of the
+// motion. All are written but mass, which is added to.
 template <class T, class Team>
-DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const double* motion, double share,
+DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const double* motion, double fraction,
                             const T* end_bar, double* motion_bar, T* x, T* mass) {
-  if (share == 0) {  // it stayed
+  if (fraction == 0) {  // it stayed
     team.each(b.size(), [&](int32_t i) {
       const int64_t at = 3 * b.row(b.vertex(i));
-      rigid::put(x + at, rigid::Body<T>::at(end_bar + at));
+      put(x + at, wide_at(end_bar + at));
     });
     for (int i = 0; i < kUnknowns && team.leads(); ++i) motion_bar[i] = 0;
     return;
   }
   const Whole whole = whole_of(b, team);
-  const Vector w = share * Vector{motion[0], motion[1], motion[2]};
+  const Vector w = fraction * vector_at(motion);
   const rigid::Angles angles(w);
   double sum[15];
   team.template sum<15>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
-    const Vector g = rigid::Body<T>::at(end_bar + 3 * b.row(v)), r = b.position(v) - whole.center;
+    const Vector g = wide_at(end_bar + 3 * b.row(v)), r = b.position(v) - whole.center;
     const Vector arm = arm_adjoint(w, angles, g);
-    rigid::put(x + 3 * b.row(v), g + arm);
-    to[0] -= arm.x, to[1] -= arm.y, to[2] -= arm.z;
-    to[3] += g.x, to[4] += g.y, to[5] += g.z;
+    put(x + 3 * b.row(v), g + arm);
+    add_to(to, -arm);
+    add_to(to + 3, g);
     to[6] += g.x * r.x, to[7] += g.x * r.y, to[8] += g.x * r.z;
     to[9] += g.y * r.x, to[10] += g.y * r.y, to[11] += g.y * r.z;
     to[12] += g.z * r.x, to[13] += g.z * r.y, to[14] += g.z * r.z;
   });
   const rigid::Matrix turning{{sum[6], sum[7], sum[8]}, {sum[9], sum[10], sum[11]}, {sum[12], sum[13], sum[14]}};
-  if (team.leads()) motion_adjoint(motion, share, Vector{sum[3], sum[4], sum[5]}, turning, motion_bar);
-  send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, x, mass);
+  if (team.leads()) motion_adjoint(motion, fraction, vector_at(sum + 3), turning, motion_bar);
+  scatter_center(b, team, whole, vector_at(sum), x, mass);
 }
 
 // How corner points [B, N, 3] move by the solution for that adjoint, and by the motion; those of no body are zero. The
@@ -455,7 +456,7 @@ DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b
   if (!any) {
     team.each(b.size(), [&](int32_t i) {
       const int64_t to = 3 * (b.scene * in.gate.corners + b.vertex(i));
-      rigid::put(p + to, Vector{}), rigid::put(q + to, Vector{});
+      put(p + to, Vector{}), put(q + to, Vector{});
     });
     return;
   }
@@ -466,8 +467,8 @@ DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b
     const int32_t v = b.vertex(i);
     const int64_t to = 3 * (b.scene * in.gate.corners + v);
     const Vector r = b.position(v) - whole.center;
-    rigid::put(p + to, moved_by(l, r));
-    rigid::put(q + to, moved_by(motion, r));
+    put(p + to, moved_by(l, r));
+    put(q + to, moved_by(motion, r));
   });
 }
 
@@ -479,18 +480,19 @@ struct CorrectionAdjoints {
   T *collider, *collider_prev;  // [B, Vc, 3]
 };
 
-// Of a body's vertices. way [B, V, 3]: what goes back by the way itself. sent: what pairs have at corner points.
+// Of a body's vertices. displacement [B, V, 3]: the direct adjoint of x. scattered: the adjoints of pairs at corner
+// points.
 template <class T, class Team>
 DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
-                                 const double* motion, const double* solution, const T* way, const PointWork<T>& sent,
-                                 const CorrectionAdjoints<T>& bars) {
+                                 const double* motion, const double* solution, const T* displacement,
+                                 const PointWork<T>& scattered, const CorrectionAdjoints<T>& bars) {
   const rigid::Adjoints<T>& out = bars.vertices;
   T* floor_lag = bars.floor_lag;
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
-    rigid::put(out.x + 3 * row, rigid::Body<T>::at(way + 3 * row) - rigid::Body<T>::at(sent.x + corner));
-    if (sent.since) rigid::add_to(out.x_prev + 3 * row, rigid::Body<T>::at(sent.since + corner));
+    put(out.x + 3 * row, wide_at(displacement + 3 * row) - wide_at(scattered.x + corner));
+    if (scattered.since) add_to(out.x_prev + 3 * row, wide_at(scattered.since + corner));
   });
   bool moves = false;
   for (int i = 0; i < kUnknowns; ++i) moves = moves || solution[i] != 0;
@@ -500,16 +502,16 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
   team.template sum<3>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
-    const VertexAdjoint bar = vertex_adjoint(in, b, v, b.position(v) - whole.center, solution, motion,
-                                             rigid::Body<T>::at(sent.p + corner), rigid::Body<T>::at(sent.q + corner),
-                                             floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
-    rigid::add_to(out.x + 3 * row, bar.x + bar.arm);
-    rigid::add_to(out.x_prev + 3 * row, bar.x_prev);
-    rigid::add_to(out.y + 3 * row, bar.y);
+    const VertexAdjoint bar =
+        vertex_adjoint(in, b, v, b.position(v) - whole.center, solution, motion, wide_at(scattered.p + corner),
+                       wide_at(scattered.q + corner), floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
+    add_to(out.x + 3 * row, bar.x + bar.arm);
+    add_to(out.x_prev + 3 * row, bar.x_prev);
+    add_to(out.y + 3 * row, bar.y);
     out.mass[row] += T(bar.mass);
-    to[0] -= bar.arm.x, to[1] -= bar.arm.y, to[2] -= bar.arm.z;
+    add_to(to, -bar.arm);
   });
-  send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, out.x, out.mass);
+  scatter_center(b, team, whole, vector_at(sum), out.x, out.mass);
   if (!out.shared && !out.own) return;
   rigid::reverse_data(b, team, out, [&](int32_t v) {
     const Vector x = b.position(v), r = x - whole.center;
@@ -519,12 +521,12 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
 
 // And of a point of a collider.
 template <class T>
-DIFFVBD_FN void reverse_collider(const RigidInputs<T>& in, int64_t scene, int32_t point, const PointWork<T>& sent,
+DIFFVBD_FN void reverse_collider(const RigidInputs<T>& in, int64_t scene, int32_t point, const PointWork<T>& scattered,
                                  const CorrectionAdjoints<T>& bars) {
   const int64_t corner = 3 * (scene * in.gate.corners + in.gate.vertices + point);
   const int64_t to = 3 * (scene * (in.gate.corners - in.gate.vertices) + point);
-  rigid::add_to(bars.collider + to, -rigid::Body<T>::at(sent.x + corner));
-  if (sent.since) rigid::add_to(bars.collider_prev + to, rigid::Body<T>::at(sent.since + corner));
+  add_to(bars.collider + to, -wide_at(scattered.x + corner));
+  if (scattered.since) add_to(bars.collider_prev + to, wide_at(scattered.since + corner));
 }
 
 }  // namespace diffvbd::contact

@@ -1,7 +1,7 @@
 // The rigid correction of one body: the rigid motion of its current shape that minimises the incremental potential
 //     1/2 sum m |R r + c - y|^2 + the vertex energies (h^2-scaled),      r = x - center of mass,
-// (docs/method.md, section 14; its transpose is in reverse.h). A rigid motion leaves the tets' energy as it is, so only
-// sums over vertices are needed. Loops and sums belong to a Team: a few threads, a block, or a whole device.
+// and its transpose (docs/method.md, section 14). A rigid motion does not change the energy of tets: sums over vertices
+// suffice.
 #pragma once
 
 #include <limits>
@@ -15,7 +15,7 @@ constexpr int kMaxHalvings = 30;
 constexpr double kDamping = 1e-9;   // of the inertia, so that a body collapsed to a line has a turning block
 constexpr double kArrived = 1e-24;  // squared step over squared radius of gyration below which a step has arrived
 constexpr int kArrivals = 2;  // steps of no length: each leaves of the derivative's error what the block leaves out
-constexpr double kRounding = 1e-13;  // relative rise of the energies' sum that is rounding
+constexpr double kRounding = 1e-13;  // relative increase of the energies' sum that is rounding
 
 // Where the rigid motion takes a body: its turn, and how far its center of mass moves.
 struct Pose {
@@ -40,10 +40,10 @@ struct Load {
   }
 };
 
-// One executed Newton step: the pose before it, (turn, translation), the share that was taken, and the factored block.
+// One executed Newton step: the pose before it, (turn, translation), its fraction, and the factored block.
 struct Iteration {
   Pose pose;
-  double step[6], share, factor[kSix];
+  double step[6], fraction, factor[kSix];
   DIFFVBD_FN Vector turn() const { return {step[0], step[1], step[2]}; }
   DIFFVBD_FN Vector shift() const { return {step[3], step[4], step[5]}; }
 };
@@ -68,7 +68,7 @@ DIFFVBD_FN Moments moments_of(const Body<T>& b, const Team& team) {
     const Vector at = b.position(v), x = at - about, mx = m * x;
     const Vector move = b.target(v) - at, y = x + move;  // small: its mean is what momentum rounds to
     to[0] += m;
-    to[1] += mx.x, to[2] += mx.y, to[3] += mx.z;
+    add_to(to + 1, mx);
     to[4] += m * move.x, to[5] += m * move.y, to[6] += m * move.z;
     to[7] += y.x * mx.x, to[8] += y.x * mx.y, to[9] += y.x * mx.z;
     to[10] += y.y * mx.x, to[11] += y.y * mx.y, to[12] += y.y * mx.z;
@@ -81,7 +81,7 @@ DIFFVBD_FN Moments moments_of(const Body<T>& b, const Team& team) {
   Moments out{};
   out.mass = sum[0];
   const double inverse = 1 / sum[0];
-  const Vector x = inverse * Vector{sum[1], sum[2], sum[3]}, move = inverse * Vector{sum[4], sum[5], sum[6]};
+  const Vector x = inverse * vector_at(sum + 1), move = inverse * vector_at(sum + 4);
   out.center = about + x;
   out.shift = move;
   out.y_x = Matrix{{sum[7], sum[8], sum[9]}, {sum[10], sum[11], sum[12]}, {sum[13], sum[14], sum[15]}} +
@@ -96,8 +96,8 @@ DIFFVBD_FN Moments moments_of(const Body<T>& b, const Team& team) {
 // J^T H J and J^T g are added for J = d(position) / d(turn, translation) of a vertex at r from the center of mass.
 DIFFVBD_FN void add_vertex(const Vector& r, const Vector& g, const Sym3<double>& H, double* g6, double* block) {
   const Vector torque = cross(r, g);
-  g6[0] += torque.x, g6[1] += torque.y, g6[2] += torque.z;
-  g6[3] += g.x, g6[4] += g.y, g6[5] += g.z;
+  add_to(g6, torque);
+  add_to(g6 + 3, g);
   // columns of H [-r]: H (e_k x r)
   const Vector q[3] = {H * Vector{0, -r.z, r.y}, H * Vector{r.z, 0, -r.x}, H * Vector{-r.y, r.x, 0}};
   const Vector w[3] = {cross(r, q[0]), cross(r, q[1]), cross(r, q[2])};
@@ -126,8 +126,8 @@ DIFFVBD_FN Load load_at(const Body<T>& b, const Team& team, const Vector& center
     b.energies(v, [&](auto energy, int, const double* data, int count) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
-        admitted = admitted &&
-                   E::template admits<T>(s, center + before.shift + before.turn * at_start, data, count, kLeastShare);
+        admitted = admitted && E::template admits<T>(s, center + before.shift + before.turn * at_start, data, count,
+                                                     kLeastGapFraction);
       }
       to[0] += E::value(s, data, count);
       E::block(s, data, count, g, H);
@@ -166,14 +166,14 @@ DIFFVBD_FN bool newton_step(const Moments& m, double spread, const Pose& pose, c
   return kArrived * m.mass * spread < decrease;
 }
 
-// By how much the inertial part of the potential rises from the pose of a step to the next one, without cancellation.
-DIFFVBD_FN double inertial_rise(const Moments& m, const Iteration& k) {
-  const Vector turn = k.share * k.turn(), shift = k.share * k.shift();
+// The increase of the inertial potential from the pose of a step to the next one, without cancellation.
+DIFFVBD_FN double inertial_increase(const Moments& m, const Iteration& k) {
+  const Vector turn = k.fraction * k.turn(), shift = k.fraction * k.shift();
   return m.mass * dot(shift, k.pose.shift - m.shift + 0.5 * shift) - inner(turned_by(turn) * k.pose.turn, m.y_x);
 }
 
 DIFFVBD_FN Pose after(const Iteration& k) {
-  return {k.pose.turn + turned_by(k.share * k.turn()) * k.pose.turn, k.pose.shift + k.share * k.shift()};
+  return {k.pose.turn + turned_by(k.fraction * k.turn()) * k.pose.turn, k.pose.shift + k.fraction * k.shift()};
 }
 
 // Finds the motion; `record`, which a team shares, receives the executed Newton steps unless it is null.
@@ -191,22 +191,21 @@ DIFFVBD_FN Executed find(const Body<T>& b, const Team& team, Iteration* record) 
     if (out.closed) return out;
     out.end = start;
     load = load_at(b, team, m.center, start, start);
-    if (!(load.value < std::numeric_limits<double>::infinity()))
-      return out;  // starts outside: there is no way to judge
+    if (!(load.value < std::numeric_limits<double>::infinity())) return out;  // starts outside of the domain
     Iteration k;
-    // The steps that arrive are taken as well, and whole: where a body rests they are the only ones, and carry the
+    // The steps that arrive are executed as well, and whole: of a body at rest they are the only ones, and have the
     // derivative.
     int arrived = 0;
     while (arrived < kArrivals && out.count < kMaxIterations) {
       const bool goes_on = newton_step(m, b.in.spread[b.body], out.end, load, k);
       arrived += !goes_on;
       bool taken = false;
-      k.share = 1;
+      k.fraction = 1;
       for (int halving = 0; halving < kMaxHalvings && !taken; ++halving) {
-        if (halving > 0) k.share *= 0.5;
+        if (halving > 0) k.fraction *= 0.5;
         const Pose next = after(k);
         const Load there = load_at(b, team, m.center, next, k.pose);
-        taken = goes_on ? inertial_rise(m, k) + there.value - load.value <= kRounding * load.value
+        taken = goes_on ? inertial_increase(m, k) + there.value - load.value <= kRounding * load.value
                         : there.value < std::numeric_limits<double>::infinity();
         if (taken) load = there, out.end = next;
       }
@@ -257,12 +256,12 @@ DIFFVBD_FN void correct(const Body<T>& b, const Team& team, Iteration* record, T
   });
 }
 
-// By how much the incremental potential of a body rises from one state to another.
+// --- the increase of the incremental potential of a body from one state to another
 
-// What the terms of one vertex alone add on its way from the state to `to`: the rise, the sizes of the terms, and a
-// count of what comes too near a plane.
+// The terms of one vertex on the path to `to`: the increase, the sizes of the terms, and a count of vertices too near a
+// plane.
 template <class T>
-DIFFVBD_FN void add_rise(const Body<T>& b, int32_t v, const Vector& to, double* sum) {
+DIFFVBD_FN void add_energy_increase(const Body<T>& b, int32_t v, const Vector& to, double* sum) {
   const Vector from = b.position(v), step = to - from;
   const double inertial = b.mass(v) * dot(step, 0.5 * (from + to) - b.target(v));
   sum[0] += inertial, sum[1] += absolute(inertial);
@@ -270,15 +269,15 @@ DIFFVBD_FN void add_rise(const Body<T>& b, int32_t v, const Vector& to, double* 
     using E = decltype(energy);
     const auto there = b.state(v, to);
     if constexpr (E::has_filter) {
-      if (!E::template admits<T>(there, from, values, count, kLeastShare)) sum[2] += 1;
+      if (!E::template admits<T>(there, from, values, count, kLeastGapFraction)) sum[2] += 1;
     }
     const double before = E::value(b.state(v, from), values, count), after = E::value(there, values, count);
     sum[0] += after - before, sum[1] += absolute(before) + absolute(after);
   });
 }
 
-// The transpose of a rigid correction: of the closed form, or of the executed Newton steps, last one first. What was
-// executed is found again, so that nothing is kept between forward and reverse.
+// --- the transpose, of the closed form or of the executed Newton steps, last one first. They are found again: nothing
+// is kept between forward and reverse.
 
 template <class T>
 struct Adjoints {
@@ -288,15 +287,15 @@ struct Adjoints {
   int32_t shared_count, own_count;
 };
 
-// The adjoint of an end position, velocity included; and what the velocity sends to x_prev.
+// The adjoint of an end position, velocity included; and that of x_prev by the velocity.
 template <class T>
 DIFFVBD_FN Vector end_bar(const Adjoints<T>& a, int64_t row, double h) {
-  const Vector bar = Body<T>::at(a.end + 3 * row);
-  return a.velocity ? bar + 1 / h * Body<T>::at(a.velocity + 3 * row) : bar;
+  const Vector bar = wide_at(a.end + 3 * row);
+  return a.velocity ? bar + 1 / h * wide_at(a.velocity + 3 * row) : bar;
 }
 template <class T>
 DIFFVBD_FN Vector before_bar(const Adjoints<T>& a, int64_t row, double h) {
-  return a.velocity ? -1 / h * Body<T>::at(a.velocity + 3 * row) : Vector{};
+  return a.velocity ? -1 / h * wide_at(a.velocity + 3 * row) : Vector{};
 }
 
 // A vertex whose body is not corrected.
@@ -313,11 +312,11 @@ DIFFVBD_FN void reverse_kept(const Inputs<T>& in, const Adjoints<T>& a, int64_t 
 
 // One executed Newton step seen from a vertex, with p = A^-1 (adjoint of the step). With P and D the displacements of
 // the vertex by p and by the whole step, A d = -g makes the adjoint that of -(P . (m (x - y) + g) + P . (m + H) D).
-struct VertexShare {
+struct VertexDisplacement {
   Vector r_start, r, x, P, D;
   template <class T>
-  DIFFVBD_FN VertexShare(const Body<T>& b, int32_t v, const Vector& center, const Iteration& k, const Vector& p_turn,
-                         const Vector& p_shift)
+  DIFFVBD_FN VertexDisplacement(const Body<T>& b, int32_t v, const Vector& center, const Iteration& k,
+                                const Vector& p_turn, const Vector& p_shift)
       : r_start(b.position(v) - center),
         r(k.pose.turn * r_start),
         x(center + k.pose.shift + r),
@@ -325,7 +324,7 @@ struct VertexShare {
         D(cross(k.turn(), r) + k.shift()) {}
 };
 
-// What a vertex does by two motions, and where it is: what the adjoint of its energies' data takes.
+// The position of a vertex and its displacements by two motions, for the adjoint of its energies' data.
 struct VertexMotions {
   Vector x, P, D;
 };
@@ -418,17 +417,21 @@ DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, c
     Matrix after_turn = e.end.turn;
     for (int n = e.count - 1; n >= 0; --n) {
       const Iteration& k = record[n];
-      const Vector turn_step = k.share * k.turn();
-      const Vector turning = k.share * turn_vjp(turn_step, turn_bar * transposed(after_turn));
-      double p[6] = {
-          turning.x, turning.y, turning.z, k.share * center_bar.x, k.share * center_bar.y, k.share * center_bar.z};
+      const Vector turn_step = k.fraction * k.turn();
+      const Vector turning = k.fraction * turn_vjp(turn_step, turn_bar * transposed(after_turn));
+      double p[6] = {turning.x,
+                     turning.y,
+                     turning.z,
+                     k.fraction * center_bar.x,
+                     k.fraction * center_bar.y,
+                     k.fraction * center_bar.z};
       solve6(k.factor, p);
       const Vector p_turn{p[0], p[1], p[2]}, p_shift{p[3], p[4], p[5]};
       turn_bar = turn_bar + transposed(turned_by(turn_step)) * turn_bar;
       const double damped = kDamping * b.in.spread[b.body] * dot(p_turn, k.turn());
       if (a.shared != nullptr || a.own != nullptr) {
         reverse_data(b, team, a, [&](int32_t v) {
-          const VertexShare at(b, v, m.center, k, p_turn, p_shift);
+          const VertexDisplacement at(b, v, m.center, k, p_turn, p_shift);
           return VertexMotions{at.x, at.P, at.D};
         });
       }
@@ -437,7 +440,7 @@ DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, c
         const int32_t v = b.vertex(i);
         const int64_t row = b.row(v);
         const double mass = b.mass(v);
-        const VertexShare at(b, v, m.center, k, p_turn, p_shift);
+        const VertexDisplacement at(b, v, m.center, k, p_turn, p_shift);
         const VertexState<double> s = b.state(v, at.x);
         const Vector lag = at.x - b.target(v);
         Vector g = mass * lag, x_bar = -mass * at.P, x_prev_bar{};
@@ -458,8 +461,8 @@ DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, c
                                  r_bar.y * r.y, r_bar.y * r.z, r_bar.z * r.x, r_bar.z * r.y, r_bar.z * r.z};
         for (int c = 0; c < 15; ++c) to[c] += values[c];
       });
-      center_bar += Vector{add[0], add[1], add[2]};
-      start_bar -= transposed_times(k.pose.turn, Vector{add[3], add[4], add[5]});
+      center_bar += vector_at(add);
+      start_bar -= transposed_times(k.pose.turn, vector_at(add + 3));
       turn_bar = turn_bar + Matrix{{add[6], add[7], add[8]}, {add[9], add[10], add[11]}, {add[12], add[13], add[14]}};
       after_turn = k.pose.turn;
     }

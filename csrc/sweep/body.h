@@ -7,8 +7,8 @@
 
 namespace diffvbd::rigid {
 
-constexpr double kLeastShare = 0.1;  // of its gap that a vertex keeps in one step: that of the updates, 1 - FILTER_ETA
-constexpr int32_t kCorrected = -2;   // as `other` of a vertex whose body is corrected
+constexpr double kLeastGapFraction = 0.1;  // of a gap, kept in one step: that of the updates, 1 - FILTER_ETA
+constexpr int32_t kCorrected = -2;         // as `other` of a vertex whose body is corrected
 
 template <class T>
 struct Inputs {
@@ -42,13 +42,13 @@ struct Body {
   DIFFVBD_FN int32_t size() const { return in.ptr[body + 1] - in.ptr[body]; }
   DIFFVBD_FN int32_t vertex(int32_t i) const { return in.order[in.ptr[body] + i]; }
   DIFFVBD_FN int64_t row(int32_t v) const { return scene * in.vertices + v; }
-  DIFFVBD_FN static Vector at(const T* p) { return {double(p[0]), double(p[1]), double(p[2])}; }
-  DIFFVBD_FN Vector position(int32_t v) const { return at(in.x + 3 * row(v)); }
-  DIFFVBD_FN Vector target(int32_t v) const { return at(in.y.data + scene * in.y.scene + 3 * int64_t{v}); }
+  DIFFVBD_FN Vector position(int32_t v) const { return wide_at(in.x + 3 * row(v)); }
+  DIFFVBD_FN Vector target(int32_t v) const { return wide_at(in.y.data + scene * in.y.scene + 3 * int64_t{v}); }
   DIFFVBD_FN double mass(int32_t v) const { return in.mass.data[scene * in.mass.scene + v]; }
   DIFFVBD_FN VertexState<double> state(int32_t v, const Vector& x) const {
-    const Vector origin = in.origin.data ? at(in.origin.data + scene * in.origin.scene + 3 * int64_t{v}) : Vector{};
-    return {x, at(in.x_prev.data + scene * in.x_prev.scene + 3 * int64_t{v}), origin, in.time_step};
+    const Vector origin =
+        in.origin.data ? wide_at(in.origin.data + scene * in.origin.scene + 3 * int64_t{v}) : Vector{};
+    return {x, wide_at(in.x_prev.data + scene * in.x_prev.scene + 3 * int64_t{v}), origin, in.time_step};
   }
 
   // calls f(energy, its position, its data for a vertex, their count) for the energies that are present
@@ -71,14 +71,5 @@ struct Body {
         VertexEnergies{});
   }
 };
-
-template <class T>
-DIFFVBD_FN void put(T* to, const Vector& a) {
-  to[0] = static_cast<T>(a.x), to[1] = static_cast<T>(a.y), to[2] = static_cast<T>(a.z);
-}
-template <class T>
-DIFFVBD_FN void add_to(T* to, const Vector& a) {
-  put(to, Body<T>::at(to) + a);
-}
 
 }  // namespace diffvbd::rigid

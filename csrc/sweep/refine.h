@@ -10,19 +10,20 @@
 
 namespace diffvbd {
 
-// Errors grow by eps times the unevenness of a block: some tenths of it beside what an ulp of the input does. 40 is lam
-// of a hundred mu. Pairs in contact make blocks uneven all the time, and their adjoint is not refined.
-constexpr double kUneven = 40, kUnevenContact = 1e3;
-constexpr int kRefinements = 2;  // each leaves eps times the unevenness of the error: from 1e-4 to 1e-12 at 1e12
+// Errors grow by eps times the spread of a block: some tenths of it relative to an ulp of the input. 40 is lam of a
+// hundred mu. Pairs in contact make blocks ill-conditioned all the time, and their adjoint is not refined.
+constexpr double kIllConditioned = 40, kIllConditionedContact = 1e3;
+constexpr int kRefinements = 2;  // each leaves eps times the spread of the error: from 1e-4 to 1e-12 at 1e12
 
 // Whether the trace and the least pivot of a block lie further apart than rounding forgives: trace(D^-1) trace(L D L^T)
 // but for the last pivot's own part, both times inv1 inv2, so that nothing is divided. What a plane puts on an entry of
 // its own does no harm.
 template <class Set, class R>
-DIFFVBD_FN auto is_uneven(const Factor<R>& f, const Shared<R>& on) {
+DIFFVBD_FN auto is_ill_conditioned(const Factor<R>& f, const Shared<R>& on) {
   const R trace =
       on.first * (R(1) + f.l21 * f.l21 + f.l31 * f.l31) * f.inv2 + on.second * (R(1) + f.l32 * f.l32) * f.inv1;
-  return R(Set::contact ? kUnevenContact : kUneven) * (f.inv1 * f.inv2) < (f.inv1 + f.inv2 + f.inv3) * trace;
+  return R(Set::contact ? kIllConditionedContact : kIllConditioned) * (f.inv1 * f.inv2) <
+         (f.inv1 + f.inv2 + f.inv3) * trace;
 }
 
 // Out of line, so that no compiler fuses its products in one place and not in another: the rounding of a strain that a
@@ -127,9 +128,9 @@ DIFFVBD_COLD Vec3<R> reverse_star(const Block<R>& given, const Star& star, const
   return own;
 }
 
-// Copies keep what the usual path works with in registers.
+// Copies keep what the well-conditioned path works with in registers.
 template <class Set, class R, class T, class Star>
-DIFFVBD_FN Vec3<R> step_uneven(const Block<R>& b, const Star& star, const StepParameters<T>& q,
+DIFFVBD_FN Vec3<R> refine_step(const Block<R>& b, const Star& star, const StepParameters<T>& q,
                                const Axes<Set, R>& axes, const Factor<R>& H, const Vec3<R>& d) {
   const Block<R> b_copy = b;
   const Star star_copy = star;
@@ -139,9 +140,9 @@ DIFFVBD_FN Vec3<R> step_uneven(const Block<R>& b, const Star& star, const StepPa
   return refined_step<Set>(b_copy, star_copy, q, axes_copy, H_copy, d_copy);
 }
 template <class Set, int wanted, class R, class T, class Star>
-DIFFVBD_FN Vec3<R> reverse_uneven(const Block<R>& b, const Star& star, const StepParameters<T>& q,
-                                  const Axes<Set, R>& axes, const Recalled<R>& r, const Vec3<R>& d_raw,
-                                  const Vec3<R>& z, Vec3<R>& p, Vec3<R>& d_low) {
+DIFFVBD_FN Vec3<R> reverse_refined(const Block<R>& b, const Star& star, const StepParameters<T>& q,
+                                   const Axes<Set, R>& axes, const Recalled<R>& r, const Vec3<R>& d_raw,
+                                   const Vec3<R>& z, Vec3<R>& p, Vec3<R>& d_low) {
   const Star star_copy = star;
   const Block<R> b_copy = b;
   const Axes<Set, R> axes_copy = axes;

@@ -30,8 +30,8 @@ struct Iterates {
   int64_t size;     // of one state
   int window;
 
-  Vector end(int i, int64_t row) const { return rigid::Body<T>::at(states + (window + 1 + i) * size + 3 * row); }
-  Vector residual(int i, int64_t row) const { return end(i, row) - rigid::Body<T>::at(states + i * size + 3 * row); }
+  Vector end(int i, int64_t row) const { return diffvbd::wide_at(states + (window + 1 + i) * size + 3 * row); }
+  Vector residual(int i, int64_t row) const { return end(i, row) - diffvbd::wide_at(states + i * size + 3 * row); }
 };
 
 // L L^T = N in place, the lower triangle row by row; then N^-1

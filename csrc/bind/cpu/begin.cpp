@@ -45,7 +45,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::
       const auto two = diffvbd::candidates<T>(f, settings, false, x_start, from_y, y);
       uint8_t* chosen = data<uint8_t>(falls);
       for_bodies(two.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
-        chosen[body.scene * in.others + body.body] = start::way_between(two, body, team).rise <= 0;
+        chosen[body.scene * in.others + body.body] = start::path_between(two, body, team).increase <= 0;
       });
       for_vertices(in.bodies, [&](int64_t scene, int32_t i) { choose_vertex(in, to, to_other, scene, i); });
     }
@@ -61,7 +61,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::
       const Tensor apart = empty(x, shape);
       const auto two = diffvbd::candidates<T>(f, settings, true, x_start, apart, y);
       for_bodies(two.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
-        start::part_body(in, two, body, team, to, data<T>(apart), parted);
+        start::release_body(in, two, body, team, to, data<T>(apart), parted);
       });
     }
     return std::make_tuple(x_start, y, falls, alone);

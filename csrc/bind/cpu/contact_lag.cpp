@@ -17,7 +17,7 @@ namespace contact = diffvbd::contact;
 template <class T>
 struct UserPositions {
   const T* x;
-  diffvbd::Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+  diffvbd::Vec3<T> operator()(int v) const { return diffvbd::vector_at(x + int64_t{3} * v); }
 };
 
 // Calls f(pair, kind, corners, constants, kappa) for each listed pair.
@@ -38,7 +38,7 @@ template <class T>
 void add_at_corners(const contact::ContactInputs<T>& in, const int32_t* record, const diffvbd::Vec3<T> (&values)[4],
                     Tensor& points) {
   for (int k = 0; k < 4; ++k) {
-    contact::add_at(data<T>(points) + 3 * (record[5] * in.corners + record[k]), values[k]);
+    diffvbd::add_to(data<T>(points) + 3 * (record[5] * in.corners + record[k]), values[k]);
   }
 }
 
@@ -86,7 +86,7 @@ std::tuple<Tensor, Tensor> contact_rubbing(const Tensor& x, const Tensor& origin
     Tensor lag = zeros(x, {pairs.size(0), contact::kLagScalars}), push = zeros(x, {x.size(0), in.corners, 3});
     each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
       const auto state = contact::lag_state(record[4], corners, a, stiffness);
-      contact::store_rubbing(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
+      contact::store_lagged_friction(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
                              data<T>(lag) + contact::kLagScalars * pair);
       diffvbd::Vec3<T> force[4];
       for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
@@ -112,7 +112,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rubbing_backward(const Tensor
     Tensor friction_bar = zeros(x, {friction.numel() ? b : 0}), damping_bar = zeros(x, {damping.numel() ? b : 0});
     each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
       const int64_t scene = record[5];
-      contact::RubbingAdjoint<T> out;
+      contact::LaggedFrictionAdjoint<T> out;
       given.reverse(by, pair, record, corners, a, stiffness, out);
       add_at_corners(in, record, out.pair.x, points);
       data<T>(kappa_bar)[scene] += out.pair.kappa;
@@ -139,13 +139,13 @@ Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& plane
       }
     };
     each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
-      own[i] = contact::lowest_of_body(in, b, body, plane, 0, 1).vertex;
+      own[i] = contact::support_vertex_of_body(in, b, body, plane, 0, 1).vertex;
     });
     each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
       const int32_t first = in.island[b * in.bodies + body];
       int32_t* to = data<int32_t>(out);
       to[i] = first >= 0 && first < body ? to[i - int64_t{body - first} * in.num_planes]  // that of its first body
-                                         : contact::lowest_of_island(in, own.data(), b, body, plane);
+                                         : contact::support_vertex_of_island(in, own.data(), b, body, plane);
     });
     return out;
   });

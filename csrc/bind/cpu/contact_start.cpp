@@ -81,7 +81,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
                               data<T>(planes_bar) + row / in.bodies * scalars);
     }
     each(b, in.vertices, [&](int64_t scene, int32_t v) {
-      contact::reverse_vertex_share(in, rate.get(), mean.get(), scene, v, data<T>(move_bar), data<T>(mass_bar));
+      contact::reverse_vertex_mean(in, rate.get(), mean.get(), scene, v, data<T>(move_bar), data<T>(mass_bar));
     });
     return std::make_tuple(move_bar, mass_bar, x_bar, planes_bar);
   });
@@ -111,7 +111,7 @@ Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& colli
     using T = decltype(scalar);
     const auto in = diffvbd::narrow_inputs<T>(x, origin, collider, room, pairs, constants, ptr);
     Tensor out = empty(x, {pairs.size(0), contact::kConstants});
-    diffvbd::narrow<T>(in, pairs.size(0), data<T>(out));
+    diffvbd::refresh_gaps<T>(in, pairs.size(0), data<T>(out));
     return out;
   });
 }

@@ -22,7 +22,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_motion(const Tensor& x, const Tensor&
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::motion_inputs<T>({x, origin, mass, move, held, order, ptr}, fall, held_bodies);
-    Tensor rigid = empty(x, {in.scenes, in.vertices, 3}), ways = empty(x, {contact::kWays, in.scenes, in.bodies});
+    Tensor rigid = empty(x, {in.scenes, in.vertices, 3}), ways = empty(x, {contact::kDisplacements, in.scenes, in.bodies});
     Tensor sums = empty(x, {in.scenes, in.bodies, 4});
     diffvbd::find_motion<T>(in, data<T>(rigid), data<T>(ways), data<T>(sums));
     return std::make_tuple(rigid, ways, sums);
@@ -50,7 +50,7 @@ Tensor contact_coast(const Tensor& x, const Tensor& mass, const Tensor& move, co
     using T = decltype(scalar);
     const auto in = diffvbd::coast_inputs<T>(x, mass, move, held, held_bodies, order, ptr, chord);
     Tensor coasted = empty(x, {in.scenes, in.vertices, 3});
-    diffvbd::coast<T>(in, chord, data<T>(coasted));
+    diffvbd::extrapolate<T>(in, chord, data<T>(coasted));
     return coasted;
   });
 }
@@ -65,7 +65,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_coast_backward(const Tensor& bar, con
     diffvbd::require_like("bar", bar, x, x.numel());
     Tensor x_bar = empty(x, {in.scenes, in.vertices, 3}), move_bar = empty(x, {in.scenes, in.vertices, 3});
     Tensor mass_bar = empty(x, {in.scenes, in.vertices});
-    diffvbd::reverse_coast<T>(in, chord, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)});
+    diffvbd::reverse_extrapolate<T>(in, chord, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)});
     return std::make_tuple(x_bar, mass_bar, move_bar);
   });
 }
@@ -88,7 +88,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
     const auto in =
         diffvbd::room_inputs<T>(motion, islands, x, {rigid, ways, sums, floor, most, most_alone, most_own, least_own},
                                 {dhat, share, least, self_contact});
-    diffvbd::find_rooms<T>(in, out.pointers<T>(in));
+    diffvbd::find_trust_radii<T>(in, out.pointers<T>(in));
     return out.tensors();
   });
 }

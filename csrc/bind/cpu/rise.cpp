@@ -32,12 +32,12 @@ void pack(const T* x, const T* to, int64_t vertices, T* at, T* way) {
 
 // The rise, and how much of it is rounding at most; infinite where a vertex would be too near a plane.
 template <class T>
-void rise(const coarse::RiseInputs<T>& in, const rigid::Body<T>& b, const Threads& team, const T* at, const T* way,
+void rise(const coarse::IncreaseInputs<T>& in, const rigid::Body<T>& b, const Threads& team, const T* at, const T* way,
           const diffvbd::CoarseKernels<T>& kernels, double* out) {
   double vertices[3];
   team.template sum<3>(b.size(), vertices, [&](int32_t i, double* sum) {
     const int32_t v = b.vertex(i);
-    rigid::add_rise(b, v, rigid::Body<T>::at(in.to + 3 * b.row(v)), sum);
+    rigid::add_energy_increase(b, v, diffvbd::wide_at(in.to + 3 * b.row(v)), sum);
   });
   double change[2 * coarse::kDegree];
   const int32_t first = in.block_ptr[b.body];

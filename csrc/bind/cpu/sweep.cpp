@@ -105,7 +105,7 @@ struct ContactSlots {
       const int64_t scene = at / corners, corner = at % corners;
       T* to = corner < v ? data<T>(bars.x_prev) + 3 * (scene * v + corner)
                          : data<T>(bars.collider_prev) + 3 * (scene * (corners - v) + corner - v);
-      contact::add_at(to, contact::vector_at(prev.get() + 3 * at));
+      diffvbd::add_to(to, diffvbd::vector_at(prev.get() + 3 * at));
     }
   }
 };

@@ -29,13 +29,13 @@ Tensor contact_sweep_rooms(const Tensor& x, const Tensor& start, const Tensor& b
     const int64_t grain = diffvbd::pieces_per_thread(in.bodies > 0 ? in.vertices / in.bodies : 0);
     parallel_for(0, in.scenes * in.bodies, grain, [&](int64_t first, int64_t last) {
       for (int64_t i = first; i < last; ++i) {
-        wishes[i] = contact::wish_of_body(in, contact::ways_of_body(in, i / in.bodies, i % in.bodies, 0, 1), i);
+        wishes[i] = contact::wish_of_body(in, contact::displacements_of_body(in, i / in.bodies, i % in.bodies, 0, 1), i);
       }
     });
     for (int64_t s = 0; s < in.scenes; ++s) most[s] = contact::most_of_scene(in, wishes.data(), s, 0, 1);
     parallel_for(0, in.scenes * in.vertices, kGrain, [&](int64_t first, int64_t last) {
       for (int64_t i = first; i < last; ++i) {
-        rooms[i] = contact::sweep_room(in, most[i / in.vertices], i / in.vertices, i % in.vertices);
+        rooms[i] = contact::sweep_radius(in, most[i / in.vertices], i / in.vertices, i % in.vertices);
       }
     });
     return out;

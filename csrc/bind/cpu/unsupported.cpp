@@ -25,7 +25,7 @@ Tensor contact_unsupported(const Tensor& x, const Tensor& origin, const Tensor& 
         {x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr}, time_step);
     Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3});
     for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
-      contact::leave_unsupported(in, b, team, data<T>(out));
+      contact::residual_acceleration(in, b, team, data<T>(out));
     });
     return out;
   });
@@ -45,7 +45,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_unsupported_backward(
         [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
     const auto out = bars.pointers<T>();
     for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
-      contact::reverse_unsupported(in, b, team, data<const T>(bar), out);
+      contact::reverse_residual_acceleration(in, b, team, data<const T>(bar), out);
     });
     return bars.tensors();
   });

@@ -92,7 +92,7 @@ Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& colli
     using T = decltype(scalar);
     const auto in = diffvbd::narrow_inputs<T>(x, origin, collider, room, pairs, constants, ptr);
     Tensor out = empty(x, {pairs.size(0), contact::kConstants});
-    check(cuda::narrow<T>(in, pairs.size(0), data<T>(out), current_stream(x)), "what a list can still reach");
+    check(cuda::refresh_gaps<T>(in, pairs.size(0), data<T>(out), current_stream(x)), "what a list can still reach");
     return out;
   });
 }

@@ -27,7 +27,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_motion(const Tensor& x, const Tensor&
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::motion_inputs<T>({x, origin, mass, move, held, order, ptr}, fall, held_bodies);
-    Tensor rigid = empty(x, {in.scenes, in.vertices, 3}), ways = empty(x, {contact::kWays, in.scenes, in.bodies});
+    Tensor rigid = empty(x, {in.scenes, in.vertices, 3}), ways = empty(x, {contact::kDisplacements, in.scenes, in.bodies});
     Tensor sums = empty(x, {in.scenes, in.bodies, 4});
     check(cuda::find_motion<T>(in, data<T>(rigid), data<T>(ways), data<T>(sums), current_stream(x)),
           "motions of bodies");
@@ -60,7 +60,7 @@ Tensor contact_coast(const Tensor& x, const Tensor& mass, const Tensor& move, co
     using T = decltype(scalar);
     const auto in = diffvbd::coast_inputs<T>(x, mass, move, held, held_bodies, order, ptr, chord);
     Tensor coasted = empty(x, {in.scenes, in.vertices, 3});
-    check(cuda::coast<T>(in, chord, data<T>(coasted), current_stream(x)), "where bodies coast to");
+    check(cuda::extrapolate<T>(in, chord, data<T>(coasted), current_stream(x)), "where bodies coast to");
     return coasted;
   });
 }
@@ -76,7 +76,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_coast_backward(const Tensor& bar, con
     diffvbd::require_like("bar", bar, x, x.numel());
     Tensor x_bar = empty(x, {in.scenes, in.vertices, 3}), move_bar = empty(x, {in.scenes, in.vertices, 3});
     Tensor mass_bar = empty(x, {in.scenes, in.vertices});
-    check(cuda::reverse_coast<T>(in, chord, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)},
+    check(cuda::reverse_extrapolate<T>(in, chord, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)},
                                  current_stream(x)),
           "the adjoint of where bodies coast to");
     return std::make_tuple(x_bar, mass_bar, move_bar);
@@ -104,7 +104,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
                                 {dhat, share, least, self_contact});
     const auto bytes = static_cast<int64_t>(cuda::islands_workspace_bytes<T>(islands));
     const Tensor work = empty(x, {bytes}, ScalarType::Byte);
-    check(cuda::find_rooms<T>(in, out.pointers<T>(in), work.data_ptr(), current_stream(x)), "rooms of bodies");
+    check(cuda::find_trust_radii<T>(in, out.pointers<T>(in), work.data_ptr(), current_stream(x)), "rooms of bodies");
     return out.tensors();
   });
 }
