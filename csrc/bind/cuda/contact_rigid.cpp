@@ -20,7 +20,7 @@ using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-cuda::PairRoom trust_radius_of(const TouchingFields& f) {
+cuda::PairRoom room_of(const TouchingFields& f) {
   return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
 }
 
@@ -39,8 +39,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
     const auto doubles = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes, ScalarType::Double); };
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
     Tensor factor = doubles(diffvbd::matrix_shape(b, n, alone));
-    const Tensor work = empty(x, {cuda::rigid_system_bytes(in, trust_radius_of(f))}, ScalarType::Byte);
-    check(cuda::rigid_system<T>(in, trust_radius_of(f), data<double>(centers), data<double>(motion), data<double>(factor),
+    const Tensor work = empty(x, {cuda::rigid_system_bytes(in, room_of(f))}, ScalarType::Byte);
+    check(cuda::rigid_system<T>(in, room_of(f), data<double>(centers), data<double>(motion), data<double>(factor),
                                 in.groups ? data<int32_t>(groups) : nullptr, work.data_ptr(), current_stream(x)),
           "the rigid correction of bodies that touch");
     return std::make_tuple(centers, motion, factor, groups);
@@ -63,8 +63,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_move(DIFFVBD_PA
     diffvbd::require_motion(in, centers, motion, x);
     const auto make = [&](const std::vector<int64_t>& sizes, ScalarType dtype) { return empty(x, sizes, dtype); };
     const diffvbd::RigidOutcomeTensors out(in, x, make);
-    const Tensor work = empty(x, {cuda::rigid_move_bytes(in, trust_radius_of(f))}, ScalarType::Byte);
-    check(cuda::rigid_move<T>(in, trust_radius_of(f), data<const double>(centers), data<const double>(motion), data<T>(way),
+    const Tensor work = empty(x, {cuda::rigid_move_bytes(in, room_of(f))}, ScalarType::Byte);
+    check(cuda::rigid_move<T>(in, room_of(f), data<const double>(centers), data<const double>(motion), data<T>(way),
                               out.view<T>(), data<T>(out.x), work.data_ptr(), current_stream(x)),
           "the rigid correction of bodies that touch");
     return out.all();
