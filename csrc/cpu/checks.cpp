@@ -83,7 +83,7 @@ void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
         if (v < 0) continue;
         const auto at = [&](const Batched<const T>& t) {
           const T* a = t.data + b * t.scene + 3 * int64_t{v};
-          return Vec3<T>{a[0], a[1], a[2]};
+          return vector_at(a);
         };
         VertexState<T> state{at(in.x_prev), zero3<T>(), zero3<T>(), T(0)};
         if (in.origin.data) state.origin = at(in.origin);
@@ -131,9 +131,9 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
 }
 
 template <class T>
-void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride) {
+void check_masses(const T* fractions, int64_t scenes, int64_t tets, int64_t stride) {
   for (int64_t i = 0; i < scenes * tets; ++i) {
-    const T mass = 4 * shares[i * stride];
+    const T mass = 4 * fractions[i * stride];
     if (mass > 0 && std::isfinite(mass)) continue;
     Message out;
     out << "density or rest_points: expected density > 0 kg/m^3 and positive volume, got a mass of " << mass

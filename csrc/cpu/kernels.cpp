@@ -76,7 +76,7 @@ template <class T>
 PairKernels<T> pair_kernels() {
   return kernels<T>().pairs;
 }
-MeetKernel meet_kernel() { return kernels<float>().meet; }
+OverlapKernel overlap_kernel() { return kernels<float>().meet; }
 
 template SweepKernel<float> forward_kernel<float>(int);
 template SweepKernel<double> forward_kernel<double>(int);

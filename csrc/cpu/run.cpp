@@ -10,7 +10,7 @@
 #include "contact.h"
 #include "kernels.h"
 #include "message.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 namespace {
@@ -131,13 +131,8 @@ std::vector<int32_t> positions_of(const Plan& plan) {
 
 template <class F>
 void for_scenes(int64_t scenes, bool parallel, const F& f) {
-  if (parallel && scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) {
-    torch::stable::parallel_for(0, scenes, 1, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) f(i);
-    });
-  } else {
-    for (int64_t i = 0; i < scenes; ++i) f(i);
-  }
+  if (parallel && scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) return for_each(scenes, f, 1);
+  for (int64_t i = 0; i < scenes; ++i) f(i);
 }
 template <class T>
 int64_t team_size(const Plan& plan, const StepInputs<T>& in) {
@@ -179,7 +174,7 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
 }  // namespace
 
 template <class T>
-void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut) {
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* truncations) {
   const auto kernel = forward_kernel<T>(in.energies);
   const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, kept_scalars(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
@@ -208,24 +203,20 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
-            member.each(first, last, [&](int64_t begin, int64_t end) {
+            member.each_sync(first, last, [&](int64_t begin, int64_t end) {
               contact->assemble(begin, end);
               contact->remember(begin, end);
             });
-            member.barrier();
           }
-          member.each(first, last, [&](int64_t begin, int64_t end) {
+          uint8_t* limits = contact ? truncations + (b * in.sweeps + k) * plan.num_vertices : nullptr;
+          member.each_sync(first, last, [&](int64_t begin, int64_t end) {
             kernel(plan, scene.view, q, k, in.tape_policy, begin, end);
-            if (contact) contact->propose(first, last, begin, end, cut + (b * in.sweeps + k) * plan.num_vertices);
+            if (contact) contact->propose(first, last, begin, end, limits);
           });
-          member.barrier();
           if (contact) {
-            uint8_t* limits = cut + (b * in.sweeps + k) * plan.num_vertices;
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
-            member.barrier();
-            member.each(first, last,
-                        [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
-            member.barrier();
+            member.each_sync(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
+            member.each_sync(first, last,
+                             [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
           }
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
         }
@@ -280,32 +271,25 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       for (int c = plan.colors - 1; c >= 0; --c) {
         const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
         if (contact) {
-          member.each(first, last, [&](int64_t begin, int64_t end) {
+          member.each_sync(first, last, [&](int64_t begin, int64_t end) {
             contact->prepare(k, rows_of_tape, begin, end, limits + (b * in.sweeps + k) * n);
           });
-          member.barrier();
           member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
           if (in.tape_policy != kFullTape) {
             member.barrier();
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
-            member.barrier();
+            member.each_sync(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
           }
         }
-        member.each(first, last,
-                    [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
-        member.barrier();
-        if (contact) {
-          member.each(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
-          member.barrier();
-        }
+        member.each_sync(first, last,
+                         [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
+        if (contact) member.each_sync(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
       }
       // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
-      member.each(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
+      member.each_sync(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
         for (int64_t block = begin; block < end; ++block) {
           store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
         }
       });
-      member.barrier();
     };
     Team::run(team_size(plan, in), [&](Team::Member member) {
       int corrections = in.coarse ? in.coarse->corrections : 0;
@@ -392,6 +376,5 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   template void pack_rest<T>(const Plan&, const T*, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
 
 }  // namespace diffvbd
