@@ -35,7 +35,6 @@ CPU_SOURCES = [
     *(f"csrc/cpu/sweep_{scalar}_{name}.cpp" for scalar in ("double", "float") for name in INSTRUCTION_SETS),
     "csrc/bind/schema.cpp",
     "csrc/cpu/advance.cpp",
-    "csrc/cpu/checks.cpp",
     "csrc/cpu/coarse.cpp",
     "csrc/cpu/contact.cpp",
     "csrc/cpu/contact_rigid.cpp",

@@ -251,7 +251,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
 struct Systems {
   struct System {
     int32_t first, count;
-    Settling state = kOnItsWay;
+    Settling state = kIterating;
     int64_t size() const { return int64_t{kUnknowns} * count; }
   };
   Groups groups;

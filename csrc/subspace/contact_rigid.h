@@ -557,11 +557,11 @@ DIFFVBD_FN double friction_fraction(double decrease, const Excess& excess) {
 }
 
 // State of a system: iterating, at the settled motion but without its matrix there, and done.
-enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
+enum Settling : uint8_t { kIterating, kSettledAt, kDone };
 
 // The fraction of a step. decrease, whole: twice the potential of the step and of the motion after it.
-template <class Share>
-DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, double whole, const Share& fraction) {
+template <class Fraction>
+DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, double whole, const Fraction& fraction) {
   if (!has_friction || state == kSettledAt) {
     state = kDone;
     return 1;

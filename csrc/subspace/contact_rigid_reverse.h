@@ -256,14 +256,14 @@ struct LaggedWork {
       const FrictionRate<double> f(square_root(dot(u, u)), eps);
       const double nP = dot(n, P), nQ = dot(n, Q), slipping = dot(u, P);
       const Vector by_u = L * (f.value * P + (f.curvature * slipping) * u);
-      const Vector by_way = by_u - dot(n, by_u) * n;
+      const Vector by_displacement = by_u - dot(n, by_u) * n;
       by_d += by_u;
       by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
       by_n += (A * approach) * P + (m.fraction * A) * (nQ * P + nP * Q) - (along + dot(n, displacement)) * by_u -
               dot(n, by_u) * displacement;
       by_load += f.value * slipping, by_damping += approach * nP + m.fraction * nP * nQ;
       const Vector by_p = (A * (approach + m.fraction * nQ)) * n + (L * f.value) * u;
-      const Vector by_q = m.fraction * ((A * nP) * n + by_way);
+      const Vector by_q = m.fraction * ((A * nP) * n + by_displacement);
       for (int k = 0; k < 4; ++k) {
         if (!m.is_of(side, k)) continue;
         put(rows + kWorkScalars * k + 3, w[k] * by_p);
