@@ -1,10 +1,10 @@
-// What the adjoint of the rigid correction needs of pairs: of their part of the virtual work
+// The adjoint of the rigid correction of bodies that touch (docs/method.md, section 18). Pairs first: the derivatives
+// of their part of the virtual work
 //
 //     W = p . (gradient + matrix q)
 //
-// of two motions p and q of all corner points, the derivatives by p, q, positions, kappa and what is lagged. A listed
-// pair is derived in twelve directions by Dual, once for each correction; a lagged one by hand. docs/method.md,
-// section 18.
+// of two motions p and q of all corner points by p, q, positions, kappa and the lagged state. A listed pair is derived
+// in twelve directions by Dual, once for each correction; a lagged one by hand.
 #pragma once
 
 #include "contact_rigid.h"
@@ -24,19 +24,19 @@ struct VirtualMotions {
 template <class T>
 struct RigidWork {
   T *barrier, *by_kappa;  // [listed, 4, 9], [listed]
-  uint8_t* pushes;        // [listed]: whose rows are written
+  uint8_t* pushes;        // [listed]: the pairs whose rows are written
   T *friction, *lag_bar;  // [lagged, 4, 9]; [lagged, 9] less the derivatives by what is lagged
   int64_t listed, lagged;
 };
-// And their sums at all corner points [B, N, 3].
+// Their sums at all corner points [B, N, 3].
 template <class T>
 struct PointWork {
-  T *x, *p, *q;  // p: without pairs of which no corner moves by p
-  T* since;      // of lagged pairs, by how points have moved since the start of the step, which `x` has in it; or null
+  T *x, *p, *q;  // p: without pairs whose corners do not move by p
+  T* since;      // of lagged pairs, by displacements since the start of the step, included in `x`; or null
 };
 constexpr int kPointScalars = kWorkScalars + 3;
 
-// Adds what every `stride`-th pair of a corner point from `first` on has at it: by x, p, q and since.
+// Adds the derivatives of every `stride`-th pair of a corner point from `first` on: by x, p, q and since.
 template <class T>
 DIFFVBD_FN void add_at_point(const RigidInputs<T>& in, const RigidWork<T>& work, int64_t point, int first, int stride,
                              double* sum) {
@@ -282,7 +282,7 @@ struct LaggedWork {
   }
 };
 
-// The adjoint of the rigid correction of bodies that touch, but for what pairs have in it (contact/rigid_backward.h).
+// Then the correction itself.
 //
 // A correction moves vertices by displaced(fraction d, r), with H d = -g. The adjoint of d, l = H^-1 (adjoint of the
 // displacement), makes that of everything g and H read the adjoint of -W, where
