@@ -179,8 +179,8 @@ struct Wishes {
   }
 };
 
-// Which of these displacements bend a free body. A body that a floor stops or a radius truncates is frozen, and so is a
-// blocked one that bends deeply; with self-contact any other bent body is pending.
+// The decision which of these displacements bend a free body. A body that a floor stops or a radius truncates is
+// frozen, and so is a blocked one that bends deeply; with self-contact any other bent body is pending.
 template <class T>
 struct Bends {
   StartInputs<T> in;

@@ -79,7 +79,7 @@ DIFFVBD_FN T asked(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t
   const T gravity = T(2) * in.displacement(kGravity, place) + in.least;
   return in.fraction * relative + in.displacement(kBends, place) + gravity + work.stopped[place];
 }
-// And the one that it gets. Prescribed vertices are not limited: their pairs are listed however far they go.
+// The radius that it gets. Prescribed vertices are not limited: their pairs are listed however far they go.
 template <class T>
 DIFFVBD_FN T trust_radius_of(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T relative, T most) {
   const T wished = asked(in, work, place, relative) + T(kSpare) * in.dhat;
@@ -214,7 +214,7 @@ struct SweepDisplacements {
   }
 };
 
-// Of every `stride`-th vertex of a body from `first` on.
+// The squares of every `stride`-th vertex of a body from `first` on.
 template <class T>
 DIFFVBD_FN SweepDisplacements<T> displacements_of_body(const SweepRadiusInputs<T>& in, int64_t scene, int64_t body,
                                                        int32_t first, int32_t stride) {
@@ -246,7 +246,7 @@ DIFFVBD_FN T most_of_scene(const SweepRadiusInputs<T>& in, const T* wishes, int6
   return out;
 }
 
-// Of one vertex, where `most` is that of its scene.
+// The radius of one vertex, where `most` is that of its scene.
 template <class T>
 DIFFVBD_FN T sweep_radius(const SweepRadiusInputs<T>& in, T most, int64_t scene, int64_t v) {
   if (in.pinned[v]) return T(0);

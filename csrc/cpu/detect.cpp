@@ -106,7 +106,7 @@ struct Near {
   uint64_t key;
 };
 
-// What a piece of the search finds.
+// The finds of a piece of the search.
 template <class T>
 struct Finds {
   std::vector<uint64_t> pairs;  // that the list needs
@@ -242,7 +242,7 @@ class SceneDetection {
     near.gap.store(gap, std::memory_order_relaxed), near.key = key;
   }
 
-  // What the pieces have found, sorted.
+  // Collects the finds, sorted.
   void gather() {
     listed_.clear(), touching_ = 0, first_touching_ = kNoKey;
     for (const Finds<T>& finds : finds_) {

@@ -53,7 +53,7 @@ int32_t source(const Plan& plan, int64_t block, int lane) {
   return v < 0 ? plan.order[block * kLanes] : v;
 }
 
-// Where component c of vertex i in sweep order is: in packs [blocks, 3, kLanes], or in rows [blocks kLanes, 4].
+// The place of component c of vertex i in sweep order: in packs [blocks, 3, kLanes], or in rows [blocks kLanes, 4].
 constexpr auto in_packs = [](int64_t i, int c) { return (i / kLanes * 3 + c) * kLanes + i % kLanes; };
 constexpr auto in_rows = [](int64_t i, int c) { return 4 * i + c; };
 
@@ -128,7 +128,7 @@ struct Scene {
   }
 };
 
-// Where each vertex stands in sweep order: asked for by contact, whose pairs name vertices.
+// The place of each vertex in sweep order: the pairs of contact name vertices.
 std::vector<int32_t> positions_of(const Plan& plan) {
   std::vector<int32_t> out(plan.num_vertices);
   for (int32_t at = 0; at < plan.blocks * kLanes; ++at) {
@@ -288,7 +288,7 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
   check_vectors("start (x, v, force, gravity, prescribed)", in.x_start, in.scenes, n);
   if (in.energies & kExactBlock) check_material<StableNeoHookean<true>>(in, plan.num_tets);
   if (in.energies & kPaperBlock) check_material<StableNeoHookean<false>>(in, plan.num_tets);
-  // What a sweep does not move needs no mass: an isolated vertex has none.
+  // Vertices that no sweep moves need no mass: an isolated vertex has none.
   for (int64_t b = 0; b < distinct_scenes(in.mass, in.scenes); ++b) {
     for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
       const int32_t v = plan.order[i];
