@@ -62,18 +62,18 @@ DIFFVBD_FN double most(const Team& team, int32_t size, const F& f) {
 }
 
 // The largest excess of a vertex of the body over its allowance.
-template <class T, class Team, class At, class Way, class Counts>
-DIFFVBD_FN double excess_over(const Team& team, int32_t size, const T* plane, const At& at, const Way& displacement,
-                              const Counts& counts) {
+template <class T, class Team, class At, class Displacement, class Counts>
+DIFFVBD_FN double excess_over(const Team& team, int32_t size, const T* plane, const At& at,
+                              const Displacement& displacement, const Counts& counts) {
   return most(team, size,
               [&](int32_t i) { return counts(i) ? Descent<T>(plane, at(i), displacement(i)).excess() : 0.0; });
 }
 
 // planes: `count` planes, as in the data of FloorBarrier. at(i), displacement(i) [m] and counts(i), false where pinned,
 // of the i-th of `size` vertices.
-template <class T, class Team, class At, class Way, class Counts>
+template <class T, class Team, class At, class Displacement, class Counts>
 DIFFVBD_FN AboveFloor above_floor(const Team& team, int32_t size, const T* planes, int32_t count, At&& at,
-                                  Way&& displacement, Counts&& counts) {
+                                  Displacement&& displacement, Counts&& counts) {
   AboveFloor out{1, Vector{0, 0, 0}, false};
   const double fraction = team.least(size, [&](int32_t i) {
     double least = 1;

@@ -159,11 +159,11 @@ DIFFVBD_FN PairPlace<T> place_of(const AdvanceInputs<T>& in, const AdvanceState<
 
 // Their trial displacements.
 template <class T>
-struct Ways {
+struct TrialDisplacements {
   Vec3<T> displacement[4];
   T fractions[4];  // of a gap that each may close
   bool free[4], moves, careful;
-  DIFFVBD_FN Ways(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair)
+  DIFFVBD_FN TrialDisplacements(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair)
       : moves(false), careful(false) {
     bool one = false, other = false;
     for (int k = 0; k < 4; ++k) {
@@ -218,7 +218,7 @@ struct PairPlane {
   }
   DIFFVBD_FN void forget() { least = T(-1); }
   DIFFVBD_FN bool is_known() const { return T(0) <= least; }
-  DIFFVBD_FN bool holds(int kind, const Ways<T>& a) const {
+  DIFFVBD_FN bool holds(int kind, const TrialDisplacements<T>& a) const {
     const bool at_rest = !a.moves && !(separation.slack[0] < T(0));
     return at_rest || holds_along(kind, n, separation, guard, least, a.displacement, a.fractions, a.careful, a.careful);
   }
@@ -306,7 +306,7 @@ DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   if (round > 0 && !is_retried(in, s, record, round)) return true;
   if (stays_far(in, s, record, in.constants + kConstants * pair)) return true;
   if (!plane.is_known()) plane = find();
-  return plane.holds(record[4], Ways<T>(in, s, record));
+  return plane.holds(record[4], TrialDisplacements<T>(in, s, record));
 }
 
 // Marks the corners that block a pair; returns whether it is safe. Round 0 tests all pairs, later rounds those with a
@@ -319,7 +319,7 @@ DIFFVBD_FN bool test_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   const T* constants = in.constants + kConstants * pair;
   if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (pair_list.h)
   if (stays_far(in, s, record, constants)) return true;                                // as do most
-  const Ways<T> a(in, s, record);
+  const TrialDisplacements<T> a(in, s, record);
   const bool plane = record[4] == kPointPlane;
   if (plane && PairPlane<T>(in, s, pair).holds(record[4], a)) return true;
   if (!plane && !a.moves) return true;

@@ -196,7 +196,7 @@ struct Surfaces {
   }
 };
 
-// What a detection returns; N corner points a scene. Unused rows of pairs and entries of `entry` are -1.
+// The result of a detection; N corner points a scene. Unused rows of pairs and entries of `entry` are -1.
 constexpr int kPairRow = 6, kConstants = 8, kNearRow = 5, kNearValues = 8, kCounts = 4;
 template <class T>
 struct Detected {

@@ -141,7 +141,7 @@ struct LagCoefficients {
   DIFFVBD_FN T damping_of(int64_t scene) const { return damping.data ? damping.data[scene * damping.scene] : T(0); }
 };
 
-// What Lag reads of a pair: friction and damping by their coefficients, its normal and weights.
+// Stores the inputs of Lag: friction and damping by their coefficients, normal and weights.
 template <class T>
 DIFFVBD_FN void store_lagged_friction(const LagState<T>& a, T friction, T damping, T kappa, T dhat, T* to) {
   const LagState<T> friction_load{friction * a.force,
@@ -203,7 +203,7 @@ DIFFVBD_FN void reverse_lagged_friction(int kind, const Corners<T>& c, const Pai
   out.friction = bar[0] * now.force, out.damping = bar[1] * fraction.value;
 }
 
-// Those adjoints of all pairs; null where there are none.
+// These adjoints of all pairs; null where there are none.
 template <class T>
 struct LaggedFrictionBars {
   const T *lag, *push;  // [pairs, 9], [B, corners, 3]

@@ -6,7 +6,7 @@
 
 namespace diffvbd::contact {
 
-// What a search for intersections returns. Unused rows are -1.
+// The result of a search for intersections. Unused rows are -1.
 constexpr int kCrossingRow = 3;
 struct Intersections {
   int64_t capacity;
@@ -120,7 +120,7 @@ template <class T>
 DIFFVBD_FN uint64_t crossing_key(const Surfaces<T>& in, int64_t scene, int32_t edge, int32_t triangle) {
   return crossing_keys(in, scene) + static_cast<uint64_t>(edge) * in.num_triangles + static_cast<uint64_t>(triangle);
 }
-// Of a point and a plane of one scene.
+// The key of a point and a plane of one scene.
 template <class T>
 DIFFVBD_FN uint64_t behind_key(const Surfaces<T>& in, int32_t point, int32_t plane) {
   return static_cast<uint64_t>(point) * in.num_planes + static_cast<uint64_t>(plane);

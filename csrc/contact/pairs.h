@@ -18,7 +18,7 @@ struct PairConstants {
       : dhat(dhat), offset(offset), threshold(threshold) {}
 };
 
-// What belongs to corner i; in a pack of lanes each has an i of its own.
+// The item of corner i; in a pack of lanes each has an i of its own.
 template <class A>
 DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
   return a[i];

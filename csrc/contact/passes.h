@@ -56,7 +56,7 @@ struct ContactInputs {
   }
 };
 
-// Where pairs leave what they add; zero at first. Slot 4 pair + i belongs to corner i, its only writer.
+// The adjoints that pairs scatter; zero at first. Slot 4 pair + i belongs to corner i, its only writer.
 template <class T>
 struct ContactAdjoints {
   T *rows = nullptr, *lag_rows = nullptr;  // [4 pairs, 4, 3]  toward each corner
@@ -192,7 +192,7 @@ DIFFVBD_FN void add_barrier_of(const Source<T, Positions>& s, int64_t entry, int
               PairConstants<T>(in.constants + kConstants * pair), in.kappa.data[s.scene * in.kappa.scene], h * h, g, H);
 }
 
-// What the lagged pair of an entry of vertex v adds to g and H.
+// Adds the lagged pair of an entry of vertex v to g and H.
 template <class T, class Positions>
 DIFFVBD_FN void add_lag_of(const Source<T, Positions>& s, int64_t entry, int v, T h, Vec3<T>& g, Sym3<T>& H) {
   const ContactInputs<T>& in = s.in;
@@ -203,7 +203,7 @@ DIFFVBD_FN void add_lag_of(const Source<T, Positions>& s, int64_t entry, int v, 
   const int own = static_cast<int>(entry & 3);
   add_lagged(lag, own, s.together(record, v), s.motion(record, lag), h, in.friction_eps, g, H);
 }
-// And friction on the floor's planes: every `stride`-th plane from `first` on.
+// Adds friction on the floor's planes: every `stride`-th plane from `first` on.
 template <class T, class Positions>
 DIFFVBD_FN void add_floor_lags(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g,
                                Sym3<T>& H) {
@@ -292,7 +292,7 @@ DIFFVBD_FN Lag<T> floor_lag(const Source<T, Positions>& s, int v, int plane) {
 // The adjoints of these passes scatter to the corners of pairs. In the reverse all p of a color are known before any is
 // scattered.
 
-// What another multiprocessor of a device may have written during the launch: it is in the L2 cache.
+// A value that another multiprocessor of a device may have written during the launch: it is in the L2 cache.
 template <class U>
 DIFFVBD_FN U fresh(const U* p) {
 #if defined(__CUDA_ARCH__)

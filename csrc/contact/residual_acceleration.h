@@ -142,7 +142,7 @@ DIFFVBD_FN Vector floor_adjoint(const ResidualInputs<T>& in, const rigid::Body<T
   return out;
 }
 
-// And of the data of one plane: normal, height, kappa and dhat.
+// The adjoint of the data of one plane: normal, height, kappa and dhat.
 constexpr int kPushedScalars = 6;
 template <class T>
 DIFFVBD_FN void add_plane_adjoint(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, int32_t plane,

@@ -141,8 +141,8 @@ struct Frames {
     const Vec3<T> u = vector_at(in.u + 3 * index);
     const double square = most(team, b.size(), [&](int32_t i) {
       const int32_t v = b.vertex(i);
-      const Vec3<T> beside = vector_at(displacement + 3 * b.row(v)) - u;
-      const double own = in.pinned[v] ? 0 : double(dot(beside, beside));
+      const Vec3<T> relative = vector_at(displacement + 3 * b.row(v)) - u;
+      const double own = in.pinned[v] ? 0 : double(dot(relative, relative));
       return own < infinity ? own : infinity;
     });
     const double longest = 0 < square ? square_root(square) : 0;
@@ -179,8 +179,8 @@ struct Wishes {
   }
 };
 
-// Which of these displacements bend a free body. A body that a floor stops or a radius truncates is frozen, and so is a
-// blocked one that bends deeply; with self-contact any other bent body is pending.
+// The decision which of these displacements bend a free body. A body that a floor stops or a radius truncates is
+// frozen, and so is a blocked one that bends deeply; with self-contact any other bent body is pending.
 template <class T>
 struct Bends {
   StartInputs<T> in;
@@ -219,14 +219,14 @@ struct Freeze {
   const T* displacement;  // [B, V, 3]
   const uint8_t* state;   // [B, V]
   const bool* increases;  // [B, V]
-  T* way_out;
+  T* displacement_out;
   uint8_t* state_out;
 
   DIFFVBD_FN void operator()(int64_t scene, int32_t v) const {
     const int64_t row = in.row(scene, v);
     const bool pending = state[row] == kPending, freezes = pending && increases[row];
     state_out[row] = pending && !freezes ? uint8_t{kMoving} : state[row];
-    put(way_out + 3 * row, freezes ? zero3<T>() : vector_at(displacement + 3 * row));
+    put(displacement_out + 3 * row, freezes ? zero3<T>() : vector_at(displacement + 3 * row));
   }
 };
 

@@ -74,15 +74,15 @@ DIFFVBD_FN void prepare_scene(const RadiusInputs<T>& in, int64_t scene, const Te
 
 // The radius that a body asks for which moves so far relative to its island.
 template <class T>
-DIFFVBD_FN T asked(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T beside) {
+DIFFVBD_FN T asked(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T relative) {
   // the sweeps may take back all of the gravity move and of the bending
   const T gravity = T(2) * in.displacement(kGravity, place) + in.least;
-  return in.fraction * beside + in.displacement(kBends, place) + gravity + work.stopped[place];
+  return in.fraction * relative + in.displacement(kBends, place) + gravity + work.stopped[place];
 }
-// And the one that it gets. Prescribed vertices are not limited: their pairs are listed however far they go.
+// The radius that it gets. Prescribed vertices are not limited: their pairs are listed however far they go.
 template <class T>
-DIFFVBD_FN T trust_radius_of(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T beside, T most) {
-  const T wished = asked(in, work, place, beside) + T(kSpare) * in.dhat;
+DIFFVBD_FN T trust_radius_of(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T relative, T most) {
+  const T wished = asked(in, work, place, relative) + T(kSpare) * in.dhat;
   const T trust_radius = larger(smaller(wished, most), in.displacement(kDriven, place));
   return trust_radius + work.pushed[place / in.motion.bodies];
 }
@@ -120,7 +120,7 @@ DIFFVBD_FN void wish_of_body(const RadiusInputs<T>& in, const MovingBody<T>& b, 
 
 // Whether a body asks for more than the bound of one with neighbours.
 template <class T>
-DIFFVBD_FN bool asks_more(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t scene, int32_t body) {
+DIFFVBD_FN bool wants_more(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t scene, int32_t body) {
   const int64_t place = scene * in.motion.bodies + body;
   const T wanted =
       asked(in, work, place, in.displacement(kBends, place)) + in.fraction * in.displacement(kStretched, place);
@@ -155,11 +155,11 @@ DIFFVBD_FN void radius_beside_island(const RadiusInputs<T>& in, const MovingBody
   team.template most<1>(b.size(), far,
                         [&](int32_t i, double* of) { of[0] = b.is_free(i) ? length(b.displacement(i) - u) : 0.0; });
   if (!team.leads()) return;
-  const T beside = T(far[0]), stretched = in.displacement(kStretched, place), most = work.most[place];
+  const T relative = T(far[0]), stretched = in.displacement(kStretched, place), most = work.most[place];
   T& trust_radius = radius_at(in, work.trust_radius, b.scene, b.body);
-  trust_radius = larger(trust_radius, trust_radius_of(in, work, place, beside, most));
-  const T displacement = beside + in.fraction * stretched,
-          wanted = asked(in, work, place, beside) + in.fraction * stretched;
+  trust_radius = larger(trust_radius, trust_radius_of(in, work, place, relative, most));
+  const T displacement = relative + in.fraction * stretched,
+          wanted = asked(in, work, place, relative) + in.fraction * stretched;
   // up to 2, which makes two substeps; a longer displacement more
   work.over[place] = larger(displacement / most, smaller(wanted / most, T(2)));
   T deformation_radius = T(0);
@@ -214,7 +214,7 @@ struct SweepDisplacements {
   }
 };
 
-// Of every `stride`-th vertex of a body from `first` on.
+// The squares of every `stride`-th vertex of a body from `first` on.
 template <class T>
 DIFFVBD_FN SweepDisplacements<T> displacements_of_body(const SweepRadiusInputs<T>& in, int64_t scene, int64_t body,
                                                        int32_t first, int32_t stride) {
@@ -246,7 +246,7 @@ DIFFVBD_FN T most_of_scene(const SweepRadiusInputs<T>& in, const T* wishes, int6
   return out;
 }
 
-// Of one vertex, where `most` is that of its scene.
+// The radius of one vertex, where `most` is that of its scene.
 template <class T>
 DIFFVBD_FN T sweep_radius(const SweepRadiusInputs<T>& in, T most, int64_t scene, int64_t v) {
   if (in.pinned[v]) return T(0);

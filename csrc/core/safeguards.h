@@ -18,7 +18,7 @@ struct StepParameters {
   bool saturates;     // whether c is given: asked once for a vertex, never inside its star
 };
 
-// Those of one sweep.
+// The parameters of one sweep.
 template <class T>
 DIFFVBD_FN StepParameters<T> of_sweep(StepParameters<T> q, bool last) {
   if (last) q.relaxation = q.last_relaxation;

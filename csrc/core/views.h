@@ -7,7 +7,8 @@
 
 namespace diffvbd {
 
-// What an energy of one vertex may read. Positions are relative to `origin` (zero unless float32 asks for a local one).
+// The state that an energy of one vertex may read. Positions are relative to `origin` (zero unless float32 asks for a
+// local one).
 template <class R>
 struct VertexState {
   Vec3<R> x;       // current position [m]
@@ -22,7 +23,7 @@ struct Batched {
   T* data = nullptr;
   int64_t scene = 0, item = 1;
 };
-// Of several tensors: whether each holds one value for all items of a scene; whether the scenes share each.
+// Whether each of several tensors holds one value for all items of a scene; whether the scenes share each.
 template <class T, int n>
 DIFFVBD_FN bool one_for_items(const Batched<T> (&tensors)[n]) {
   bool one = true;
@@ -50,7 +51,7 @@ DIFFVBD_FN constexpr int other_corner(int i, int a) {
   return others[i][a];
 }
 
-// Where the weight of an edge stands among the six of a tet: k01 k02 k03 k12 k13 k23.
+// The place of the weight of an edge among the six of a tet: k01 k02 k03 k12 k13 k23.
 DIFFVBD_FN constexpr int weight_index(int a, int b) {
   constexpr int first[4] = {0, 3, 5, 0};
   return a < b ? first[a] + b - a - 1 : first[b] + a - b - 1;

@@ -30,7 +30,7 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
       failures_(c_.plan.bodies, 0),
       plain_(c_.plan.bodies, 0),
       gradient_(size_t(plan.blocks) * kLanes * 4, true),
-      way_(size_t(plan.blocks) * kLanes * 4, true),
+      displacement_(size_t(plan.blocks) * kLanes * 4, true),
       wanted_(size_t(plan.blocks) * kLanes * 4, true),
       material_(size_t(c_.plan.tet_blocks) * kTetScalars * kLanes),
       coarse_(size_t(c_.plan.functions) * 4, true),
@@ -38,7 +38,7 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
       turns_(size_t(c_.matrix_bar ? c_.corrections : 1) * c_.plan.functions * 3, true),
       matrix_(c_.has_vertex_blocks ? size_t(9) * c_.plan.cells : 0) {
   s.gradient = gradient_.get();
-  s.displacement = way_.get();
+  s.displacement = displacement_.get();
   s.wanted = wanted_.get();
   const coarse::Plan& p = c_.plan;
   sums_ = Buffer<double>(size_t(p.parts) * coarse::kDegree);

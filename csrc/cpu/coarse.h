@@ -43,7 +43,7 @@ class CoarseScene {
   const CoarseKernels<T> kernels_;
   std::vector<int> failures_;
   std::vector<char> plain_;  // bodies on whose vertices no energy acts, and whose matrix is factored
-  Buffer<T> gradient_, way_, wanted_, material_, coarse_, rows_, turns_, matrix_;
+  Buffer<T> gradient_, displacement_, wanted_, material_, coarse_, rows_, turns_, matrix_;
   Buffer<double> sums_;
   bool over_ = false;
 };

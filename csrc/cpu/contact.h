@@ -42,7 +42,7 @@ class ContactScene {
     Vec3<T> operator()(int v) const { return vector_at(rows + int64_t{4} * position[v]); }
     bool together(int v, int u) const { return colors->are_together(v, u); }
   };
-  // Of a color whose vertices have moved, as they were before.
+  // Positions before the updates of a color.
   struct Before {
     const T *rows, *before;
     const int32_t* position;

@@ -6,7 +6,8 @@
 
 namespace diffvbd {
 
-// What a kernel takes: of each lane the rows of four scalars that hold its corners and, unless null, their origins; the
+// The input of a kernel: of each lane the rows of four scalars that hold its corners and, unless null, their origins;
+// the
 // pair's constants; the corner whose block it is and how many move together with it; in the reverse p and d_raw of that
 // one, kLanes apart.
 template <class T>
@@ -16,7 +17,7 @@ struct PairPack {
   T own[kLanes], together[kLanes];
   const T* turn[kLanes];
 };
-// What it gives for each lane, in rows of four scalars: g; H, in two rows; the Clearance of the corner: toward; then 1
+// The result for each lane, in rows of four scalars: g; H, in two rows; the Clearance of the corner: toward; then 1
 // if the pair is active, else 0, and gap and slack. Or, in the reverse, the adjoints of the corners; then active and
 // the adjoint of kappa.
 constexpr int kPairResult = 5 * 4;

@@ -251,7 +251,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
 struct Systems {
   struct System {
     int32_t first, count;
-    Settling state = kOnItsWay;
+    Settling state = kIterating;
     int64_t size() const { return int64_t{kUnknowns} * count; }
   };
   Groups groups;
@@ -302,7 +302,7 @@ void each_lagged(const RigidInputs<T>& in, int64_t scene, const BodyMotions& mot
   }
 }
 
-// What friction and damping add, linear about the motions of bodies.
+// Adds friction and damping, linear about the motions of bodies.
 template <class T>
 void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const BodyMotions& motions, const Systems& systems,
                          double* gradient, double* matrix) {

@@ -1,4 +1,4 @@
-// The rigid correction of bodies that touch (contact/rigid.h), on the CPU.
+// The rigid correction of bodies that touch (subspace/contact_rigid.h), on the CPU.
 #pragma once
 
 #include "../subspace/contact_rigid.h"
@@ -26,7 +26,7 @@ template <class T>
 void rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
                     const contact::RigidWork<T>& out, const contact::PointWork<T>& sums);
 
-// The parts of the adjoint of a correction for all bodies (contact/rigid_reverse.h).
+// The parts of the adjoint of a correction for all bodies (subspace/contact_rigid_reverse.h).
 template <class T>
 void rigid_end_backward(const contact::RigidInputs<T>& in, const double* motions, const double* fractions,
                         const T* end_bar, double* motion_bar, T* x, T* mass);

@@ -25,7 +25,7 @@ class Trials {
         center_(center),
         motion_(motion),
         move_(move),
-        share_(fraction),
+        fraction_(fraction),
         lead_(in.bodies()),
         low_(in.bodies()),
         decided_(in.bodies(), 0) {
@@ -41,7 +41,7 @@ class Trials {
   void run(AdvanceState<T> state, std::vector<Motion<T>>& motions) {
     const int32_t n = in_.bodies();
     state.motion = motions.data() - scene_ * in_.scene.vertices;
-    std::fill_n(share_, n, 1.0);
+    std::fill_n(fraction_, n, 1.0);
     for (int attempt = 0; attempt < kTrials; ++attempt) {
       each_open([&](int32_t k) { displace(k); });
       each_vertex([&](int64_t row) {
@@ -69,9 +69,9 @@ class Trials {
         }
         low_ = next;
       }
-      each_open([&](int32_t k) { share_[k] *= low_[k]; });
+      each_open([&](int32_t k) { fraction_[k] *= low_[k]; });
     }
-    each_open([&](int32_t k) { share_[k] = 0, displace(k); });
+    each_open([&](int32_t k) { fraction_[k] = 0, displace(k); });
   }
 
  private:
@@ -130,7 +130,7 @@ class Trials {
     }
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       if (moves[lead_[k]]) continue;
-      decided_[k] = 1, share_[k] = 1;
+      decided_[k] = 1, fraction_[k] = 1;
       displace(k);
     }
   }
@@ -181,7 +181,7 @@ class Trials {
     const Vector center = vector_at(center_ + 3 * k);
     for (int32_t i = 0; i < body.size(); ++i) {
       const int32_t v = body.vertex(i);
-      const Vector d = displaced(motion_ + kUnknowns * k, share_[k], body.position(v) - center);
+      const Vector d = displaced(motion_ + kUnknowns * k, fraction_[k], body.position(v) - center);
       put(move_ + 3 * body.row(v), d);
     }
   }
@@ -208,7 +208,7 @@ class Trials {
   const int64_t scene_;
   const double *center_, *motion_;
   T* move_;
-  double* share_;
+  double* fraction_;
   std::vector<int32_t> lead_;  // the first of the bodies that decide together
   std::vector<double> low_, before_;
   std::vector<uint8_t> decided_;

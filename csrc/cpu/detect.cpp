@@ -17,6 +17,10 @@
 
 namespace diffvbd {
 
+using namespace contact;
+
+namespace {
+
 constexpr int64_t kSearchGrain = 8;                // pieces of a search that are worth one more thread: about 300 us
 constexpr int64_t kChunk = 256;                    // primitives of one piece
 constexpr int32_t kGroup = 8;                      // neighbors in a tree that look for others together
@@ -26,9 +30,9 @@ struct Keyed {
   uint64_t key;
   int32_t item;
 };
-inline uint64_t key_of(const Keyed& a) { return a.key; }
-inline uint64_t key_of(uint64_t a) { return a; }
-inline bool operator<(const Keyed& a, const Keyed& b) { return a.key != b.key ? a.key < b.key : a.item < b.item; }
+uint64_t key_of(const Keyed& a) { return a.key; }
+uint64_t key_of(uint64_t a) { return a; }
+bool operator<(const Keyed& a, const Keyed& b) { return a.key != b.key ? a.key < b.key : a.item < b.item; }
 
 // Stable sort by keys below 2^bits; the items of equal keys must come in ascending order.
 template <class Item>
@@ -45,55 +49,55 @@ void sort_by_key(std::vector<Item>& items, std::vector<Item>& other, int bits) {
   }
 }
 
-inline int bits_of(uint64_t below) {
+int bits_of(uint64_t below) {
   int bits = 0;
   while (bits < 64 && below >> bits != 0) ++bits;
   return bits;
 }
 
+// f(begin, end) for all scenes; with few scenes, threads share each.
+template <class F>
+void for_scenes(int64_t scenes, const F& f) {
+  if (scenes < static_cast<int64_t>(torch::stable::get_num_threads())) return f(0, scenes);
+  torch::stable::parallel_for(0, scenes, 1, f);
+}
+
 // Boxes of all corner points of a scene.
 template <class T>
-void fill_corner_boxes(const contact::Surfaces<T>& in, int64_t scene, std::vector<contact::Box>& boxes) {
-  const contact::Place<T> reference = contact::reference_point(in, scene);
+void fill_corner_boxes(const Surfaces<T>& in, int64_t scene, std::vector<Box>& boxes) {
+  const Place<T> reference = reference_point(in, scene);
   boxes.resize(in.corners);
-  for_each(in.corners,
-           [&](int64_t i) { boxes[i] = contact::corner_box(in, scene, static_cast<int32_t>(i), reference); });
+  for_each(in.corners, [&](int64_t i) { boxes[i] = corner_box(in, scene, static_cast<int32_t>(i), reference); });
 }
 
 struct Tree {
   int32_t leaves = kGroup;
-  std::vector<contact::Box> boxes, nodes;  // of the primitives in their order, and the tree's
+  std::vector<Box> boxes, nodes;  // of the primitives in their order, and the tree's
   std::vector<Keyed> codes, scratch;
 
   // Boxes of `count` primitives with so many corners each, from those of all corner points.
   template <class T>
-  void fill(const contact::Surfaces<T>& in, const std::vector<contact::Box>& corner_boxes, const int32_t* items,
-            int64_t count, int corners) {
+  void fill(const Surfaces<T>& in, const std::vector<Box>& corner_boxes, const int32_t* items, int64_t count,
+            int corners) {
     boxes.resize(count);
     for_each(count, [&](int64_t i) {
-      boxes[i] = contact::primitive_box(in, items + corners * i, corners, static_cast<int32_t>(i),
-                                        [&](int32_t corner) { return corner_boxes[corner]; });
+      boxes[i] = primitive_box(in, items + corners * i, corners, static_cast<int32_t>(i),
+                               [&](int32_t corner) { return corner_boxes[corner]; });
     });
   }
   // `bounds` cover all boxes that are not empty.
-  void build(const contact::Box& bounds) {
+  void build(const Box& bounds) {
     const auto n = static_cast<int64_t>(boxes.size());
     codes.resize(n);
-    for_each(n, [&](int64_t i) {
-      codes[i] = {contact::morton_code(boxes[i], bounds, contact::kMostAxisBits), static_cast<int32_t>(i)};
-    });
-    sort_by_key(codes, scratch, 3 * contact::kMostAxisBits);
-    leaves = std::max(kGroup, contact::padded_leaves(n));
+    for_each(n, [&](int64_t i) { codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)}; });
+    sort_by_key(codes, scratch, 3 * kMostAxisBits);
+    leaves = std::max(kGroup, padded_leaves(n));
     nodes.resize(int64_t{2} * leaves);
-    for_each(leaves, [&](int64_t k) { nodes[leaves + k] = k < n ? boxes[codes[k].item] : contact::empty_box(); });
-    for (int32_t i = leaves - 1; i >= contact::kRoot; --i) nodes[i] = hull(nodes[2 * i], nodes[2 * i + 1]);
+    for_each(leaves, [&](int64_t k) { nodes[leaves + k] = k < n ? boxes[codes[k].item] : empty_box(); });
+    for (int32_t i = leaves - 1; i >= kRoot; --i) nodes[i] = hull(nodes[2 * i], nodes[2 * i + 1]);
   }
   int32_t groups() const { return leaves / kGroup; }
 };
-
-namespace {
-
-using namespace contact;
 
 // The near pair of a corner point: the smallest gap, then the smallest key.
 template <class T>
@@ -102,7 +106,7 @@ struct Near {
   uint64_t key;
 };
 
-// What a piece of the search finds.
+// The finds of a piece of the search.
 template <class T>
 struct Finds {
   std::vector<uint64_t> pairs;  // that the list needs
@@ -223,7 +227,7 @@ class SceneDetection {
     if (least >= reach_ || (gap > T(0) && !is_listed(in_, c, least, in_.dhat))) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
-    const uint64_t key = contact::key_of(in_, c);
+    const uint64_t key = key_of(in_, c);
     if (!(gap > T(0) && begins > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
     if (std::isnan(gap)) return;
     for (const int32_t v : c.v) offer(near_[v], v, gap, key);
@@ -238,7 +242,7 @@ class SceneDetection {
     near.gap.store(gap, std::memory_order_relaxed), near.key = key;
   }
 
-  // What the pieces have found, sorted.
+  // Collects the finds, sorted.
   void gather() {
     listed_.clear(), touching_ = 0, first_touching_ = kNoKey;
     for (const Finds<T>& finds : finds_) {
@@ -292,12 +296,7 @@ std::vector<uint64_t> detect(const Surfaces<T>& in, const Detected<T>& out) {
       touching[b] = detection.touching(), first_touching[b] = detection.first_touching();
     }
   };
-  // With few scenes, threads share each.
-  if (in.scenes < torch::stable::get_num_threads()) {
-    detect_scenes(0, in.scenes);
-  } else {
-    torch::stable::parallel_for(0, in.scenes, 1, detect_scenes);
-  }
+  for_scenes(in.scenes, detect_scenes);
 
   std::vector<uint64_t> keys;
   int64_t touches = 0;
@@ -331,8 +330,6 @@ DIFFVBD_INSTANTIATE(double)
 
 namespace {
 
-using namespace contact;
-
 // Triangles near a group of edges, in rows for the kernel that compares them with an edge.
 class NearTriangles {
  public:
@@ -348,7 +345,7 @@ class NearTriangles {
   template <class Visit>
   void each_near(const Box& own, const int32_t* ends, const Visit& visit) {
     const float box[] = {own.lo.x, own.lo.y, own.lo.z, own.hi.x, own.hi.y, own.hi.z};
-    const int found = meet_(BoxRows{sides_.data(), corners_.data(), stride_, count_}, box, ends, near_.data());
+    const int found = overlap_(BoxRows{sides_.data(), corners_.data(), stride_, count_}, box, ends, near_.data());
     for (int i = 0; i < found; ++i) visit(items_[near_[i]]);
   }
   // Up to a whole number of packs.
@@ -371,7 +368,7 @@ class NearTriangles {
     stride_ = stride;
   }
 
-  const OverlapKernel meet_ = overlap_kernel();
+  const OverlapKernel overlap_ = overlap_kernel();
   int stride_ = 0, count_ = 0;
   std::vector<float> sides_;
   std::vector<int32_t> corners_, items_, near_;
@@ -465,12 +462,7 @@ void find_intersections(const Surfaces<T>& in, const Intersections& out) {
     SceneIntersections<T> search(in);
     for (int64_t b = begin; b < end; ++b) lists[b] = search.run(b, out);
   };
-  // With few scenes, threads share each.
-  if (in.scenes < torch::stable::get_num_threads()) {
-    search_scenes(0, in.scenes);
-  } else {
-    torch::stable::parallel_for(0, in.scenes, 1, search_scenes);
-  }
+  for_scenes(in.scenes, search_scenes);
   int64_t row = 0;
   for (const auto& keys : lists) {
     for (size_t k = 0; k < keys.size() && row < out.capacity; ++k) {

@@ -1,4 +1,4 @@
-// Which instruction set the sweeps run: the newest that the processor has, or an older one that DIFFVBD_ISA names.
+// The instruction set of the sweeps: the newest that the processor has, or an older one that DIFFVBD_ISA names.
 #include "kernels.h"
 
 #include <cstdlib>

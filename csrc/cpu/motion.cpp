@@ -188,7 +188,7 @@ void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
   for_bodies<MovingBody>(in.motion,
                          [&](const MovingBody<T>& b, const Threads& team) { wish_of_body(in, b, team, work); });
   bool looks = false;
-  each([&](int64_t scene, int32_t body) { looks = looks || asks_more(in, work, scene, body); });
+  each([&](int64_t scene, int32_t body) { looks = looks || wants_more(in, work, scene, body); });
   if (looks) find_islands(in.islands, work.island);
   each([&](int64_t scene, int32_t body) { radius_among_others(in, work, scene, body, looks); });
   find_islands(in.islands, work.island);

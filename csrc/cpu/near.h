@@ -1,4 +1,5 @@
-// Where in a scene's rows the corners of a pair lie: found once for what is near, read in every sweep.
+// The near pairs of a scene: where their corners lie in its rows, the packs of their kernels, and the account of what is
+// near.
 #pragma once
 
 #include <algorithm>
@@ -157,15 +158,15 @@ class PairBatches {
   int size_ = 0;
 };
 
-// Which listed pairs can matter in a sweep, kept from one color to the next: most of a list is out of reach of what its
-// vertices do, and to look at each pair of it in every color takes longer than the updates themselves.
+// Near pairs: listed pairs that can matter in a sweep, tracked from one color to the next. Most of a list is out of
+// reach of the updates, and testing each pair of it in every color takes longer than the updates themselves.
 //
 // A vertex keeps an anchor: a motion since the start of the substep, a radius around it that its motion stays within,
 // and the longest update that it may try. By those of its corners a pair is far if its gap exceeds dhat and what
 // updates may close: the passes would leave it out at every visit. A vertex that leaves its radius takes a new anchor
 // and looks at its far pairs anew. What is near stays near, until settle().
 
-// What was found of a near entry when it was last looked at.
+// The state of a near entry when it was last tested.
 enum PairState : uint8_t {
   kNotSeen,  // nothing, in this list
   kFar,      // its gap is above dhat for sure; the Clearance has dhat for a gap
@@ -301,7 +302,7 @@ class NearPairs {
   static bool load(const uint8_t* flag) { return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0; }
   static void store(uint8_t* flag) { __atomic_store_n(flag, uint8_t{1}, __ATOMIC_RELAXED); }
 
-  // What no two anchors can be apart, with all around them, and no update can close: most of what is far is so by that.
+  // A bound of what two anchors and an update can close: most far pairs are far by that.
   void extend(const Anchor& a) {
     const T own = T(2 + kRounded) * (contact::length_of(a.motion) + a.radius + a.length);
     T most = reach_.load(std::memory_order_relaxed);

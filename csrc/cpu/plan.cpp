@@ -188,7 +188,7 @@ std::vector<int32_t> start_buffer(const Layout& layout, int64_t vertices, int64_
 
 int32_t* writable(const int32_t* p) { return const_cast<int32_t*>(p); }
 
-// What visits the pairs and edges of a layout needs of the mesh.
+// The mesh, for visits of the pairs and edges of a layout.
 struct Mesh {
   const int64_t* tets;
   const Stars& stars;
@@ -237,7 +237,7 @@ struct Mesh {
   }
 };
 
-// Which corners of which pairs of its vertex lead along each edge (see GroupPlan).
+// The corners of pairs of a vertex that lead along each edge (see GroupPlan).
 struct Entries {
   std::vector<int32_t> first, entry;
 };

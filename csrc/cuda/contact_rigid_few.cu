@@ -254,7 +254,7 @@ struct System {
   }
 
   __device__ void solve(const LaggedForces<T>& friction) const {
-    Settling state = kOnItsWay;  // the same for all threads
+    Settling state = kIterating;  // the same for all threads
     const bool has_friction = in.has_friction_in(scene);
     for (int iteration = 0; iteration < kFrictionIterations && state != kDone; ++iteration) {
       team.each(size() * size(), [&](int32_t i) { matrix[i] = base[i]; });

@@ -359,7 +359,7 @@ struct GroupSystem {
   }
 
   __device__ void solve(Pivots& pivots) const {
-    Settling state = kOnItsWay;  // the same for all threads
+    Settling state = kIterating;  // the same for all threads
     const bool has_friction = in.has_friction_in(scene);
     for (int iteration = 0; iteration < kFrictionIterations && state != kDone; ++iteration) {
       each_body([&](int32_t b) { copy_column(b); });

@@ -135,7 +135,7 @@ struct FloorBarrier {
     return true;
   }
 
-  // What one plane adds to the block: slope n to g, curvature n n^T to H.
+  // The part of one plane in the block: slope n in g, curvature n n^T in H.
   template <class R>
   struct Push {
     Vec3<R> n;  // in the axes of the block
@@ -202,7 +202,7 @@ struct FloorBarrier {
     }
     return sum;
   }
-  // Of one plane, at a gap and after a travel away from it within the step.
+  // The potential of one plane, at a gap and after a travel away from it within the step.
   template <class R>
   DIFFVBD_FN static R potential(const VertexState<R>& s, const Plane<R>& plane, const R& gap, const R& travel) {
     R out = R(0);

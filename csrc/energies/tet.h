@@ -50,7 +50,7 @@ struct TetPair {
   }
 };
 
-// What one reversed update adds to the adjoints of a tet's corners, with the sign and h^2 already applied.
+// The adjoints of a tet's corners by one reversed update, with the sign and h^2 applied.
 template <class R>
 struct TetAdjoint {
   Vec3<R> xi, xj, xk, xl;
@@ -85,14 +85,14 @@ DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, cons
   reverse_shape<Law, wanted>(star, e, tet, view, d_raw, p, minus_h2);
 }
 
-// What the tets of a star add to the block of its vertex, without h^2.
+// The sums of the tets of a star, without h^2.
 template <class R>
 struct TetSums {
   Vec3<R> g;
   R h_diagonal;
   Sym3<R> h_outer;
 };
-// What the two loops below read over and over they copy first: no store of theirs can then be to it.
+// The two loops below copy what they read often: no store of theirs can alias it.
 template <class Law, class R, class Star>
 DIFFVBD_FN TetSums<R> sum_tets(const Star& shared, const Vec3<R>& position) {
   decltype(auto) star = shared.local();

@@ -86,7 +86,7 @@ DIFFVBD_FN Plan view_plan(const int64_t* sizes, const int32_t* p, int64_t& used)
   return out;
 }
 
-// What the corrections of a step read besides the scene.
+// The inputs of the corrections of a step besides the scene.
 template <class T>
 struct Inputs {
   Plan plan;
@@ -174,7 +174,7 @@ struct Line {
   DIFFVBD_FN int64_t row(int32_t i) const { return int64_t{kRow} * c.plan.list_position[c.plan.list_ptr[body] + i]; }
   DIFFVBD_FN static Vector at(const T* a) { return {double(a[0]), double(a[1]), double(a[2])}; }
 
-  // What vertex i adds to the slope of the inertial part of the potential.
+  // Vertex i's part of the slope of the inertial potential.
   DIFFVBD_FN double inertia(int32_t i) const {
     const int64_t v = vertex(i);
     const double mass = in.mass.data[scene * in.mass.scene + v];
@@ -228,7 +228,7 @@ struct Line {
     return admitted ? increase : std::numeric_limits<double>::infinity();
   }
 
-  // What they add to the block of vertex i.
+  // Their part of the block of vertex i.
   DIFFVBD_FN Sym3<double> block(int32_t i) const {
     const VertexState<double> now = state(i);
     Vector g{};

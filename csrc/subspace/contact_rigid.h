@@ -156,8 +156,7 @@ struct PairForce {
   double friction_load;  // h^2 times its load [N], over `doubled`
   double doubled;        // 2 where sides are not of one group: each takes twice its body's motion; else 1
 
-  // Of one of two sides. Chosen by comparison: an index that is not known when this is compiled would move the arrays
-  // from registers to memory.
+  // The item of a side, by comparison: an index unknown at compile time would move the arrays from registers to memory.
   static DIFFVBD_FN double of(int side, const double (&a)[2]) { return side == 0 ? a[0] : a[1]; }
   static DIFFVBD_FN Vector of(int side, const Vector (&a)[2]) {
     return {side == 0 ? a[0].x : a[1].x, side == 0 ? a[0].y : a[1].y, side == 0 ? a[0].z : a[1].z};
@@ -168,7 +167,7 @@ struct PairForce {
     const Vector e = {double(k % 3 == 0), double(k % 3 == 1), double(k % 3 == 2)};
     return k < 3 ? cross(e, arm(side, center)) : of(side, weight) * e;
   }
-  // And by all of its unknowns.
+  // The motion by all of its unknowns.
   DIFFVBD_FN Vector moved(int side, const Vector& center, const double* motion) const {
     const Vector turn = {motion[0], motion[1], motion[2]}, shift = {motion[3], motion[4], motion[5]};
     return cross(turn, arm(side, center)) + of(side, weight) * shift;
@@ -343,7 +342,7 @@ DIFFVBD_FN void add_plane_friction(const RigidInputs<T>& in, const rigid::Body<T
   add_outer(H, -a.size * f.value, a.n);
   add_outer(H, a.size * f.curvature, a.tangential);
 }
-// And on all planes.
+// The same on all planes.
 template <class T>
 DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v,
                                    const Vector& displacement, Vector& g, Sym3<double>& H) {
@@ -390,7 +389,7 @@ DIFFVBD_FN void keep_finite(double* solution) {
 
 // --- lagged friction and damping of pairs
 
-// Where a corner point was at the start of the step, relative to origin.
+// The position of a corner point at the start of the step, relative to origin.
 template <class T>
 DIFFVBD_FN Vector before(const RigidInputs<T>& in, int64_t scene, int32_t v) {
   const int32_t mesh = in.gate.vertices;
@@ -523,7 +522,7 @@ struct FrictionLine {
   }
 };
 
-// Of a lagged pair and its force.
+// The line of a lagged pair, from its force.
 template <class T>
 DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, int64_t pair, const PairForce& a, const double* center,
                                       const double* step) {
@@ -533,7 +532,8 @@ DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, int64_t pair, co
   return {a.tangential, displacement - dot(n, displacement) * n, a.friction_load, in.friction_eps};
 }
 
-// Of a vertex at r from its body's center on one plane of a floor, with that body's motion so far and its step.
+// The line of a vertex at r from its body's center on one plane of a floor, with that body's motion so far and its
+// step.
 template <class T>
 DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
                                       const Vector& r, const double* motion, const double* step) {
@@ -557,11 +557,11 @@ DIFFVBD_FN double friction_fraction(double decrease, const Excess& excess) {
 }
 
 // State of a system: iterating, at the settled motion but without its matrix there, and done.
-enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
+enum Settling : uint8_t { kIterating, kSettledAt, kDone };
 
 // The fraction of a step. decrease, whole: twice the potential of the step and of the motion after it.
-template <class Share>
-DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, double whole, const Share& fraction) {
+template <class Fraction>
+DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, double whole, const Fraction& fraction) {
   if (!has_friction || state == kSettledAt) {
     state = kDone;
     return 1;
@@ -654,7 +654,7 @@ struct RigidOutcome {
   bool* blocked;
   T* left;  // the rest of its shift [m]
 };
-// Of a body with a known fraction; returns whether it was blocked after a part of its motion.
+// Ends the trials of a body; returns whether it was blocked after a part of its motion.
 template <class T>
 DIFFVBD_FN bool finish_trials(const RigidInputs<T>& in, const double* motions, int64_t unit,
                               const RigidOutcome<T>& out) {

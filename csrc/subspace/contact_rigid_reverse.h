@@ -1,10 +1,10 @@
-// What the adjoint of the rigid correction needs of pairs: of their part of the virtual work
+// The adjoint of the rigid correction of bodies that touch (docs/method.md, section 18). Pairs first: the derivatives
+// of their part of the virtual work
 //
 //     W = p . (gradient + matrix q)
 //
-// of two motions p and q of all corner points, the derivatives by p, q, positions, kappa and what is lagged. A listed
-// pair is derived in twelve directions by Dual, once for each correction; a lagged one by hand. docs/method.md,
-// section 18.
+// of two motions p and q of all corner points by p, q, positions, kappa and the lagged state. A listed pair is derived
+// in twelve directions by Dual, once for each correction; a lagged one by hand.
 #pragma once
 
 #include "contact_rigid.h"
@@ -24,19 +24,19 @@ struct VirtualMotions {
 template <class T>
 struct RigidWork {
   T *barrier, *by_kappa;  // [listed, 4, 9], [listed]
-  uint8_t* pushes;        // [listed]: whose rows are written
+  uint8_t* pushes;        // [listed]: the pairs whose rows are written
   T *friction, *lag_bar;  // [lagged, 4, 9]; [lagged, 9] less the derivatives by what is lagged
   int64_t listed, lagged;
 };
-// And their sums at all corner points [B, N, 3].
+// Their sums at all corner points [B, N, 3].
 template <class T>
 struct PointWork {
-  T *x, *p, *q;  // p: without pairs of which no corner moves by p
-  T* since;      // of lagged pairs, by how points have moved since the start of the step, which `x` has in it; or null
+  T *x, *p, *q;  // p: without pairs whose corners do not move by p
+  T* since;      // of lagged pairs, by displacements since the start of the step, included in `x`; or null
 };
 constexpr int kPointScalars = kWorkScalars + 3;
 
-// Adds what every `stride`-th pair of a corner point from `first` on has at it: by x, p, q and since.
+// Adds the derivatives of every `stride`-th pair of a corner point from `first` on: by x, p, q and since.
 template <class T>
 DIFFVBD_FN void add_at_point(const RigidInputs<T>& in, const RigidWork<T>& work, int64_t point, int first, int stride,
                              double* sum) {
@@ -61,7 +61,7 @@ DIFFVBD_FN void store_at_point(const double* sum, int64_t point, const PointWork
   }
 }
 
-// What the corners of a pair do by p and q, and which of them move together: all, or each side by itself.
+// The motions of the corners of a pair by p and q, and which of them move together: all, or each side by itself.
 struct PairMotions {
   Vector p[4], q[4];
   int sides, first;  // how many move by themselves; corners of the first
@@ -70,7 +70,7 @@ struct PairMotions {
   DIFFVBD_FN bool is_of(int side, int corner) const { return sides == 1 || (corner < first) == (side == 0); }
 };
 
-// Whether a corner of a pair moves by p: else the pair does no virtual work, and nobody needs its derivative by p.
+// Whether a corner of a pair moves by p: else the pair does no virtual work.
 template <class T>
 DIFFVBD_FN bool works(const RigidInputs<T>& in, const VirtualMotions<T>& given, const int32_t* record) {
   for (int k = 0; k < 4; ++k) {
@@ -94,7 +94,7 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   return out;
 }
 
-// Of a listed pair, gradient and matrix by the motion of its weighted corners, and what a mollifier adds at corners.
+// Gradient and matrix of a listed pair by the motion of its weighted corners, and the part of a mollifier at corners.
 template <class R>
 struct ForceTerms {
   Vec3<R> force, n, at_corner[4];
@@ -159,7 +159,7 @@ DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const Pair
 // threads.
 constexpr int kDirections = 12, kWorkParts = kDirections + 1;
 
-// Of a listed pair.
+// The work of a listed pair.
 template <class T>
 struct BarrierWork {
   bool acts;
@@ -194,7 +194,7 @@ struct BarrierWork {
            barrier_force(in, pair, CornerPoints<T>{in, false}, term);
   }
 
-  // Of the rows of the corners [4, 9], and adds the derivative by kappa, where the pair pushes.
+  // Stores a part of the rows of the corners [4, 9], and adds the derivative by kappa, where the pair acts.
   DIFFVBD_FN void store(int part, T* rows, T* by_kappa) const {
     if (part < kDirections) {
       const int k = part / 3, i = part % 3;
@@ -235,7 +235,7 @@ struct LaggedWork {
     const Lag<T> lag(in.lag + kLagScalars * pair);
     load = lag.friction, damping = lag.damping;
     m = motions_of(in, given, record);
-    // what does nothing joined no bodies; with any coefficient it would
+    // a pair that does nothing joined no bodies; with any coefficient it would
     if (load == 0 && damping == 0) m.sides = 1, m.fraction = 1;
     n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
     for (int k = 0; k < 4; ++k) {
@@ -245,7 +245,7 @@ struct LaggedWork {
     }
   }
 
-  // Of the rows of the corners [4, 9], and adds to lag_bar [9].
+  // Stores the rows of the corners [4, 9], and adds to lag_bar [9].
   DIFFVBD_FN void store(T* rows, T* lag_bar) const {
     const double along = dot(n, d), approach = along < 0 ? along : 0, A = h * damping, L = h * h * load;
     double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
@@ -256,14 +256,14 @@ struct LaggedWork {
       const FrictionRate<double> f(square_root(dot(u, u)), eps);
       const double nP = dot(n, P), nQ = dot(n, Q), slipping = dot(u, P);
       const Vector by_u = L * (f.value * P + (f.curvature * slipping) * u);
-      const Vector by_way = by_u - dot(n, by_u) * n;
+      const Vector by_displacement = by_u - dot(n, by_u) * n;
       by_d += by_u;
       by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
       by_n += (A * approach) * P + (m.fraction * A) * (nQ * P + nP * Q) - (along + dot(n, displacement)) * by_u -
               dot(n, by_u) * displacement;
       by_load += f.value * slipping, by_damping += approach * nP + m.fraction * nP * nQ;
       const Vector by_p = (A * (approach + m.fraction * nQ)) * n + (L * f.value) * u;
-      const Vector by_q = m.fraction * ((A * nP) * n + by_way);
+      const Vector by_q = m.fraction * ((A * nP) * n + by_displacement);
       for (int k = 0; k < 4; ++k) {
         if (!m.is_of(side, k)) continue;
         put(rows + kWorkScalars * k + 3, w[k] * by_p);
@@ -282,7 +282,7 @@ struct LaggedWork {
   }
 };
 
-// The adjoint of the rigid correction of bodies that touch, but for what pairs have in it (contact/rigid_backward.h).
+// Then the correction itself.
 //
 // A correction moves vertices by displaced(fraction d, r), with H d = -g. The adjoint of d, l = H^-1 (adjoint of the
 // displacement), makes that of everything g and H read the adjoint of -W, where
@@ -297,7 +297,7 @@ DIFFVBD_FN Vector arm_adjoint(const Vector& w, const rigid::Angles& s, const Vec
   return s.b * cross(w, turned) - s.a * turned;
 }
 
-// And to its motion: of all vertices of a body `sum` = sum g, and `turning` = sum g r^T.
+// The adjoint of its motion: over all vertices of a body `sum` = sum g, and `turning` = sum g r^T.
 DIFFVBD_FN void motion_adjoint(const double* motion, double fraction, const Vector& sum, const rigid::Matrix& turning,
                                double* out) {
   const Vector w = fraction * vector_at(motion);
@@ -345,8 +345,8 @@ struct VertexAdjoint {
   double mass;
 };
 
-// by_p, by_q: what pairs send to P and Q. floor_lag: the adjoint of a scene's floor_lag at this vertex, which is added
-// to, or null.
+// by_p, by_q: adjoints of P and Q by pairs. floor_lag: the adjoint of floor_lag at this vertex, which is added to, or
+// null.
 template <class T>
 DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& r,
                                         const double* p, const double* q, const Vector& by_p, const Vector& by_q,
@@ -440,9 +440,8 @@ DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const dou
   scatter_center(b, team, whole, vector_at(sum), x, mass);
 }
 
-// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion; those of no body are zero. The
-// solution of a body that did not move becomes zero: of a matrix that was not positive definite no motion came, and
-// nothing goes back through it.
+// The motions of corner points [B, N, 3] by the solution for that adjoint, and by the motion; those of no body are
+// zero. The solution of a body that did not move becomes zero: a matrix that was not positive definite has no adjoint.
 template <class T, class Team>
 DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
                                const double* motion, double* solution, T* p, T* q) {
@@ -519,7 +518,7 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
   });
 }
 
-// And of a point of a collider.
+// The adjoint of a point of a collider.
 template <class T>
 DIFFVBD_FN void reverse_collider(const RigidInputs<T>& in, int64_t scene, int32_t point, const PointWork<T>& scattered,
                                  const CorrectionAdjoints<T>& bars) {

@@ -17,7 +17,7 @@ constexpr double kArrived = 1e-24;  // squared step over squared radius of gyrat
 constexpr int kArrivals = 2;  // steps of no length: each leaves of the derivative's error what the block leaves out
 constexpr double kRounding = 1e-13;  // relative increase of the energies' sum that is rounding
 
-// Where the rigid motion takes a body: its turn, and how far its center of mass moves.
+// The pose of a body: its turn, and the shift of its center of mass.
 struct Pose {
   Matrix turn;
   Vector shift;
@@ -29,8 +29,8 @@ struct Moments {
   Matrix x_x, y_x;       // sum m r r^T and sum m (y - target) r^T
 };
 
-// Of the vertex energies at a pose: their sum (infinite where a vertex is too near a plane), gradient and Gauss-Newton
-// block with respect to (turn, translation).
+// The vertex energies at a pose: sum (infinite where a vertex is too near a plane), gradient and Gauss-Newton block
+// with respect to (turn, translation).
 struct Load {
   double value, g[6], block[kSix];
   DIFFVBD_FN bool acts() const {
@@ -48,7 +48,7 @@ struct Iteration {
   DIFFVBD_FN Vector shift() const { return {step[3], step[4], step[5]}; }
 };
 
-// What was executed: nothing, the closed form (with or without a turn), or `count` Newton steps.
+// The executed method: none, the closed form (with or without a turn), or `count` Newton steps.
 struct Executed {
   Moments moments;
   Pose end;

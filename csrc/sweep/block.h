@@ -17,7 +17,7 @@ struct ContactTerm {
 };
 constexpr int kContactScalars = 9;
 
-// Everything one block update reads besides its star.
+// The inputs of one block update besides its star.
 template <class R>
 struct Block {
   VertexState<R> state;
