@@ -28,13 +28,35 @@ except ImportError:
         "is installed.\nInstall torch if it is missing, then: pip install --no-build-isolation ."
     )
 
-# The sweeps for each scalar and instruction set come first: they take longest.
+# Run, not imported: the package does not load before it is built.
+cuda = runpy.run_path("diffvbd/ops/build_cuda.py")
 QUICK = bool(os.environ.get("DIFFVBD_QUICK"))
 INSTRUCTION_SETS = ["baseline"] if QUICK or os.environ.get("DIFFVBD_NO_CLONES") else ["v4", "v3", "baseline"]
+
+
+def sweep_instance(scalar: str, name: str) -> str:
+    """Source of the sweeps of a scalar for an instruction set."""
+    lines = ['#include "../../csrc/cpu/sweep_kernels.h"']
+    lines += [f"template diffvbd::Kernels<{scalar}> diffvbd::{name}::sweep_kernels<{scalar}>();"]
+    if name != "baseline":
+        lines = [
+            # The standard library comes first: what it has inline is compiled for every processor.
+            '#include "../../csrc/cpu/standard.h"',
+            "#ifdef DIFFVBD_HAS_SETS",
+            f'#pragma GCC target("arch=x86-64-{name}")',
+            f"#define DIFFVBD_SET {name}",
+            "#define DIFFVBD_UPPER_HALVES",
+            *lines,
+            "#endif",
+        ]
+    return "\n".join([*lines, ""])
+
+
+SWEEPS = {f"sweep_{s}_{name}.cpp": sweep_instance(s, name) for s in ("double", "float") for name in INSTRUCTION_SETS}
 CPU_SOURCES = [
-    *(f"csrc/cpu/sweep_{scalar}_{name}.cpp" for scalar in ("double", "float") for name in INSTRUCTION_SETS),
+    *cuda["write_instances"](SWEEPS),  # first: they take longest
     *sorted(glob("csrc/bind/*.cpp")),
-    *(path for path in sorted(glob("csrc/cpu/*.cpp")) if not path.startswith("csrc/cpu/sweep_")),
+    *sorted(glob("csrc/cpu/*.cpp")),
 ]
 
 # -ffp-contract=off: the same bits from every instruction set. -fno-math-errno: sqrt is one instruction.
@@ -94,8 +116,6 @@ extensions = [
         py_limited_api=True,
     )
 ]
-# Run, not imported: the package does not load before it is built.
-cuda = runpy.run_path("diffvbd/ops/build_cuda.py")
 if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA") and not QUICK:
     extensions.append(cuda["extension"]())
 

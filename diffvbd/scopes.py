@@ -1,4 +1,4 @@
-"""What holds inside a ``with``, for the thread or task that is in it: debug_checks(), contact.record() and refine().
+"""State inside a ``with``, for the thread or task that is in it: debug_checks(), contact.record() and refine().
 
 Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
 guards, and so sees what any thread is inside of.
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+_peek = torch._C._functorch.peek_interpreter_stack  # pyright: ignore[reportAttributeAccessIssue]
 F = TypeVar("F", bound=Callable[..., Any])
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
@@ -22,7 +23,7 @@ _recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.
 
 
 class Finer(NamedTuple):
-    """How rollouts run inside dv.refine."""
+    """Refinement of rollouts inside dv.refine."""
 
     steps: int  # times as many, of a time step so much shorter
     sweeps: int  # times as many
@@ -40,14 +41,14 @@ _recorders: tuple[tuple[str, list[Any]], ...] = ()  # of all threads and tasks
 
 def checking() -> bool:
     """Whether debug_checks() is on."""
-    return _any_checking if torch.compiler.is_compiling() else _checking.get()
+    return _any_checking and (torch.compiler.is_compiling() or _checking.get())
 
 
 def looks_at(value: Tensor) -> bool:
     """Whether values may be looked at now. On CUDA that waits for the device; compiled and transformed ones cannot."""
     if torch.compiler.is_compiling():
         return False
-    return not transformed() and (checking() or not value.is_cuda)
+    return _peek() is None and (checking() or not value.is_cuda)
 
 
 def is_captured(value: Tensor) -> bool:
@@ -64,7 +65,7 @@ def transformed() -> bool:
     """Whether a transform of torch.func is under way. Under torch.compile one may be, unseen."""
     if torch.compiler.is_compiling():
         return False
-    return torch._C._functorch.peek_interpreter_stack() is not None  # pyright: ignore[reportAttributeAccessIssue]
+    return _peek() is not None
 
 
 def refuse_transforms(name: str) -> None:
@@ -170,7 +171,7 @@ def refined(finer: Finer | None) -> Iterator[None]:
 
 
 class Scope:
-    """What the code that makes one is inside of. A backward may run in another thread, as torch's own on CUDA does;
+    """Context of the code that makes one. A backward may run in another thread, as torch's own on CUDA does;
     inside ``resumed()`` what held in the forward holds there, too."""
 
     def __init__(self) -> None:

@@ -205,8 +205,8 @@ DIFFVBD_OPERATOR(Tensor, potential_rise, In x, In to, In x_prev, In y, In mass, 
     require(in.bodies.ptr[bodies] <= in.listed, "diffvbd::potential_rise: expected order with all vertices of ptr");
 #endif
     const Tensor out = device.empty({read.b, bodies, 2}, ScalarType::Double);
-    DIFFVBD_ON_CUDA(const Tensor work = device.empty({cuda::rise_workspace(in)}, ScalarType::Double);)
-    DIFFVBD_RUN(device, potential_rise, in, DIFFVBD_ON_CUDA(data<double>(work), ) data<double>(out));
+    DIFFVBD_ON_CUDA(const Tensor work = device.empty({cuda::energy_increase_workspace(in)}, ScalarType::Double);)
+    DIFFVBD_RUN(device, energy_increase, in, DIFFVBD_ON_CUDA(data<double>(work), ) data<double>(out));
     return out;
   });
 }

@@ -35,7 +35,7 @@ DIFFVBD_OPERATOR(Tensor, coarse_matrix, DIFFVBD_PARAMETERS(COARSE) Ints sizes, d
 #ifdef USE_CUDA
     const int64_t b = in.scenes, edge = cuda::kEdge;
     const auto doubles = [&](int64_t count) { return device.empty({count}, ScalarType::Double); };
-    const Tensor turn = doubles(b * p.groups * cuda::kTurn), sums = doubles(b * size),
+    const Tensor turn = doubles(b * p.groups * cuda::kGroupScalars), sums = doubles(b * size),
                  panel = doubles(b * 6 * p.functions * edge), block = doubles(b * p.bodies * edge * edge);
     const cuda::MatrixWork work{data<double>(turn), data<double>(sums), data<double>(panel), data<double>(block)};
     DIFFVBD_RUN(device, coarse_inverse<T>, in, work, data<T>(out), factored);
@@ -66,7 +66,7 @@ DIFFVBD_OPERATOR(Out<3>, coarse_matrix_backward, DIFFVBD_PARAMETERS(COARSE) In b
     const int64_t stiffnesses = in.stiffness.scene == 0 ? 1 : in.scenes;
     const Tensor x_bar = device.like_x(), mass_bar = device.empty({in.scenes, cells}),
                  stiffness_bar = device.empty({stiffnesses, p.groups, 3, 3, p.width, p.width}),
-                 turn = device.empty({in.scenes * p.groups * cuda::kTurn}, ScalarType::Double);
+                 turn = device.empty({in.scenes * p.groups * cuda::kGroupScalars}, ScalarType::Double);
     DIFFVBD_RUN(device, coarse_inverse_vjp<T>, in, given, data<double>(turn), data<T>(x_bar), data<T>(stiffness_bar),
                 data<T>(mass_bar));
 #else
@@ -82,7 +82,7 @@ DIFFVBD_OPERATOR(Out<3>, coarse_matrix_backward, DIFFVBD_PARAMETERS(COARSE) In b
   });
 }
 
-#ifndef USE_CUDA  // there products of torch do the rest, see diffvbd/ops/coarse_cuda.py
+#ifndef USE_CUDA  // there products of torch do the rest, see diffvbd/ops/coarse.py
 
 // gradients [1 | B, tets, 4, 3] of the tets' shape functions
 template <class T>

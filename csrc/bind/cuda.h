@@ -10,28 +10,13 @@
 #include <string>
 #include <vector>
 
-#include "../cuda/advance.h"
-#include "../cuda/begin.h"
-#include "../cuda/clear.h"
+#include "../cuda/arrays.h"
+#include "../cuda/bodies.h"
 #include "../cuda/coarse.h"
 #include "../cuda/contact.h"
 #include "../cuda/contact_rigid.h"
-#include "../cuda/detect.h"
-#include "../cuda/intersect.h"
-#include "../cuda/islands.h"
-#include "../cuda/keep.h"
-#include "../cuda/lowest.h"
-#include "../cuda/motion.h"
 #include "../cuda/neighbors.h"
-#include "../cuda/part.h"
-#include "../cuda/reductions.h"
-#include "../cuda/rigid.h"
-#include "../cuda/rise.h"
-#include "../cuda/segments.h"
-#include "../cuda/start.h"
 #include "../cuda/step.h"
-#include "../cuda/sweep_rooms.h"
-#include "../cuda/unsupported.h"
 #include "arguments.h"
 
 // A launch, checked, and what only launches take.

@@ -117,7 +117,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_rooms, In x, In origin, In mass, In move, In he
     work.island = data<int32_t>(island);
     work.room = data<T>(room), work.own_room = data<T>(own_room), work.over = data<T>(over);
     DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(in.islands));)
-    DIFFVBD_RUN(device, find_rooms<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
+    DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
     return Out<4>(island, room, own_room, over);
   });
 }
@@ -144,7 +144,7 @@ DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move,
     in.more = static_cast<T>(more), in.least = static_cast<T>(least);
     Tensor out = device.empty({in.scenes, in.vertices});
     const Tensor wishes = device.empty({in.scenes, in.bodies}), most = device.empty({in.scenes});
-    DIFFVBD_RUN(device, sweep_rooms<T>, in, data<T>(wishes), data<T>(most), data<T>(out));
+    DIFFVBD_RUN(device, sweep_radii<T>, in, data<T>(wishes), data<T>(most), data<T>(out));
     return out;
   });
 }
@@ -181,7 +181,7 @@ DIFFVBD_OPERATOR(Tensor, contact_unsupported, In x, In origin, In lift, In force
     const auto in =
         unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
     Tensor out = device.like_x();
-    DIFFVBD_RUN(device, unsupported<T>, in, data<T>(out));
+    DIFFVBD_RUN(device, residual_acceleration<T>, in, data<T>(out));
     return out;
   });
 }
@@ -198,7 +198,7 @@ DIFFVBD_OPERATOR(Out<5>, contact_unsupported_backward, In bar, In x, In origin, 
         device.zeros({wants_planes ? b : 0, in.scene.bodies, int64_t{in.planes} * contact::kPlaneScalars});
     const contact::UnsupportedAdjoints<T> out{data_or_null<T>(x_bar), data<T>(lift_bar), data<T>(force_bar),
                                               data<T>(mass_bar), data_or_null<T>(planes_bar)};
-    DIFFVBD_RUN(device, unsupported_backward<T>, in, Reader<T>(x).vectors("bar", bar), out);
+    DIFFVBD_RUN(device, residual_acceleration_backward<T>, in, Reader<T>(x).vectors("bar", bar), out);
     return Out<5>(x_bar, lift_bar, force_bar, mass_bar, planes_bar);
   });
 }

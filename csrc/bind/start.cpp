@@ -22,7 +22,7 @@ DIFFVBD_OPERATOR(Tensor, contact_lowest, In x, In origin, In planes, In body_ord
     const auto in = lowest_inputs<T>(x, origin, planes, body_order, body_ptr, island);
     Tensor out = device.empty({in.scenes, in.bodies, in.num_planes}, ScalarType::Int);
     const Tensor own = device.empty({in.scenes, in.bodies, in.num_planes}, ScalarType::Int);
-    DIFFVBD_RUN(device, lowest_vertices<T>, in, data<int32_t>(own), data<int32_t>(out));
+    DIFFVBD_RUN(device, support_vertices<T>, in, data<int32_t>(own), data<int32_t>(out));
     return out;
   });
 }
@@ -137,7 +137,7 @@ DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, 
     in.constants = pair_constants<T>(constants, pairs, x);
     in.vertices = static_cast<int32_t>(read.v), in.colliders = static_cast<int32_t>(colliders);
     Tensor out = device.empty({pairs.size(0), contact::kConstants});
-    DIFFVBD_RUN(device, narrow<T>, in, pairs.size(0), data<T>(out));
+    DIFFVBD_RUN(device, refresh_gaps<T>, in, pairs.size(0), data<T>(out));
     return out;
   });
 }
@@ -172,8 +172,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
     const contact::Kept<T> out{data<int64_t>(rows),      data<int32_t>(pairs_out), data<int32_t>(ptr_out),
                                data<int32_t>(entry_out), data<T>(constants_out),   capacity};
 #ifdef USE_CUDA
-    const Tensor work = device.bytes(cuda::keep_bytes(in));
-    DIFFVBD_RUN(device, keep<T>, in, out, work.data_ptr());
+    const Tensor work = device.bytes(cuda::compact_list_bytes(in));
+    DIFFVBD_RUN(device, compact_list<T>, in, out, work.data_ptr());
 #else
     for (int64_t i = 0; i < in.count; ++i) {
       if (contact::stays(in, i)) contact::copy_pair(in, i, kept[i], out);
@@ -236,7 +236,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_rubbing, In x, In origin, In collider, In kappa
     const auto by = lag_coefficients(friction, damping, Reader<T>(x));
     Tensor lag = device.empty({pairs.size(0), contact::kLagScalars}), push = device.empty({x.size(0), in.corners, 3});
     DIFFVBD_ON_CUDA(const Tensor slots = device.empty({pairs.size(0), cuda::kLagSlots});)
-    DIFFVBD_RUN(device, rubbing<T>, in, by, data<const T>(x), x.size(0), pairs.size(0), data<T>(lag),
+    DIFFVBD_RUN(device, lagged_friction<T>, in, by, data<const T>(x), x.size(0), pairs.size(0), data<T>(lag),
                 DIFFVBD_ON_CUDA(data<T>(slots), ) data<T>(push));
     return Out<2>(lag, push);
   });
@@ -256,7 +256,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x
     Tensor friction_bar = device.empty({friction.numel() ? b : 0});
     Tensor damping_bar = device.empty({damping.numel() ? b : 0});
     DIFFVBD_ON_CUDA(const Tensor slots = device.empty({pairs.size(0), cuda::kLagSlots});)
-    DIFFVBD_RUN(device, rubbing_backward<T>, in, by, given, data<const T>(x), b,
+    DIFFVBD_RUN(device, lagged_friction_backward<T>, in, by, given, data<const T>(x), b,
                 DIFFVBD_ON_CUDA(pairs.size(0), data<T>(slots), ) data<T>(points), data<T>(kappa_bar),
                 data_or_null<T>(friction_bar), data_or_null<T>(damping_bar));
     return Out<4>(points, kappa_bar, friction_bar, damping_bar);

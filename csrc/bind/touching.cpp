@@ -64,7 +64,7 @@ void set_moving(contact::RigidInputs<T>& in, const Tensor& moving, bool alone, c
   if (!all && moving.numel() > 0) in.moving = mask;
 }
 
-DIFFVBD_ON_CUDA(cuda::PairRoom room_of(const TouchingFields& f) {
+DIFFVBD_ON_CUDA(cuda::PairCapacity room_of(const TouchingFields& f) {
   return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
 })
 
@@ -228,7 +228,7 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
                                       sums,
                                       data<int32_t>(pushing),
                                       out};
-      DIFFVBD_RUN(device, rigid_reverse<T>, in, own);
+      DIFFVBD_RUN(device, rigid_contact_backward<T>, in, own);
 #else
       rigid_end_backward<T>(in, motions, shares, end_bar, l, data<T>(way), out.vertices.mass);
       rigid_solve<T>(in, factors, l);

@@ -136,14 +136,14 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
 }
 
 template <class T>
-void narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants) {
+void refresh_gaps(const NarrowInputs<T>& in, int64_t pairs, T* constants) {
   torch::stable::parallel_for(0, pairs, kPairGrain, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) narrow_pair(in, i, constants + kConstants * i);
   });
 }
 
-template void narrow<float>(const NarrowInputs<float>&, int64_t, float*);
-template void narrow<double>(const NarrowInputs<double>&, int64_t, double*);
+template void refresh_gaps<float>(const NarrowInputs<float>&, int64_t, float*);
+template void refresh_gaps<double>(const NarrowInputs<double>&, int64_t, double*);
 template int64_t advance<float>(const AdvanceInputs<float>&, float*);
 template int64_t advance<double>(const AdvanceInputs<double>&, double*);
 

@@ -12,6 +12,6 @@ int64_t advance(const contact::AdvanceInputs<T>& in, T* share);
 
 // constants [pairs, 8] (contact/narrow.h).
 template <class T>
-void narrow(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants);
+void refresh_gaps(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants);
 
 }  // namespace diffvbd

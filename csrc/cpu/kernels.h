@@ -46,7 +46,7 @@ template <class T>
 PairKernels<T> pair_kernels();
 MeetKernel meet_kernel();
 
-// The loops of one instruction set: each is compiled in files of its own, sweep_<scalar>_<set>.cpp.
+// The loops of one instruction set: each is compiled by itself (setup.py).
 template <class T>
 struct Kernels {
   SweepKernel<T> (*forward)(int energies), (*reverse)(int energies);

@@ -111,7 +111,7 @@ void begin_backward(const start::Inputs<T>& in, const start::Adjoints<T>& a, T* 
 // out [B, bodies, 2]: the rise, and how much of it is rounding at most; infinite where a vertex would be too near a
 // plane.
 template <class T>
-void potential_rise(const coarse::RiseInputs<T>& in, double* out) {
+void energy_increase(const coarse::RiseInputs<T>& in, double* out) {
   static_assert(coarse::kBlockTets == kLanes);
   const int64_t scenes = in.bodies.scenes, vertices = in.bodies.vertices;
   // x[i] and to[i] - x[i] as rows of four
@@ -151,13 +151,13 @@ void potential_rise(const coarse::RiseInputs<T>& in, double* out) {
 // ----------------------------------------------------------------------------------------------------------
 
 template <class T>
-void unsupported(const contact::UnsupportedInputs<T>& in, T* out) {
+void residual_acceleration(const contact::UnsupportedInputs<T>& in, T* out) {
   for_bodies(in.scene,
              [&](const rigid::Body<T>& b, const Threads& team) { contact::leave_unsupported(in, b, team, out); });
 }
 template <class T>
-void unsupported_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
-                          const contact::UnsupportedAdjoints<T>& out) {
+void residual_acceleration_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
+                                    const contact::UnsupportedAdjoints<T>& out) {
   for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
     contact::reverse_unsupported(in, b, team, bar, out);
   });
@@ -165,7 +165,7 @@ void unsupported_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
 
 // wishes [B, bodies] and most [B]: memory
 template <class T>
-void sweep_rooms(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* rooms) {
+void sweep_radii(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* rooms) {
   const int64_t grain = pieces_per_thread(in.bodies > 0 ? in.vertices / in.bodies : 0);
   for_items(in.scenes, in.bodies, grain, [&](int64_t scene, int32_t body) {
     const int64_t i = scene * in.bodies + body;
@@ -219,7 +219,7 @@ void translation_backward(const contact::TranslationInputs<T>& in, const T* u_ba
 
 // own [B, bodies, planes]: memory
 template <class T>
-void lowest_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out) {
+void support_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out) {
   const auto each = [&](auto&& f) {
     int64_t i = 0;
     for (int64_t b = 0; b < in.scenes; ++b) {
@@ -281,8 +281,8 @@ void pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t 
   });
 }
 template <class T>
-void rubbing(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x, int64_t scenes,
-             int64_t pairs, T* values, T* push) {
+void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
+                     int64_t scenes, int64_t pairs, T* values, T* push) {
   std::fill_n(values, pairs * contact::kLagScalars, T(0)), std::fill_n(push, 3 * scenes * in.corners, T(0));
   for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
     const auto state = contact::lag_state(record[4], corners, a, stiffness);
@@ -295,9 +295,9 @@ void rubbing(const contact::ContactInputs<T>& in, const contact::LagCoefficients
 }
 // friction and damping may be null
 template <class T>
-void rubbing_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                      const contact::RubbingBars<T>& given, const T* x, int64_t scenes, T* points, T* kappa,
-                      T* friction, T* damping) {
+void lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
+                              const contact::RubbingBars<T>& given, const T* x, int64_t scenes, T* points, T* kappa,
+                              T* friction, T* damping) {
   std::fill_n(points, 3 * scenes * in.corners, T(0));
   for (T* bars : {kappa, friction, damping}) {
     if (bars) std::fill_n(bars, scenes, T(0));

@@ -31,7 +31,7 @@ void reverse_coast(const MotionInputs<T>& in, double chord, const MotionAdjoints
 }
 
 template <class T>
-void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
+void find_trust_radii(RoomInputs<T> in, const RoomWork<T>& work) {
   const int64_t scenes = in.motion.scenes;
   const auto each = [&](const auto& f) {
     for (int64_t i = 0; i < scenes * in.motion.bodies; ++i) {
@@ -61,7 +61,7 @@ void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
   template void reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&);        \
   template void coast<T>(const MotionInputs<T>&, double, T*);                               \
   template void reverse_coast<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&); \
-  template void find_rooms<T>(RoomInputs<T>, const RoomWork<T>&);
+  template void find_trust_radii<T>(RoomInputs<T>, const RoomWork<T>&);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -20,6 +20,6 @@ void reverse_coast(const contact::MotionInputs<T>& in, double chord, const conta
 
 // Fills all that `work` points to.
 template <class T>
-void find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work);
+void find_trust_radii(contact::RoomInputs<T> in, const contact::RoomWork<T>& work);
 
 }  // namespace diffvbd

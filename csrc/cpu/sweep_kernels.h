@@ -1,4 +1,4 @@
-// The loops of the instruction set DIFFVBD_SET: the body of the files sweep_<scalar>_<set>.cpp.
+// The loops of the instruction set DIFFVBD_SET. setup.py writes a source that instantiates them for each scalar and set.
 #pragma once
 
 #include "coarse_kernels.h"

@@ -1,9 +1,9 @@
 #include <algorithm>
 
-#include "advance.h"
-#include "clear.h"
+#include "arrays.h"
 #include "cluster.cuh"
-#include "small_scenes.h"
+#include "common.cuh"
+#include "contact.h"
 
 namespace diffvbd::cuda {
 namespace {
@@ -11,10 +11,11 @@ namespace {
 using namespace contact;
 
 constexpr int kThreads = 256, kWarp = 32;
-constexpr int64_t kManyPairs = 1 << 19;  // worth more than one block a multiprocessor: more blocks wait longer
-constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
+constexpr int64_t kManyPairs =
+    1 << 19;  // from which on more than one block per multiprocessor pays: more blocks synchronize more slowly
+constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each grid-wide vote
 
-// Out of line: whoever asks gets the same bits.
+// Out of line, so that all callers get the same bits.
 template <class T>
 __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
   return try_pair(in, s, pair, round);
@@ -29,25 +30,24 @@ struct Range {
   int64_t begin, end;
 };
 
-// The whole grid, on all scenes. flags [kFlags]: zero at first.
+// Team of the whole grid, for all scenes. flags [kFlags]: zero at first.
 struct GridTeam {
   unsigned* flags;
   template <class F>
   __device__ void each(const Range& items, const F& f) const {
-    for (int64_t i = items.begin + static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < items.end;
-         i += static_cast<int64_t>(gridDim.x) * kThreads) {
+    for (int64_t i = items.begin + own_item(kThreads); i < items.end; i += static_cast<int64_t>(gridDim.x) * kThreads) {
       f(i);
     }
   }
   __device__ void sync() const { cooperative_groups::this_grid().sync(); }
-  // Whether any thread says yes, once all have come here.
+  // Grid-wide vote; all threads must call it.
   __device__ bool any(bool own) {
     if (own) *flags = 1;
     sync();
     return *static_cast<volatile unsigned*>(flags++) != 0;
   }
 };
-// A cluster, on a scene of its own.
+// Team of a cluster, for one scene.
 struct SceneTeam {
   Cluster cluster;
   Answers& answers;
@@ -63,7 +63,7 @@ struct SceneTeam {
   __device__ bool any(bool own) { return any_of_cluster(cluster, answers, turn, own); }
 };
 
-// All listed pairs, as the grid looks at them.
+// All listed pairs, for the grid.
 template <class T>
 struct AllPairs {
   Range pairs;
@@ -77,9 +77,9 @@ struct AllPairs {
     });
   }
 };
-// Those of a scene that may matter in a move, in any order, and their planes, as the blocks of its cluster look at
-// them, each at its own: first at what is quick of all, and then at what is slow of those that are left, so that no
-// warp waits for a few of its threads.
+// Pairs of a scene that may matter in a move, in any order, with their planes. Each block of the cluster has its own
+// pairs. It runs the cheap test on all of them first and the expensive test on the rest, so that no warp waits for a
+// few of its threads.
 template <class T>
 struct NearPairs {
   Cluster cluster;
@@ -89,8 +89,7 @@ struct NearPairs {
   int *count, *slows;   // of the block
   int32_t* slow;        // [2 kThreads]
 
-  // Where the block has its i-th pair, and keeps the i-th of those that may matter. These lie side by side: each block
-  // has some of every part of the list.
+  // Index of the i-th pair of the block, and of the i-th pair that it keeps. Warps of pairs alternate between blocks.
   __device__ int64_t place(int i) const {
     return pairs.begin + int64_t{i / kWarp * cluster.size + cluster.rank} * kWarp + i % kWarp;
   }
@@ -115,7 +114,7 @@ struct NearPairs {
       __syncthreads();
       const int kept = *slows;
       __syncthreads();
-      if (kept <= kThreads && first + kThreads < *count) continue;  // there is room for those of one more turn
+      if (kept <= kThreads && first + kThreads < *count) continue;  // another round fits
       for (int of = static_cast<int>(threadIdx.x); of < kept; of += kThreads) {
         if (!passes(in, s, slow[of], round)) f(slow[of]);
       }
@@ -125,16 +124,17 @@ struct NearPairs {
   }
 };
 
-// All moves and rounds of some scenes: most are over after the first round, and only the device knows.
-// motions: memory for all vertices.
+// All moves and rounds of some scenes. Most scenes end after the first round, which only the device knows. motions:
+// memory for all vertices.
 template <class T, class Team, class Pairs>
 __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceState<T> s, Motion<T>* motions,
-                               const Range& scenes, const Pairs& pairs, unsigned long long* stuck) {
+                               const Range& scenes, const Pairs& pairs, unsigned long long* infeasible) {
   const int64_t of_scene = in.units() / in.scenes;
   const Range rows = {scenes.begin * in.vertices, scenes.end * in.vertices};
   const Range units = {scenes.begin * of_scene, scenes.end * of_scene};
   s.motion = motions;
-  // works out the motions of what tries less in a round; in round 0 of all. Vertices by themselves do when they retreat
+  // Motions of the vertices whose fraction this round lowers; of all in round 0. Single vertices compute theirs when
+  // they retreat.
   const auto look = [&](int round) {
     team.each(rows, [&](int64_t i) {
       const int64_t scene = i / in.vertices;
@@ -150,7 +150,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
     team.sync();
     look(0);
     pairs.begin_move(team, in, s);
-    bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
+    bool clean = false;  // all pairs pass at their full fractions; only the first round looks at all of them
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
       bool found = false, less = false;
@@ -178,7 +178,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
     if (s.first && !clean) {
       team.sync();
       look(0);
-      pairs.each_failing(team, in, s, 0, [&](int64_t) { atomicAdd(stuck, 1ULL); });
+      pairs.each_failing(team, in, s, 0, [&](int64_t) { atomicAdd(infeasible, 1ULL); });
       team.sync();
     }
     bool open = false;
@@ -190,110 +190,108 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
   }
 }
 
-// One cooperative launch. stuck [1]: zero at first.
+// One cooperative launch. infeasible [1]: zero at first.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, unsigned* flags,
-                   unsigned long long* stuck) {
+                   unsigned long long* infeasible) {
   const AllPairs<T> pairs{{0, in.listed.ptr[in.scenes * in.corners] / 4}};
-  advance_scenes(GridTeam{flags}, in, s, motions, {0, in.scenes}, pairs, stuck);
+  advance_scenes(GridTeam{flags}, in, s, motions, {0, in.scenes}, pairs, infeasible);
 }
 
-// A cluster for each small scene. near, planes: memory for all listed pairs. stuck: with several scenes zero at first.
+// A cluster for each small scene. near, planes: memory for all listed pairs. infeasible: zero at first where there are
+// several scenes.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
     scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, int32_t* near,
-                 PairPlane<T>* planes, unsigned long long* stuck) {
+                 PairPlane<T>* planes, unsigned long long* infeasible) {
   __shared__ int32_t slow[2 * kThreads];
   __shared__ int count, slows;
   __shared__ Answers answers;
   Cluster cluster = Cluster::all();
   const int64_t scene = blockIdx.x / cluster.size;
-  if (in.scenes == 1 && blockIdx.x == 0 && threadIdx.x == 0) *stuck = 0;  // before the first meeting
+  if (in.scenes == 1 && blockIdx.x == 0 && threadIdx.x == 0) *infeasible = 0;  // before the first synchronization
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
   if (cluster.leaves(in.vertices + own.end - own.begin)) return;
   const NearPairs<T> pairs{cluster, own, near, planes, &count, &slows, slow};
-  advance_scenes(SceneTeam{cluster, answers}, in, s, motions, {scene, scene + 1}, pairs, stuck);
+  advance_scenes(SceneTeam{cluster, answers}, in, s, motions, {scene, scene + 1}, pairs, infeasible);
 }
 
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    narrow_kernel(const __grid_constant__ NarrowInputs<T> in, int64_t pairs, T* constants) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+    refresh_kernel(const __grid_constant__ NarrowInputs<T> in, int64_t pairs, T* constants) {
+  const int64_t i = own_item(kThreads);
   if (i < pairs) narrow_pair(in, i, constants + kConstants * i);
 }
 
-// Bytes of each part of the workspace, rounded up to what any type needs.
-constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
+// Parts of the workspace; without memory, its size.
+template <class T>
+struct AdvanceWork {
+  AdvanceState<T> state{};
+  Motion<T>* motions;
+  int32_t* near = nullptr;
+  PairPlane<T>* planes = nullptr;
+  unsigned* flags = nullptr;
+  int64_t bytes;
+  AdvanceWork(const AdvanceInputs<T>& in, int64_t capacity, bool clusters, void* workspace) {
+    Parts<16> take(workspace);
+    const int64_t units = in.units();
+    take(state.now, units), take(state.blocked, units), take(state.stamp, units), take(state.failed, in.scenes);
+    take(motions, in.scenes * in.vertices);
+    if (clusters) take(near, capacity), take(planes, capacity);
+    if (!clusters) take(flags, kFlags);
+    bytes = static_cast<int64_t>(take.bytes);
+  }
+};
 
 }  // namespace
 
 template <class T>
 int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
-  const int64_t units = in.units();
-  const int64_t bytes = aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes) +
-                        aligned(in.scenes * in.vertices * sizeof(Motion<T>));
-  if (!has_block_each(in.vertices, in.scenes, capacity)) return bytes + aligned(kFlags * sizeof(unsigned));
-  return bytes + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(PairPlane<T>));
+  return AdvanceWork<T>(in, capacity, has_block_each(in.vertices, in.scenes, capacity), nullptr).bytes;
 }
 
 template <class T>
-cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
+cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* infeasible, void* workspace,
                     int multiprocessors, cudaStream_t stream) {
   const int64_t rows = in.scenes * in.vertices;
   const bool clusters = has_block_each(in.vertices, in.scenes, capacity);
-  std::vector<Span> zeros{{stuck, sizeof(*stuck)}};
+  std::vector<Span> zeros{{infeasible, sizeof(*infeasible)}};
   if (rows == 0) return clear(zeros, stream);
-  auto* at = static_cast<uint8_t*>(workspace);
-  const auto take = [&](int64_t bytes) {
-    uint8_t* here = at;
-    at += aligned(bytes);
-    return here;
-  };
-  const int64_t units = in.units();
-  auto* now = reinterpret_cast<T*>(take(units * sizeof(T)));
-  uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
-  auto* motions = reinterpret_cast<Motion<T>*>(take(rows * sizeof(Motion<T>)));
-  AdvanceState<T> state{share, now, blocked, stamp, failed, true};
-  auto* found = reinterpret_cast<unsigned long long*>(stuck);
+  AdvanceWork<T> work(in, capacity, clusters, workspace);
+  work.state.share = share, work.state.first = true;
+  auto* found = reinterpret_cast<unsigned long long*>(infeasible);
   if (clusters) {
-    if (in.scenes > 1) {  // a single one clears it by itself
+    if (in.scenes > 1) {  // a single scene clears it itself
       if (auto error = clear(zeros, stream)) return error;
     }
-    auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
-    auto* planes = reinterpret_cast<PairPlane<T>*>(take(capacity * sizeof(PairPlane<T>)));
-    return launch_clusters(scene_kernel<T>, in.scenes, capacity, kThreads, stream, in, state, motions, near, planes,
-                           found);
+    return launch_clusters(scene_kernel<T>, in.scenes, capacity, kThreads, stream, in, work.state, work.motions,
+                           work.near, work.planes, found);
   }
-  auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
-  zeros.push_back({flags, kFlags * sizeof(unsigned)});
+  zeros.push_back({work.flags, kFlags * sizeof(unsigned)});
   if (auto error = clear(zeros, stream)) return error;
   AdvanceInputs<T> inputs = in;
   const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
   int resident = 0;
   if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, kernel, kThreads, 0)) return error;
-  const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
+  const int64_t wanted = blocks_for(std::max(rows, capacity), kThreads);
   const int64_t each = capacity < kManyPairs ? 1 : resident;
   const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, each * multiprocessors));
-  void* arguments[] = {&inputs, &state, &motions, &flags, &found};
+  void* arguments[] = {&inputs, &work.state, &work.motions, &work.flags, &found};
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 
 template <class T>
-cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
+cudaError_t refresh_gaps(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
   if (pairs == 0) return cudaSuccess;
-  const auto blocks = static_cast<unsigned>((pairs + kThreads - 1) / kThreads);
-  narrow_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);
+  const auto blocks = blocks_for(pairs, kThreads);
+  refresh_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                       \
-  template cudaError_t narrow<T>(const NarrowInputs<T>&, int64_t, T*, cudaStream_t); \
-  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&, int64_t);     \
-  template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(refresh_gaps)
+DIFFVBD_INSTANTIATE(advance_workspace_bytes)
+DIFFVBD_INSTANTIATE(advance)
 
 }  // namespace diffvbd::cuda

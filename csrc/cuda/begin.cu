@@ -1,5 +1,6 @@
-#include "begin.h"
 #include "bodies.cuh"
+#include "bodies.h"
+#include "common.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -23,7 +24,7 @@ __global__ void __launch_bounds__(kVertexThreads)
   if (row.exists) reverse_vertex(in, a, row.scene, row.vertex);
 }
 
-// What a kernel does to a body.
+// Actions of the kernels on a body.
 template <class T>
 struct Choose {
   static constexpr bool keeps_record = false, computes = false;
@@ -108,13 +109,7 @@ cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups,
   return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, coasted, y}, workspace, stream);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                        \
-  template cudaError_t begin<T>(const start::Inputs<T>&, const BodyGroups&, const StartChoice<T>&, const BodyGroups&, \
-                                const StartChoice<T>&, T*, T*, double*, cudaStream_t);                                \
-  template cudaError_t begin_backward<T>(const start::Inputs<T>&, const BodyGroups&, const start::Adjoints<T>&, T*,   \
-                                         T*, double*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(begin)
+DIFFVBD_INSTANTIATE(begin_backward)
 
 }  // namespace diffvbd::cuda

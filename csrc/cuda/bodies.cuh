@@ -1,5 +1,5 @@
-// Work on bodies: a team of threads for each, 4 or 8 lanes of a warp, a block, or, one body after another, the whole
-// device.
+// Teams of threads that work on bodies: 4 or 8 lanes of a warp, a block, or the whole device for one body after
+// another.
 #pragma once
 
 #include <cooperative_groups.h>
@@ -7,19 +7,21 @@
 
 #include "../rigid/body.h"
 #include "bodies.h"
-#include "exchange.cuh"
+#include "common.cuh"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 
 constexpr int kTile = 8, kTileThreads = 128;
-constexpr int kTinyTile = 4;               // of 8 vertices: all lanes find the rotation, so fewer do it less often
-constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fill the device with a thread each
+constexpr int kTinyTile =
+    4;  // lanes for bodies of 8 vertices: all lanes find the rotation, so fewer lanes repeat it less often
+constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fill the device with one thread each
 constexpr int kThreads = 256, kWarps = kThreads / 32;
-constexpr int32_t kOfWarp = 256;                // vertices of a body up to which a warp of a block has it to itself
-constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers that a team adds up at once
-constexpr int kFewSums = 4;                     // that every thread of a block adds up from its warps
-// Of work on a large body: worked out from times on an H100, 0.27 ms of a block for 9,261 vertices, and of the whole
-// device 15 us for 17,576 and 80 us for 195,112.
+constexpr int32_t kOfWarp = 256;                // vertices up to which one warp of a block takes a body
+constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers in one sum of a team
+constexpr int kFewSums = 4;                     // numbers that every thread of a block sums over the warps itself
+// Cost model of a large body, from times on an H100: 0.27 ms of a block for 9,261 vertices; for the whole device 15 us
+// for 17,576 and 80 us for 195,112 vertices.
 constexpr int64_t kBegun = 450, kFaster = 85;
 
 template <int n, class F>
@@ -29,10 +31,10 @@ __device__ __forceinline__ void own_sum(int32_t first, int32_t count, int32_t st
   for (int32_t i = first; i < count; i += stride) f(i, out);
 }
 
-// Sums by a butterfly, after which every lane holds the same bits.
+// Butterfly sums, after which every lane holds the same bits.
 template <int n, int width>
 __device__ __forceinline__ void butterfly(unsigned mask, double* out) {
-  constexpr int kAtOnce = 8;  // more would take registers, and gain nothing
+  constexpr int kAtOnce = 8;  // more need registers without a gain
   if constexpr (n > kAtOnce) {
     butterfly<kAtOnce, width>(mask, out);
     butterfly<n - kAtOnce, width>(mask, out + kAtOnce);
@@ -47,8 +49,8 @@ __device__ __forceinline__ void butterfly(unsigned mask, double* out) {
   }
 }
 
-// Sums of 32 numbers over the lanes of a warp, each to the lane of its number: half of them go at each exchange. The
-// same bits as by a butterfly.
+// Sums of 32 numbers over the lanes of a warp, each delivered to the lane of its number: every exchange halves the
+// numbers. Same bits as a butterfly.
 template <int half = 16>
 __device__ __forceinline__ double sums_by_lane(double* of) {
   const bool upper = threadIdx.x & half;
@@ -61,7 +63,7 @@ __device__ __forceinline__ double sums_by_lane(double* of) {
   return of[0];
 }
 
-// The least of the lanes of a part of a warp.
+// Minimum over `width` lanes.
 template <int width>
 __device__ __forceinline__ double butterfly_least(unsigned mask, double value) {
 #pragma unroll
@@ -149,7 +151,7 @@ struct BlockTeam {
   __device__ double least(int32_t count, const F& f) const {
     return reduce_least(own_least(static_cast<int32_t>(threadIdx.x), count, kThreads, f));
   }
-  // the largest of each of n numbers >= 0 that f(i, of) gives, or one that is no number
+  // maximum of each of n numbers >= 0 that f(i, of) gives, or NaN
   template <int n, class F>
   __device__ void most(int32_t count, double* out, const F& f) const {
     static_assert(n <= kMostSums);
@@ -183,7 +185,7 @@ struct BlockTeam {
       for (int k = 0; k < n && lane == 0; ++k) part[warp][k] = out[k];
       __syncthreads();
       for (int k = 0; k < n; ++k) out[k] = of_warps(k);
-    } else {  // a thread for each number
+    } else {  // one thread sums one number over the warps
       double all[32];
 #pragma unroll
       for (int k = 0; k < 32; ++k) all[k] = k < n ? out[k] : 0;
@@ -204,7 +206,7 @@ struct BlockTeam {
   }
 };
 
-// Calls f(b, who works on it) for so many bodies, of size(b) vertices: a warp each, or the block where they are large.
+// Calls f(b, team) for bodies of size(b) vertices: a warp for each, or the block for large ones.
 template <class Size, class F>
 __device__ __forceinline__ void each_body_of(int32_t count, const BlockTeam& block, const Size& size, const F& f) {
   for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) {
@@ -219,7 +221,7 @@ struct DeviceTeam {
   BlockTeam block;
   double* workspace;  // [2, blocks, kMostSums]
   mutable int turn = 0;
-  __device__ bool leads() const { return block.leads(); }  // each block keeps a record of its own
+  __device__ bool leads() const { return block.leads(); }  // each block has its own record
   template <int n, class F>
   __device__ void sum(int32_t count, double* out, const F& f) const {
     own_sum<n>(first(), count, stride(), out, f);
@@ -243,10 +245,10 @@ struct DeviceTeam {
   __device__ void each(int32_t count, const F& f) const {
     for (int32_t i = first(); i < count; i += stride()) f(i);
   }
-  // The numbers of every block, once all are there.
+  // Sums of all blocks, in the workspace. Two buffers alternate, so that one barrier per sum suffices.
   template <int n>
   __device__ double* share(const double* own) const {
-    double* to = workspace + static_cast<int64_t>(turn) * gridDim.x * kMostSums;  // two in turn: one barrier a sum
+    double* to = workspace + static_cast<int64_t>(turn) * gridDim.x * kMostSums;
     turn = 1 - turn;
     if (threadIdx.x == 0) {
       for (int k = 0; k < n; ++k) to[blockIdx.x * kMostSums + k] = own[k];
@@ -258,7 +260,7 @@ struct DeviceTeam {
   __device__ int32_t stride() const { return static_cast<int32_t>(gridDim.x * kThreads); }
 };
 
-// A record has no constructor that shared memory could run, so it is named by its size.
+// Records in shared memory, declared by size: shared memory runs no constructors.
 struct alignas(8) RecordBytes {
   unsigned char bytes[sizeof(rigid::Iteration) * rigid::kMaxIterations];
   __device__ rigid::Iteration* get() { return reinterpret_cast<rigid::Iteration*>(bytes); }
@@ -272,7 +274,7 @@ __global__ void __launch_bounds__(kTileThreads)
   const int64_t item = static_cast<int64_t>(blockIdx.x) * tiles + threadIdx.x / width;
   if (item >= in.scenes * bodies) return;
   const rigid::Body<T> body{in, item / bodies, static_cast<int32_t>(first + item % bodies)};
-  if constexpr (width == 1) {  // a record for each thread would not fit
+  if constexpr (width == 1) {  // records of all threads do not fit into shared memory
     RecordBytes record;
     act(body, Tile<width>(), record.get());
   } else {
@@ -312,11 +314,11 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// A thread for each vertex of each scene.
+// Vertices of all scenes, one thread each.
 constexpr int kVertexThreads = 128;
 template <class T>
 unsigned blocks_of(const rigid::Inputs<T>& in) {
-  return static_cast<unsigned>((in.scenes * in.vertices + kVertexThreads - 1) / kVertexThreads);
+  return blocks_for(in.scenes * in.vertices, kVertexThreads);
 }
 struct Row {
   int64_t scene;
@@ -324,7 +326,7 @@ struct Row {
   bool exists;
   template <class T>
   __device__ explicit Row(const rigid::Inputs<T>& in) {
-    const int64_t row = static_cast<int64_t>(blockIdx.x) * kVertexThreads + threadIdx.x;
+    const int64_t row = own_item(kVertexThreads);
     exists = row < in.scenes * in.vertices;
     scene = row / in.vertices;
     vertex = static_cast<int32_t>(row % in.vertices);
@@ -338,11 +340,11 @@ inline int multiprocessors() {
   return count;
 }
 
-// Whether large bodies take a block each, side by side: the whole device takes one after another, each in the time in
-// which a block gets through kBegun vertices, and 1 / kFaster of the rest.
+// Whether large bodies take one block each. The whole device takes them one after another, in the time in which a block
+// processes kBegun vertices plus 1 / kFaster of the rest.
 inline bool by_block(const BodyGroups& groups, int64_t scenes, int64_t vertices) {
   if (groups.large == 0) return false;
-  const int64_t size = vertices / groups.large;  // on average, at most
+  const int64_t size = vertices / groups.large;  // upper bound of the average
   return scenes * groups.large * (kBegun + size / kFaster) >= size;
 }
 
@@ -351,7 +353,7 @@ template <class T, class Act>
 cudaError_t run_bodies(const rigid::Inputs<T>& in, BodyGroups groups, const Act& act, double* workspace,
                        cudaStream_t stream) {
   if (in.scenes == 0) return cudaSuccess;
-  // work that is not memory's alone
+  // limited by arithmetic rather than memory
   if (Act::computes && in.scenes * groups.tiny >= kEnoughThreads) {
     launch_small<1>(in, act, 0, groups.tiny, stream);
   } else if (groups.tiny > 0) {

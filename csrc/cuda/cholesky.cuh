@@ -1,5 +1,5 @@
-// Systems of rigid motions, by the threads of one block: a system has the same bits alone and among others. Matrices
-// are of blocks of six, one for each two bodies, and only their lower half is looked at.
+// Cholesky factors of systems of rigid motions, by the threads of one block. The bits do not depend on other systems.
+// Matrices consist of blocks of six rows, one for each pair of bodies; only the lower half is read.
 #pragma once
 
 #include <cstdint>
@@ -10,13 +10,13 @@ namespace diffvbd::cuda {
 
 constexpr int kBlock = contact::kUnknowns;
 
-// Memory of a factorization, shared.
+// Shared memory of a factorization.
 struct Pivots {
-  double inverse[kBlock * contact::kMostCoupled];  // over the diagonal of the factor
-  uint8_t below[2][contact::kMostCoupled];         // blocks of a column that are not zero, of two columns in turn
+  double inverse[kBlock * contact::kMostCoupled];  // inverse diagonal of the factor
+  uint8_t below[2][contact::kMostCoupled];         // nonzero blocks of a column, double-buffered
 };
 
-// The lower half of the block that begins at a.
+// Lower half of the block at a.
 struct LowerBlock {
   double l[kBlock][kBlock];
   __device__ LowerBlock(int64_t size, const double* a) {
@@ -28,7 +28,7 @@ struct LowerBlock {
   }
 };
 
-// Its factor, by one thread.
+// Factor of a block, by one thread.
 __device__ inline void factor_block(int64_t size, double* a, double* inverse) {
   LowerBlock b(size, a);
 #pragma unroll
@@ -50,7 +50,7 @@ __device__ inline void factor_block(int64_t size, double* a, double* inverse) {
   }
 }
 
-// A row x of a column of blocks over the pivot of that column: x L^-T.
+// Row x of a column of blocks times the inverse transpose of the pivot: x L^-T.
 __device__ inline void over_pivot(int64_t size, const double* pivot, const double* inverse, double* row) {
   double x[kBlock];
 #pragma unroll
@@ -64,9 +64,9 @@ __device__ inline void over_pivot(int64_t size, const double* pivot, const doubl
   }
 }
 
-// The factor L of a matrix of `count` blocks a side, over its lower half, and L^-1 b over b. columns [count]: a bit for
-// each block of a column below the diagonal that is not zero, in the factor; or null, if none is. The last warp works
-// on the next pivot while the others update the rest: that takes one thread as long.
+// Factor L of a matrix of `count` blocks a side, in place, and L^-1 b in place of b. columns [count]: a bit for each
+// nonzero block of a column of the factor below the diagonal, or null for dense. The last warp prepares the next pivot
+// while the others update the rest.
 template <int threads>
 __device__ void factor_blocks(int32_t count, const uint64_t* columns, double* a, double* b, Pivots& pivots) {
   static_assert(threads > contact::kMostCoupled);
@@ -94,13 +94,13 @@ __device__ void factor_blocks(int32_t count, const uint64_t* columns, double* a,
     const uint8_t* below = pivots.below[k % 2];
     const int32_t left = __popcll(column);
     for (int32_t item = thread; item <= kBlock * left; item += threads) {
-      double* row = item == kBlock * left  // the right side is like one more row
+      double* row = item == kBlock * left  // the right-hand side is one more row
                         ? b + kBlock * k
                         : a + size * (kBlock * below[item / kBlock] + item % kBlock) + kBlock * k;
       over_pivot(size, pivot, pivots.inverse + kBlock * k, row);
     }
     __syncthreads();
-    // of a row of the block of below[r] and below[c], or of the right side
+    // Row i of block (below[r], below[c]), or of the right-hand side.
     const auto update = [&](int32_t r, int32_t c, int32_t i) {
       const double* row = a + size * i + kBlock * k;
       double x[kBlock];
@@ -140,21 +140,21 @@ __device__ void factor_blocks(int32_t count, const uint64_t* columns, double* a,
   }
 }
 
-// The inverses of the diagonal blocks of a factor, of which solutions are made; of each what is below its diagonal,
-// where m[block k + stride j + i] is in row i and column j.
+// Inverses of the diagonal blocks of a factor, below their diagonals: m[block k + stride j + i] is at row i and column
+// j.
 struct Inverses {
   double* m;
   int64_t block, stride;
   const double* diagonal;
 
-  // In the upper halves of the blocks, which nobody looks at.
+  // Stored in the upper halves of the blocks, which are not read otherwise.
   __device__ static Inverses within(int32_t count, double* a, const double* diagonal) {
     const int64_t size = int64_t{kBlock} * count;
     return {a, (size + 1) * kBlock, size, diagonal};
   }
 };
 
-// By all threads: one for each block. The diagonals have been inverted.
+// By all threads, one block each. The diagonals have been inverted.
 template <int threads>
 __device__ void invert_pivots(int32_t count, const double* a, const Inverses& to) {
   const int64_t size = int64_t{kBlock} * count;
@@ -177,7 +177,7 @@ __device__ void invert_pivots(int32_t count, const double* a, const Inverses& to
   __syncthreads();
 }
 
-// The inverse of a diagonal block, or of its transpose, times six numbers over these, by the first warp.
+// Inverse of a diagonal block, or its transpose, times six numbers, in place, by the first warp.
 template <bool turned>
 __device__ void times_inverse(const Inverses& of, int32_t k, double* b) {
   const auto own = static_cast<int32_t>(threadIdx.x);
@@ -195,7 +195,7 @@ __device__ void times_inverse(const Inverses& of, int32_t k, double* b) {
   if (own < kBlock) b[own] = x;
 }
 
-// L^-1 b over b, with such a factor L; then L^-T b.
+// Forward substitution L^-1 b and backward substitution L^-T b, in place.
 template <int threads>
 __device__ void solve_forward(int32_t count, const double* a, const Inverses& inverses, double* b) {
   const int64_t size = int64_t{kBlock} * count;

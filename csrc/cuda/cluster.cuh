@@ -1,5 +1,5 @@
-// The blocks of a cluster share a small scene: they meet in less time than a launch takes, and see each other's shared
-// memory. Before compute capability 9 a cluster is one block.
+// Small scenes, each for one block or for the blocks of a cluster. These synchronize in less time than a launch takes,
+// and see each other's shared memory. Before compute capability 9 a cluster is one block.
 #pragma once
 
 #include <cooperative_groups.h>
@@ -8,16 +8,25 @@
 
 namespace diffvbd::cuda {
 
-constexpr int kMostBlocks = 8;           // of a cluster, on every device that has them
-constexpr int64_t kPairsOfBlock = 1024;  // worth a block of their own
-constexpr int64_t kBlocksAtOnce = 128;   // of all scenes: more do not run side by side
+constexpr int64_t kSmallScene = 4096;  // vertices of a scene
+constexpr int64_t kFewPairs = 131072;  // capacity of pairs per scene; most of it is unused
+constexpr int64_t kManyScenes = 64;    // scenes that fill the device
 
-constexpr int64_t kItemsAlone = 1536;  // vertices and pairs that one block is done with before several have met
+inline bool has_block_each(int64_t vertices, int64_t scenes, int64_t pairs) {
+  return vertices <= kSmallScene && (pairs <= kFewPairs * scenes || kManyScenes <= scenes);
+}
+
+constexpr int kMostBlocks = 8;           // of a cluster, on every device that has them
+constexpr int64_t kPairsOfBlock = 1024;  // pairs that one more block pays for
+constexpr int64_t kBlocksAtOnce = 128;   // of all scenes: more do not run concurrently
+
+constexpr int64_t kItemsAlone =
+    1536;  // vertices and pairs below which one block is faster than a cluster that synchronizes
 
 struct Cluster {
   int rank, size;
-  // Whether this block has nothing to do: a scene of few items is left to the first one, which no longer meets others.
-  // What lists have room for decides about blocks, and there may be much less.
+  // Whether this block leaves: a scene of few items is left to the first block, which then stops synchronizing with
+  // others. The number of blocks follows from capacities, and lists may be much shorter.
   __device__ bool leaves(int64_t items) {
     if (items > kItemsAlone) return false;
     size = 1;
@@ -28,7 +37,7 @@ struct Cluster {
     const auto cluster = cooperative_groups::this_cluster();
     return {static_cast<int>(cluster.block_rank()), static_cast<int>(cluster.num_blocks())};
   }
-  // What blocks have written before is seen by all after.
+  // Barrier of the cluster; earlier writes are visible after it.
   __device__ void meet() const {
     if (size == 1) {
       __syncthreads();
@@ -36,7 +45,7 @@ struct Cluster {
       cooperative_groups::this_cluster().sync();
     }
   }
-  // Where another block has what is at `own` in this one's shared memory.
+  // Address in another block of what is at `own` in this one's shared memory.
   template <class U>
   __device__ static U* of(U* own, int block) {
     return cooperative_groups::this_cluster().map_shared_rank(own, block);
@@ -51,11 +60,11 @@ struct Cluster {
 #endif
 };
 
-// Answers of blocks to questions that all of them are asked, two in turn: one meeting each. In shared memory.
+// Votes of the blocks of a cluster, double-buffered: one barrier for each vote. In shared memory.
 struct Answers {
   int of[2][kMostBlocks];
 };
-// Whether any thread of the cluster says yes, once all have come here. turn: 0 at first, the same for all threads.
+// Vote of all threads of a cluster. turn: 0 at first, the same for all threads.
 __device__ inline bool any_of_cluster(const Cluster& cluster, Answers& answers, int& turn, bool own) {
   const int here = __syncthreads_or(own), size = cluster.size;
   if (size == 1) return here != 0;
@@ -68,7 +77,7 @@ __device__ inline bool any_of_cluster(const Cluster& cluster, Answers& answers, 
   return out;
 }
 
-// Blocks for each scene, a power of two. What a kernel was compiled for decides: a newer device may run it as well.
+// Blocks for each scene, a power of two. The architecture that the kernel was compiled for decides, not the device.
 inline int blocks_of_scene(const void* kernel, int64_t scenes, int64_t pairs) {
   cudaFuncAttributes of{};
   if (cudaFuncGetAttributes(&of, kernel) != cudaSuccess || of.ptxVersion < 90) return 1;
@@ -79,7 +88,7 @@ inline int blocks_of_scene(const void* kernel, int64_t scenes, int64_t pairs) {
   return blocks;
 }
 
-// A cluster for each scene, of lists with room for so many pairs.
+// A cluster for each scene; pairs: capacity of the lists.
 template <class... P, class... A>
 cudaError_t launch_clusters(void (*kernel)(P...), int64_t scenes, int64_t pairs, int threads, cudaStream_t stream,
                             A... arguments) {

@@ -1,17 +1,18 @@
-// The launches of a coarse correction: gradient, restriction, solve, prolongation, length, motion; and back.
+// Coarse correction: gradient, restriction, solve, prolongation, step length, motion; and their transposes.
 #include "../coarse/line.h"
 #include "bodies.cuh"
 #include "coarse.h"
+#include "common.cuh"
 #include "group.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
 constexpr int kSumThreads = 128, kManySumThreads = 1024;  // of a function, and of a part of a body
-constexpr int kShortRow = 128, kLongRow = 1024;  // positions of a function on average: below which a warp adds it up,
-                                                 // and from which on many threads do
+constexpr int kShortRow = 128, kLongRow = 1024;  // average positions of a function: a warp sums fewer than the first,
+                                                 // many threads more than the second
 constexpr int kRowThreads = 128;
-constexpr int kMostSmall = 8;  // functions of a body up to which eight threads solve for an unknown, else a warp
+constexpr int kMostSmall = 8;  // functions of a body up to which eight threads solve for an unknown; otherwise a warp
 
 template <class T>
 struct View {
@@ -28,7 +29,7 @@ struct View {
   }
 };
 
-// Sums over the threads of a block, in a fixed order; the first thread has them.
+// Sums over the threads of a block in a fixed order; thread 0 has them.
 template <int threads, int n>
 __device__ __forceinline__ void block_sum(double (&value)[n]) {
   __shared__ double part[threads / 32][n];
@@ -42,8 +43,8 @@ __device__ __forceinline__ void block_sum(double (&value)[n]) {
   }
 }
 
-// A block for each function of each scene: what `rows` [positions, 4] are to it. In the reverse times -s of its body,
-// and 0 where the body has not moved.
+// Restriction of `rows` [positions, 4], a block for each function of each scene. In the reverse times minus the step
+// length of its body, and 0 where the body did not move.
 template <class T, int threads, bool reverse>
 __global__ void __launch_bounds__(threads)
     restrict_rows(const __grid_constant__ View<T> a, int k, const T* __restrict__ rows) {
@@ -68,12 +69,12 @@ __global__ void __launch_bounds__(threads)
   for (int i = 0; i < 3; ++i) to[i] = length > 0 ? -length * T(sum[i]) : T(0);
 }
 
-// Some threads for each unknown of each scene: A^-1 times what was restricted.
+// A^-1 times the restricted rows, several threads for each unknown of each scene.
 template <class T, int threads, bool reverse>
 __global__ void __launch_bounds__(kRowThreads) solve_rows(const __grid_constant__ View<T> a, int k) {
   const coarse::Plan& p = a.c.plan;
   const int64_t unknowns = int64_t{3} * p.functions;
-  const int64_t item = (static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x) / threads;
+  const int64_t item = own_item(kRowThreads) / threads;
   const bool exists = item < a.s.scenes * unknowns;
   const int64_t scene = exists ? item / unknowns : 0, row = exists ? item - scene * unknowns : 0;
   const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
@@ -87,11 +88,11 @@ __global__ void __launch_bounds__(kRowThreads) solve_rows(const __grid_constant_
 #pragma unroll
   for (int d = threads / 2; d > 0; d /= 2) sum += __shfl_xor_sync(kWholeWarp, sum, d, threads);
   if (!exists || threadIdx.x % threads != 0) return;
-  const bool still = reverse && !(a.lengths(scene, k)[body] > 0);  // which may be no number
+  const bool still = reverse && !(a.lengths(scene, k)[body] > 0);  // which may be NaN
   (reverse ? a.solved(scene, k) : a.tape(scene, k))[row] = still ? T(0) : T(sum);
 }
 
-// The functions at a position, times three numbers of each.
+// Prolongation at a position of three numbers for each function.
 template <class T>
 __device__ __forceinline__ Vec3<T> prolonged(const coarse::Inputs<T>& c, int64_t position, const T* of) {
   Vec3<T> sum = zero3<T>();
@@ -102,41 +103,42 @@ __device__ __forceinline__ Vec3<T> prolonged(const coarse::Inputs<T>& c, int64_t
   return sum;
 }
 
-// The way of a correction, or that of its transpose.
+// Displacement of a correction or of its transpose.
 template <class T, bool reverse>
 __global__ void __launch_bounds__(kRowThreads) prolong(const __grid_constant__ View<T> a, int k) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions;
-  const Vec3<T> way = prolonged(a.c, i - scene * a.s.positions, reverse ? a.solved(scene, k) : a.tape(scene, k));
-  store_row(a.w.way, i, reverse ? way : -way);
+  const Vec3<T> displacement =
+      prolonged(a.c, i - scene * a.s.positions, reverse ? a.solved(scene, k) : a.tape(scene, k));
+  store_row(a.w.displacement, i, reverse ? displacement : -displacement);
 }
 
-// What the energies of a vertex add to its block.
+// Hessian block of the energies of a vertex.
 template <class T>
 __global__ void __launch_bounds__(kRowThreads)
-    press_rows(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in) {
+    vertex_block_rows(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in) {
   const coarse::Plan& p = a.c.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t item = own_item(kRowThreads);
   if (item >= a.s.scenes * p.listed) return;
   const int64_t scene = item / p.listed;
   const int i = static_cast<int>(item - scene * p.listed), position = __ldg(p.list_position + i);
   const int body = __ldg(p.position_body + position);
   const coarse::Line<T, StepInputs<T>> line{
-      in, a.c, a.s.data_start, a.s.base + scene, body, a.s.w.x + scene * a.s.positions * kRow, a.w.way};
+      in, a.c, a.s.data_start, a.s.base + scene, body, a.s.w.x + scene * a.s.positions * kRow, a.w.displacement};
   const Sym3<double> H = line.block(i - __ldg(p.list_ptr + body));
-  double* to = a.w.press + (scene * a.s.positions + position) * 6;
+  double* to = a.w.vertex_blocks + (scene * a.s.positions + position) * 6;
   to[0] = H.xx, to[1] = H.xy, to[2] = H.xz, to[3] = H.yy, to[4] = H.yz, to[5] = H.zz;
 }
 
-// A block for each part of each scene: how the energy of its tets changes along the way.
+// Change of the energy of tets along the displacement, a block for each part of each scene.
 template <class T>
 __global__ void __launch_bounds__(kSumThreads)
     line_of_parts(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in) {
   const coarse::Plan& p = a.c.plan;
   const int64_t scene = blockIdx.x / p.parts, user = a.s.base + scene;
   const int part = static_cast<int>(blockIdx.x - scene * p.parts);
-  const T *x = a.s.w.x + scene * a.s.positions * kRow, *way = a.w.way + scene * a.s.positions * kRow;
+  const T *x = a.s.w.x + scene * a.s.positions * kRow, *displacement = a.w.displacement + scene * a.s.positions * kRow;
   double sum[coarse::kDegree] = {};
   const int end = a.s.has_tets ? __ldg(p.part_begin + part + 1) * kLanes : 0;
   for (int i = __ldg(p.part_begin + part) * kLanes + static_cast<int>(threadIdx.x); i < end; i += kSumThreads) {
@@ -145,7 +147,7 @@ __global__ void __launch_bounds__(kSumThreads)
 #pragma unroll
     for (int corner = 0; corner < 4; ++corner) {
       const int row = __ldg(p.corner + (static_cast<int64_t>(block) * 4 + corner) * kLanes + lane) / kRow;
-      at[corner] = load_row(x, row, true), to[corner] = load_row(way, row, true);
+      at[corner] = load_row(x, row, true), to[corner] = load_row(displacement, row, true);
     }
     T rest[kRestScalars], material[kTetScalars], change[coarse::kDegree] = {};
     const T* scalars =
@@ -184,7 +186,7 @@ __global__ void __launch_bounds__(kThreads)
                                               a.s.base + scene,
                                               body,
                                               a.s.w.x + scene * a.s.positions * kRow,
-                                              a.w.way + scene * a.s.positions * kRow};
+                                              a.w.displacement + scene * a.s.positions * kRow};
     length = coarse::decide(line, a.tape(scene, k), a.w.restricted + scene * p.functions * 3,
                             a.w.sums + scene * p.parts * coarse::kDegree, BlockTeam{part});
   }
@@ -196,7 +198,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kRowThreads)
     move_bodies(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i == 0) *barrier = 0;
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
@@ -208,20 +210,20 @@ __global__ void __launch_bounds__(kRowThreads)
     T* before = a.lengths(scene, k) + a.c.plan.bodies + 3 * position;
     before[0] = x.x, before[1] = x.y, before[2] = x.z;
   }
-  // a way that was refused may be no number
-  if (length > 0) store_row(a.s.w.x, i, x + length * load_row(a.w.way, i, true));
+  // a rejected displacement may be NaN
+  if (length > 0) store_row(a.s.w.x, i, x + length * load_row(a.w.displacement, i, true));
 }
 
-// The adjoint of every vertex that moves: its own, and what the sweeps that are already reversed have left for it, the
-// rows of lower colors. They stay where they are, for its next turn.
+// Adjoint of every vertex that moves: its own and the rows of lower colors that the reversed sweeps left for it. They
+// stay for its next turn.
 template <class T>
 __global__ void __launch_bounds__(kRowThreads)
     sum_adjoints(const __grid_constant__ StepView<T> s, T* __restrict__ total) {
   const int64_t active = int64_t{__ldg(s.plan.color_block + s.plan.colors)} * kSlice;
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i >= s.scenes * active) return;
   const int64_t scene = i / active, position = i - scene * active, row = scene * s.positions + position;
-  Place<1> at(scene, static_cast<int>(position / kSlice), 0);
+  LaneLayout<1> at(scene, static_cast<int>(position / kSlice), 0);
   at.v = static_cast<int>(position % kSlice);
   int color = 0;
   while (at.block >= __ldg(s.plan.color_block + color + 1)) ++color;
@@ -231,16 +233,16 @@ __global__ void __launch_bounds__(kRowThreads)
   store_row(total, row, sum);
 }
 
-// Back to where the correction began.
+// Restores the positions from before the correction.
 template <class T>
 __global__ void __launch_bounds__(kRowThreads) move_back(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  const int64_t i = own_item(kRowThreads);
   if (i == 0) *barrier = 0;
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
   const int body = __ldg(a.c.plan.position_body + position);
   const T length = body < 0 ? T(0) : a.lengths(scene, k)[body];
-  Vec3<T> wanted = zero3<T>();  // a way that was refused may be no number
+  Vec3<T> wanted = zero3<T>();  // a rejected displacement may be NaN
   if (length > 0) wanted = -prolonged(a.c, position, a.tape(scene, k));
   if (a.w.wanted) store_row(a.w.wanted, i, wanted);
   if (body < 0) return;
@@ -252,12 +254,12 @@ __global__ void __launch_bounds__(kRowThreads) move_back(const __grid_constant__
   }
 }
 
-// A warp for each row of the matrices of each scene: minus the sum over the corrections of q a'.
+// Minus the sum of q a' over the corrections, a warp for each row of the matrices of each scene.
 template <class T>
 __global__ void __launch_bounds__(kRowThreads) sum_products(const __grid_constant__ View<T> a) {
   const coarse::Plan& p = a.c.plan;
   const int64_t unknowns = int64_t{3} * p.functions;
-  const int64_t item = (static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x) / 32;
+  const int64_t item = own_item(kRowThreads) / 32;
   if (item >= a.s.scenes * unknowns) return;
   const int64_t scene = item / unknowns, row = item - scene * unknowns;
   const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
@@ -288,7 +290,7 @@ cudaError_t solve(const View<T>& a, int k, cudaStream_t stream) {
   return launch(solve_rows<T, 32, reverse>, unknowns * 32, kRowThreads, stream, a, k);
 }
 
-// P' of the rows in `gradient`.
+// Restriction of `gradient`.
 template <bool reverse, class T>
 cudaError_t restricted(const View<T>& a, int k, cudaStream_t stream) {
   const coarse::Plan& p = a.c.plan;
@@ -306,10 +308,10 @@ cudaError_t restricted(const View<T>& a, int k, cudaStream_t stream) {
 
 }  // namespace
 
-// As the sweeps of a color, for all colors at once.
+// Gradient of all colors at once, by the kernels of coarse_gradient.cuh.
 template <class T>
 cudaError_t Corrections<T>::gradients(int wanted) const {
-  constexpr int64_t kManyVertices = 16000;  // up to which a warp works on each
+  constexpr int64_t kManyVertices = 16000;  // up to which a warp takes one vertex
   const bool reverse = wanted != kForward;
   const int64_t active = host.color_block[host.plan.colors];
   const int least = s.scenes * active * kSlice > kManyVertices ? kFewLanes : kManyLanes;
@@ -344,7 +346,7 @@ cudaError_t Corrections<T>::correct(int k) const {
   const int64_t positions = s.scenes * s.positions, parts = s.scenes * p.parts * kSumThreads;
   if (auto error = gradients(kForward)) return error;
   if (auto error = restricted<false>(a, k, stream)) return error;
-  if (auto error = press()) return error;
+  if (auto error = invert_with_vertex_blocks()) return error;
   if (auto error = solve<false>(a, k, stream)) return error;
   if (auto error = launch(prolong<T, false>, positions, kRowThreads, stream, a, k)) return error;
   if (auto error = launch(line_of_parts<T>, parts, kSumThreads, stream, a, in)) return error;
@@ -359,18 +361,18 @@ cudaError_t Corrections<T>::reverse(int k, int wanted) const {
   if (auto error = launch(sum_adjoints<T>, s.scenes * active, kRowThreads, stream, s, w.gradient)) return error;
   if (auto error = restricted<true>(a, k, stream)) return error;
   if (auto error = launch(move_back<T>, positions, kRowThreads, stream, a, k, barrier)) return error;
-  if (auto error = press()) return error;
+  if (auto error = invert_with_vertex_blocks()) return error;
   if (auto error = solve<true>(a, k, stream)) return error;
   if (auto error = launch(prolong<T, true>, positions, kRowThreads, stream, a, k)) return error;
   return gradients(wanted);
 }
 
 template <class T>
-cudaError_t Corrections<T>::press() const {
+cudaError_t Corrections<T>::invert_with_vertex_blocks() const {
   const View<T> a{s, *in.coarse, w};
   if (!a.c.pressed) return cudaSuccess;
-  if (auto error = launch(press_rows<T>, s.scenes * a.c.plan.listed, kRowThreads, stream, a, in)) return error;
-  return pressed_inverse(a.c, s.base, s.scenes, s.positions, w.press, w.matrix, w.inverse, stream);
+  if (auto error = launch(vertex_block_rows<T>, s.scenes * a.c.plan.listed, kRowThreads, stream, a, in)) return error;
+  return inverse_with_vertex_blocks(a.c, s.base, s.scenes, s.positions, w.vertex_blocks, w.matrix, w.inverse, stream);
 }
 
 template <class T>

@@ -1,5 +1,4 @@
-// Coarse corrections on the device (docs/method.md, section 15): what run.cuh launches between sweeps, and the matrices
-// of a step. No torch here.
+// Coarse corrections (docs/method.md, section 15): what run.cuh launches between sweeps, and the matrices of a step.
 #pragma once
 
 #include "../coarse/length.h"
@@ -8,29 +7,29 @@
 
 namespace diffvbd::cuda {
 
-// What the inverses are made in.
+// Workspace of the inverses.
 struct MatrixWork {
-  double* turn;    // [scenes, groups, kTurn]; only where the matrices are made
+  double* states;  // [scenes, groups, kGroupScalars]; only where the matrices are made
   double* matrix;  // [scenes, 9 cells]
   double* panel;   // [scenes, 2, 3 functions, kEdge]
   double* block;   // [scenes, bodies, kEdge, kEdge]
 };
 
-// Where the corrections of a chunk of scenes work; per scene.
+// Workspace of the corrections of a chunk of scenes; sizes per scene.
 template <class T>
 struct CoarseWork {
-  T *gradient, *way;  // [positions, 4]; the first has the adjoint of every vertex in the reverse
-  T* restricted;      // [functions, 3]  P' gradient
-  T* solved;          // [corrections, functions, 3]  of the reverse: q of each correction
-  T* wanted;          // [positions, 4]  of the reverse, if pressed: how a correction wanted to move the vertices
-  T* inverse;         // [9 cells]  if pressed: of the matrices with the blocks of vertex energies
-  double* press;      // [positions, 6]  these blocks
+  T *gradient, *displacement;  // [positions, 4]; the first has the adjoint of every vertex in the reverse
+  T* restricted;               // [functions, 3]  P' gradient
+  T* solved;                   // [corrections, functions, 3]  reverse: q of each correction
+  T* wanted;                   // [positions, 4]  reverse with vertex blocks: full displacement of a correction
+  T* inverse;                  // [9 cells]  inverses of the matrices with vertex blocks
+  double* vertex_blocks;       // [positions, 6]  Hessian blocks of vertex energies
   MatrixWork matrix;
   double* sums;       // [parts, kDegree]
   int32_t* failures;  // [bodies]  lengths of 0 so far
 };
 
-// The corrections of a step, of the chunk of scenes that a StepView is of.
+// Corrections of a step for the chunk of scenes of a StepView.
 template <class T>
 struct Corrections {
   const HostPlan& host;
@@ -41,7 +40,7 @@ struct Corrections {
   unsigned* barrier;  // of the next cooperative launch: set to zero
   cudaStream_t stream;
 
-  // The correction of number k: moves s.w.x and records what it did.
+  // Correction k: moves s.w.x and records it.
   cudaError_t correct(int k) const;
   // Its transpose. wanted: as of the sweeps.
   cudaError_t reverse(int k, int wanted) const;
@@ -49,16 +48,16 @@ struct Corrections {
   cudaError_t matrix_bars() const;
   // wanted: kForward for the gradient
   cudaError_t gradients(int wanted) const;
-  // If pressed: the inverses at s.w.x.
-  cudaError_t press() const;
+  // With vertex blocks: the inverses at s.w.x.
+  cudaError_t invert_with_vertex_blocks() const;
 };
 
 template <class T>
 using GradientKernel = void (*)(StepView<T>, CoarseWork<T>);
-// The gradient of the potential at all vertices, into `gradient`; or, where adjoints are wanted, that of its product
-// with `way`.
+// Gradient of the potential at all vertices, into `gradient`; where adjoints are wanted, the gradient of its product
+// with `displacement`.
 constexpr int kForward = -1;
-// scalars of shared memory that a warp needs for it: no more than for a sweep
+// Scalars of shared memory for a warp, no more than for a sweep.
 DIFFVBD_FN constexpr int gradient_scalars(int degree, int lanes, bool reverse) {
   return kSlice / threads_of(lanes) * 3 * degree * (reverse ? 2 : 1);
 }
@@ -66,19 +65,20 @@ template <class T, int wanted>
 GradientKernel<T> gradient_kernel_of(int energies, int lanes);
 
 constexpr int kEdge = coarse::kTile;  // of the tiles of a matrix
-constexpr int kTurn = 19;             // deformation of a group, its rotation, and 1 where that is determined
+constexpr int kGroupScalars = 19;     // deformation of a group, its rotation, and 1 where that is determined
 
 // inverse [scenes, 9 cells], or the matrices themselves
 template <class T>
 cudaError_t coarse_inverse(const coarse::MatrixInputs<T>& in, const MatrixWork& work, T* inverse, bool inverts,
                            cudaStream_t stream);
-// Of the matrices of scenes from `base` on with what presses [scenes, positions, 6].
+// Inverses for the scenes from `base` on, with vertex_blocks [scenes, positions, 6] added to the matrices.
 template <class T>
-cudaError_t pressed_inverse(const coarse::Inputs<T>& c, int64_t base, int64_t scenes, int64_t positions,
-                            const double* press, const MatrixWork& work, T* inverse, cudaStream_t stream);
-// Adjoints of x_prev [scenes, vertices, 3], stiffness (of as many scenes as there are) and mass [scenes, cells]
+cudaError_t inverse_with_vertex_blocks(const coarse::Inputs<T>& c, int64_t base, int64_t scenes, int64_t positions,
+                                       const double* vertex_blocks, const MatrixWork& work, T* inverse,
+                                       cudaStream_t stream);
+// Adjoints of x_prev [scenes, vertices, 3], stiffness (for its own number of scenes) and mass [scenes, cells].
 template <class T>
-cudaError_t coarse_inverse_vjp(const coarse::MatrixInputs<T>& in, const T* bar, double* turn, T* x_bar,
+cudaError_t coarse_inverse_vjp(const coarse::MatrixInputs<T>& in, const T* bar, double* states, T* x_bar,
                                T* stiffness_bar, T* mass_bar, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

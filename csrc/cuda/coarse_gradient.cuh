@@ -1,5 +1,5 @@
-// The gradient of the potential at every vertex at once, and its transpose. One instantiation for each set of energies
-// without contact and number of threads per vertex.
+// Gradient of the potential at every vertex at once, and its transpose: an instance for each set of energies without
+// contact and number of threads per vertex.
 #pragma once
 
 #include <utility>
@@ -10,37 +10,37 @@
 namespace diffvbd::cuda {
 namespace {
 
-// A star that also has w of the neighbours, beside their positions.
+// Star with the displacements of the neighbours.
 template <class T, int lanes>
-struct WayStar : GroupStar<T, lanes> {
+struct DisplacementStar : GroupStar<T, lanes> {
   using Base = GroupStar<T, lanes>;
   using typename Base::P;
-  const T* ways;
-  __device__ __forceinline__ WayStar(const StepView<T>& s, const P& at, const StarSpans& spans, T* shared)
+  const T* displacements;
+  __device__ __forceinline__ DisplacementStar(const StepView<T>& s, const P& at, const StarSpans& spans, T* shared)
       : Base(s, at, spans, shared) {}
 
-  __device__ __forceinline__ void fetch_ways(const T* of, T* shared) {
+  __device__ __forceinline__ void fetch_displacements(const T* of, T* shared) {
     T* to = shared + this->s.degree * 3 * P::groups + this->at.group;
-    ways = to;
+    displacements = to;
     of += this->at.scene * this->s.positions * kRow;
     for (int a = this->at.lane; a < this->degree; a += Base::lanes) {
       const int64_t edge = static_cast<int64_t>(this->first_edge + a) * kSlice + this->at.v;
-      const Vec3<T> way = load_row(of, __ldg(this->s.plan.adjacent + edge), true);
-      to[(3 * a) * P::groups] = way.x;
-      to[(3 * a + 1) * P::groups] = way.y;
-      to[(3 * a + 2) * P::groups] = way.z;
+      const Vec3<T> displacement = load_row(of, __ldg(this->s.plan.adjacent + edge), true);
+      to[(3 * a) * P::groups] = displacement.x;
+      to[(3 * a + 1) * P::groups] = displacement.y;
+      to[(3 * a + 2) * P::groups] = displacement.z;
     }
     __syncwarp();
   }
   __device__ __forceinline__ PairWay<T> way(int) const {
     const auto of = [&](int a) {
-      const T* from = ways + a * 3 * P::groups;
+      const T* from = displacements + a * 3 * P::groups;
       return Vec3<T>{from[0], from[P::groups], from[2 * P::groups]};
     };
     const int where = this->where;
     return {of(where & kMaxDegree), of(where >> kLocalBits & kMaxDegree), of(where >> 2 * kLocalBits)};
   }
-  __device__ __forceinline__ const WayStar& local() const { return *this; }
+  __device__ __forceinline__ const DisplacementStar& local() const { return *this; }
   template <class Law, int wanted>
   __device__ __forceinline__ Vec3<T> multiply_tets(const Vec3<T>& x, const Vec3<T>& w, const T& minus_h2) const {
     Vec3<T> out = diffvbd::multiply_tets<Law, wanted>(*this, x, w, minus_h2);
@@ -49,19 +49,19 @@ struct WayStar : GroupStar<T, lanes> {
   }
 };
 
-// The plan lists no tets of pinned vertices: what reaches them goes by rows, which add up (GroupStar::send_rows). One
-// thread does it for a vertex, out of line, so that the others take no registers for it.
+// Adjoints of pinned vertices: the plan lists no tets of theirs, so contributions go through rows, which add up
+// (GroupStar::scatter_rows). One thread of a vertex does it, out of line, so that the others need no registers for it.
 template <class Law, class T>
-__device__ __noinline__ void send_to_pinned(const StepView<T>& s, int64_t scene, int block, int v, const Vec3<T> x,
-                                            const Vec3<T> w, T minus_h2) {
-  const Place<1> place(scene, block, 0);
-  Place<1> at = place;
+__device__ __noinline__ void scatter_to_pinned(const StepView<T>& s, int64_t scene, int block, int v, const Vec3<T> x,
+                                               const Vec3<T> w, T minus_h2) {
+  const LaneLayout<1> place(scene, block, 0);
+  LaneLayout<1> at = place;
   at.v = v;
   const int pinned = __ldg(s.plan.color_block + s.plan.colors) * kSlice, first_edge = __ldg(s.plan.block_edge + block);
   const auto neighbour = [&](int a) { return __ldg(s.plan.adjacent + (int64_t{first_edge} + a) * kSlice + v); };
   const T* rows_of_x = s.w.x + scene * s.positions * kRow;
   T* rows = s.w.rows + scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
-  const auto send = [&](int a, const Vec3<T>& bar) {
+  const auto scatter = [&](int a, const Vec3<T>& bar) {
     if (neighbour(a) < pinned) return;
     const int64_t edge = (int64_t{first_edge} + a) * kSlice + v;
     store_row(rows, edge, load_row(rows, edge, true) + bar);
@@ -86,13 +86,13 @@ __device__ __noinline__ void send_to_pinned(const StepView<T>& s, int64_t scene,
                                        : __ldg(s.w.material + scene * s.material_scene + pair * kTetScalars + m);
     }
     const TetAdjoint<T> bar = Law::block_vjp(tet, Law::view(tet, x, none, p), none, p, minus_h2);
-    send(j, bar.xj);
-    send(k, bar.xk);
-    send(l, bar.xl);
+    scatter(j, bar.xj);
+    scatter(k, bar.xk);
+    scatter(l, bar.xl);
   }
 }
 
-// A warp's own memory: positions of the neighbours, and w of them in the reverse.
+// Memory of a warp: positions of the neighbours, and their displacements in the reverse.
 template <class T, int lanes>
 __device__ __forceinline__ T* memory_of_gradients(const StepView<T>& s, bool reverse) {
   extern __shared__ __align__(16) unsigned char memory[];
@@ -103,7 +103,7 @@ __device__ __forceinline__ T* memory_of_gradients(const StepView<T>& s, bool rev
   return reinterpret_cast<T*>(memory) + warp * size;
 }
 
-// Calls visit(place) for the warps' share of all vertices that move.
+// Calls visit(layout) for the warp's part of all moving vertices.
 template <int lanes_, class T, class Visit>
 __device__ __forceinline__ void each_vertex(const StepView<T>& s, const Visit& visit) {
   constexpr int lanes = threads_of(lanes_);
@@ -111,7 +111,7 @@ __device__ __forceinline__ void each_vertex(const StepView<T>& s, const Visit& v
   const int64_t warps = blockDim.x / kSlice, stride = int64_t{gridDim.x} * warps;
   for (int64_t i = blockIdx.x * warps + threadIdx.x / kSlice; i < s.scenes * parts; i += stride) {
     const int64_t scene = i / parts, part = i - scene * parts;
-    visit(Place<lanes_>(scene, static_cast<int>(part / lanes), static_cast<int>(part % lanes)));
+    visit(LaneLayout<lanes_>(scene, static_cast<int>(part / lanes), static_cast<int>(part % lanes)));
     __syncwarp();
   }
 }
@@ -121,7 +121,7 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 80 : 128)
     gradient_of_vertices(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
   using Set = EnergySet<mask>;
   T* const shared = memory_of_gradients<T, lanes>(s, false);
-  each_vertex<lanes>(s, [&](const Place<lanes>& at) {
+  each_vertex<lanes>(s, [&](const LaneLayout<lanes>& at) {
     GroupStar<T, lanes> star(s, at, spans_of(s.plan, at.block), shared);
     const Block<T> b = load_block<Set>(s, at, true, s.w.x);
     if (s.has_tets) star.fetch_neighbours(true);
@@ -137,15 +137,16 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
   using Set = EnergySet<mask>;
   T* const shared = memory_of_gradients<T, lanes>(s, true);
   const int pinned = __ldg(s.plan.color_block + s.plan.colors) * kSlice;
-  each_vertex<lanes>(s, [&](const Place<lanes>& at) {
+  each_vertex<lanes>(s, [&](const LaneLayout<lanes>& at) {
     const int64_t position = int64_t{at.block} * kSlice + at.v, row = at.scene * s.positions + position;
     const bool writes = at.lane == 0 && __ldg(s.plan.order + position) >= 0;
-    WayStar<T, lanes> star(s, at, spans_of(s.plan, at.block), shared);
-    if (s.has_tets) star.fetch_neighbours(true), star.fetch_ways(w.way, shared);
+    DisplacementStar<T, lanes> star(s, at, spans_of(s.plan, at.block), shared);
+    if (s.has_tets) star.fetch_neighbours(true), star.fetch_displacements(w.displacement, shared);
     const Block<T> b = load_block<Set>(s, at, true, s.w.x);
-    const Vec3<T> way = load_row(w.way, row, true), move = w.wanted ? load_row(w.wanted, row, true) : zero3<T>();
+    const Vec3<T> displacement = load_row(w.displacement, row, true),
+                  move = w.wanted ? load_row(w.wanted, row, true) : zero3<T>();
     const BlockAdjoint<T> out = reverse_gradient<Set, wanted>(
-        b, star, way, move, s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {
+        b, star, displacement, move, s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {
           if (writes) s.w.data_bar[(at.scene * s.data_scalars + s.data_row[k] + d) * s.positions + position] += value;
         });
     bool touches = false;
@@ -155,7 +156,7 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
     }
     if (star.any(touches) && writes) {
       const T h = s.parameters.time_step;
-      send_to_pinned<typename Set::Elastic>(s, at.scene, at.block, at.v, b.state.x, way, -(h * h));
+      scatter_to_pinned<typename Set::Elastic>(s, at.scene, at.block, at.v, b.state.x, displacement, -(h * h));
     }
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) star.total(star.material_bar);
@@ -203,6 +204,3 @@ GradientKernel<T> gradient_kernel_of(int energies, int lanes) {
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_GRADIENT(T, wanted) \
-  template diffvbd::cuda::GradientKernel<T> diffvbd::cuda::gradient_kernel_of<T, (wanted)>(int, int);

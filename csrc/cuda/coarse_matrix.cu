@@ -1,7 +1,8 @@
-// The matrices of a step and their inverses, body by body, and the transpose.
+// Matrices of a step, their inverses body by body, and the transpose.
 #include "../coarse/line.h"
 #include "bodies.cuh"
 #include "coarse.h"
+#include "common.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -11,7 +12,7 @@ using rigid::Matrix, rigid::outer, rigid::transposed, rigid::Vector;
 
 constexpr int kEdgeRows = 8;
 constexpr int kPairThreads = 128;
-constexpr int kTurned = 18;  // where the rotation is known
+constexpr int kDetermined = 18;  // 1 where the rotation is determined
 
 __device__ __forceinline__ Matrix load_matrix(const double* a) {
   return {{a[0], a[1], a[2]}, {a[3], a[4], a[5]}, {a[6], a[7], a[8]}};
@@ -22,10 +23,10 @@ __device__ __forceinline__ void store_matrix(double* a, const Matrix& m, int64_t
   a[0] = m.z.x, a[1] = m.z.y, a[2] = m.z.z;
 }
 
-// A block for each group of each scene.
+// Deformations and rotations, a block for each group of each scene.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    turn_groups(const __grid_constant__ MatrixInputs<T> in, double* __restrict__ turns) {
+    rotate_groups(const __grid_constant__ MatrixInputs<T> in, double* __restrict__ states) {
   __shared__ double part[kWarps][kMostSums];
   const int64_t scene = blockIdx.x / in.plan.groups;
   const int group = static_cast<int>(blockIdx.x - scene * in.plan.groups);
@@ -40,15 +41,15 @@ __global__ void __launch_bounds__(kThreads)
     }
   });
   if (!team.leads()) return;
-  double* to = turns + static_cast<int64_t>(blockIdx.x) * kTurn;
+  double* to = states + static_cast<int64_t>(blockIdx.x) * kGroupScalars;
   Matrix rotation = rigid::identity();
   const Matrix f = load_matrix(sums);
-  to[kTurned] = coarse::nearest_rotation(f, in.volume[group], rotation) ? 1 : 0;
+  to[kDetermined] = coarse::nearest_rotation(f, in.volume[group], rotation) ? 1 : 0;
   store_matrix(to, f);
   store_matrix(to + 9, rotation);
 }
 
-// Which body a cell of the matrices is of, and of which two functions.
+// Body and two functions of a cell of the matrices.
 struct Cell {
   int body, i, j, count;
   __device__ Cell(const Plan& p, int cell) {
@@ -73,14 +74,14 @@ __device__ __forceinline__ Matrix load_block(const T* k, int64_t plane) {
 // A thread for each two functions of a body.
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
-    assemble_pairs(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ turns,
+    assemble_pairs(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ states,
                    double* __restrict__ matrix) {
   const Plan& p = in.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= in.scenes * p.cells) return;
   const int64_t scene = item / p.cells, cell = item - scene * p.cells;
   const Cell at(p, static_cast<int>(cell));
-  const bool mirrored = at.i > at.j;  // the same numbers on both sides of the diagonal
+  const bool mirrored = at.i > at.j;  // both halves get the same bits
   const int i = mirrored ? at.j : at.i, j = mirrored ? at.i : at.j;
   const int64_t plane = int64_t{p.width} * p.width;
   Matrix sum{};
@@ -89,7 +90,7 @@ __global__ void __launch_bounds__(kPairThreads)
     const int one = __ldg(place + i), two = __ldg(place + j);
     if (one < 0 || two < 0) continue;
     const T* k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * plane;
-    const Matrix r = load_matrix(turns + (scene * p.groups + g) * kTurn + 9);
+    const Matrix r = load_matrix(states + (scene * p.groups + g) * kGroupScalars + 9);
     sum = sum + r * load_block(k + int64_t{one} * p.width + two, plane) * transposed(r);
   }
   sum = in.time_step * in.time_step * sum;
@@ -103,7 +104,7 @@ __global__ void __launch_bounds__(kPairThreads)
 // --- the inverse: a symmetric sweep (Goodnight) over tiles of the diagonal, after which the matrix holds -A^-1
 // --------
 
-// The body of a block, its matrix and where it works.
+// Body of a block, its matrix and workspace.
 struct Swept {
   int n, tiles;
   double *matrix, *panel, *columns, *block;
@@ -120,7 +121,7 @@ struct Swept {
   }
 };
 
-// A warp, of which each thread has a column in registers: a symmetric tile becomes minus its inverse.
+// Minus the inverse of a symmetric tile, by a warp whose threads hold one column each.
 __device__ __forceinline__ void invert_tile(double (&tile)[kEdge][kEdge + 1], int c) {
   double column[kEdge];
 #pragma unroll
@@ -142,7 +143,7 @@ __device__ __forceinline__ void invert_tile(double (&tile)[kEdge][kEdge + 1], in
   for (int r = 0; r < kEdge; ++r) tile[r][c] = column[r];
 }
 
-// A warp for each body: minus the inverse of its pivot tile.
+// Minus the inverse of the pivot tile of each body, a warp each.
 template <class T>
 __global__ void __launch_bounds__(kEdge)
     invert_pivots(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
@@ -162,8 +163,8 @@ __global__ void __launch_bounds__(kEdge)
   for (int r = 0; r < kEdge; ++r) a.block[r * kEdge + c] = own[r][c];
 }
 
-// A block of kEdge x kEdgeRows threads for each tile of rows: its columns of the pivot tile, and these times the
-// inverse of that.
+// Panel of a tile of rows, a block of kEdge x kEdgeRows threads each: its columns of the pivot tile, and these times
+// the inverse of the pivot tile.
 template <class T>
 __global__ void __launch_bounds__(kEdge* kEdgeRows)
     sweep_panel(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
@@ -194,7 +195,7 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
   }
 }
 
-// A block for each two tiles, the lower and its mirror image; the last pivot leaves the inverse.
+// Update of a lower tile and its mirror image, a block each; the last pivot leaves the inverse.
 template <class T>
 __global__ void __launch_bounds__(kEdge* kEdgeRows)
     sweep_tiles(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
@@ -225,7 +226,7 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
 #pragma unroll
   for (int u = 0; u < kEdge / kEdgeRows; ++u) {
     const int r = first + u * kEdgeRows;
-    // on the diagonal what is below it stands for both sides
+    // on the diagonal the lower half stands for both
     if (rows + r >= a.n || columns + c >= a.n || (high == low && c > r)) continue;
     const int64_t at = int64_t{rows + r} * a.n + columns + c, mirror = int64_t{columns + c} * a.n + rows + r;
     double value = 0;
@@ -246,7 +247,7 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
 
 // --- the transpose --------------------------------------------------------------------------------------------------
 
-// h^2 times the adjoint of a block and of its mirror image.
+// h^2 times the adjoint of a block plus that of its mirror image.
 template <class T>
 __device__ __forceinline__ Matrix pair_bar(const MatrixInputs<T>& in, const T* bar, int body, int i, int j) {
   const int64_t n = int64_t{3} * (__ldg(in.plan.function_ptr + body + 1) - __ldg(in.plan.function_ptr + body));
@@ -256,17 +257,17 @@ __device__ __forceinline__ Matrix pair_bar(const MatrixInputs<T>& in, const T* b
   return i == j ? h2 * above : h2 * (above + transposed(coarse::block_at(own + 3 * j * n + 3 * i, n)));
 }
 
-// A block for each group of each scene: the adjoint of its deformation takes the place of the deformation.
+// Replaces the deformation of each group by its adjoint, a block each.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    turn_groups_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar, double* turns) {
+    rotate_groups_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar, double* states) {
   __shared__ double part[kWarps][kMostSums];
   const Plan& p = in.plan;
   const int64_t scene = blockIdx.x / p.groups, plane = int64_t{p.width} * p.width;
   const int g = static_cast<int>(blockIdx.x - scene * p.groups), body = __ldg(p.group_body + g);
   const int32_t *functions = p.group_function + static_cast<int64_t>(g) * p.width, first = p.function_ptr[body];
-  double* turn = turns + static_cast<int64_t>(blockIdx.x) * kTurn;
-  const Matrix f = load_matrix(turn), r = load_matrix(turn + 9);
+  double* state = states + static_cast<int64_t>(blockIdx.x) * kGroupScalars;
+  const Matrix f = load_matrix(state), r = load_matrix(state + 9);
   const T *k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * plane,
           *own = bar + int64_t{9} * p.cells * scene;
   const BlockTeam team{part};
@@ -282,34 +283,33 @@ __global__ void __launch_bounds__(kThreads)
   });
   if (!team.leads()) return;
   Matrix f_bar{};
-  if (turn[kTurned] > 0) f_bar = rigid::polar_vjp(f, r, load_matrix(sums));
-  store_matrix(turn, f_bar);
+  if (state[kDetermined] > 0) f_bar = rigid::polar_vjp(f, r, load_matrix(sums));
+  store_matrix(state, f_bar);
 }
 
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
-    vertices_vjp(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ turns, T* __restrict__ x_bar) {
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+    vertices_vjp(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ states, T* __restrict__ x_bar) {
+  const int64_t item = own_item(kPairThreads);
   if (item >= in.scenes * in.vertices) return;
   const int64_t scene = item / in.vertices, v = item - scene * in.vertices;
   Vector sum{0, 0, 0};
   for (int e = __ldg(in.plan.vertex_ptr + v); e < __ldg(in.plan.vertex_ptr + v + 1); ++e) {
     const int64_t moment = __ldg(in.plan.vertex_moment + e);
     const T* m = in.moment + 3 * moment;
-    const double* f_bar = turns + (scene * in.plan.groups + __ldg(in.plan.moment_group + moment)) * kTurn;
+    const double* f_bar = states + (scene * in.plan.groups + __ldg(in.plan.moment_group + moment)) * kGroupScalars;
     sum += load_matrix(f_bar) * Vector{double(m[0]), double(m[1]), double(m[2])};
   }
   x_bar[3 * item] = T(sum.x), x_bar[3 * item + 1] = T(sum.y), x_bar[3 * item + 2] = T(sum.z);
 }
 
-// A thread for each two places of a group; scenes that share a stiffness are added up.
+// A thread for each two places of a group; sums over scenes that share a stiffness.
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
     stiffness_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar,
-                  const double* __restrict__ turns, T* __restrict__ stiffness_bar) {
+                  const double* __restrict__ states, T* __restrict__ stiffness_bar) {
   const Plan& p = in.plan;
-  const int64_t plane = int64_t{p.width} * p.width,
-                item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t plane = int64_t{p.width} * p.width, item = own_item(kPairThreads);
   const bool shared = in.stiffness.scene == 0;
   if (item >= (shared ? 1 : in.scenes) * p.groups * plane) return;
   const int64_t first_scene = item / (p.groups * plane);
@@ -319,7 +319,7 @@ __global__ void __launch_bounds__(kPairThreads)
   Matrix sum{};
   if (j >= i && functions[i] >= 0 && functions[j] >= 0) {
     for (int64_t scene = first_scene; scene < (shared ? in.scenes : first_scene + 1); ++scene) {
-      const Matrix r = load_matrix(turns + (scene * p.groups + g) * kTurn + 9);
+      const Matrix r = load_matrix(states + (scene * p.groups + g) * kGroupScalars + 9);
       const T* own = bar + int64_t{9} * p.cells * scene;
       sum = sum + transposed(r) * pair_bar(in, own, body, functions[i] - first, functions[j] - first) * r;
     }
@@ -334,7 +334,7 @@ template <class T>
 __global__ void __launch_bounds__(kPairThreads)
     mass_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar, T* __restrict__ mass_bar) {
   const Plan& p = in.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= in.scenes * p.cells) return;
   const int64_t scene = item / p.cells;
   const Cell at(p, static_cast<int>(item - scene * p.cells));
@@ -343,9 +343,7 @@ __global__ void __launch_bounds__(kPairThreads)
   mass_bar[item] = own[0] + own[n + 1] + own[2 * n + 2];
 }
 
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kPairThreads - 1) / kPairThreads); }
-
-// Pivots of the bodies [first, first + count), whose matrices have at most so many tiles.
+// Inverts the matrices of the bodies [first, first + count), of at most `tiles` tiles.
 template <class T>
 void invert(const MatrixInputs<T>& in, const MatrixWork& work, int first, int count, int tiles, T* inverse,
             cudaStream_t stream) {
@@ -368,17 +366,17 @@ void invert_all(const MatrixInputs<T>& in, const MatrixWork& work, T* inverse, c
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
     store_matrices(const double* __restrict__ matrix, int64_t count, T* __restrict__ out) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t i = own_item(kPairThreads);
   if (i < count) out[i] = T(matrix[i]);
 }
 
-// A thread for each two functions of a body: their block of A + P' H P. press: H of each position.
+// Blocks of A + P' H P, a thread for each two functions of a body. vertex_blocks: H of each position.
 template <class T>
 __global__ void __launch_bounds__(kPairThreads)
-    add_presses(const __grid_constant__ coarse::Inputs<T> c, int64_t base, int64_t scenes, int64_t positions,
-                const double* __restrict__ press, double* __restrict__ matrix) {
+    add_vertex_blocks(const __grid_constant__ coarse::Inputs<T> c, int64_t base, int64_t scenes, int64_t positions,
+                      const double* __restrict__ vertex_blocks, double* __restrict__ matrix) {
   const Plan& p = c.plan;
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const int64_t item = own_item(kPairThreads);
   if (item >= scenes * p.cells) return;
   const int64_t scene = item / p.cells;
   const Cell at(p, static_cast<int>(item - scene * p.cells));
@@ -388,7 +386,7 @@ __global__ void __launch_bounds__(kPairThreads)
   Matrix sum = coarse::block_at(c.factor.data + (base + scene) * c.factor.scene + own + 3 * at.i * n + 3 * at.j, n);
   for (int e = __ldg(p.row_ptr + i); e < __ldg(p.row_ptr + i + 1); ++e) {
     const int position = __ldg(p.row + e);
-    const double* H = press + (scene * positions + position) * 6;
+    const double* H = vertex_blocks + (scene * positions + position) * 6;
     const Sym3<double> block{H[0], H[1], H[2], H[3], H[4], H[5]};
     if (!coarse::acts(block)) continue;
     for (int f = __ldg(p.position_ptr + position); f < __ldg(p.position_ptr + position + 1); ++f) {
@@ -410,24 +408,26 @@ cudaError_t coarse_inverse(const MatrixInputs<T>& in, const MatrixWork& work, T*
   const Plan& p = in.plan;
   if (in.scenes * p.bodies == 0) return cudaSuccess;
   if (p.groups > 0) {
-    turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, work.turn);
+    rotate_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, work.states);
   }
-  assemble_pairs<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, work.turn, work.matrix);
+  assemble_pairs<<<blocks_for(in.scenes * p.cells, kPairThreads), kPairThreads, 0, stream>>>(in, work.states,
+                                                                                             work.matrix);
   if (inverts) {
     invert_all(in, work, inverse, stream);
   } else if (p.cells > 0) {
     const int64_t count = in.scenes * 9 * p.cells;
-    store_matrices<<<blocks_for(count), kPairThreads, 0, stream>>>(work.matrix, count, inverse);
+    store_matrices<<<blocks_for(count, kPairThreads), kPairThreads, 0, stream>>>(work.matrix, count, inverse);
   }
   return cudaGetLastError();
 }
 
 template <class T>
-cudaError_t pressed_inverse(const coarse::Inputs<T>& c, int64_t base, int64_t scenes, int64_t positions,
-                            const double* press, const MatrixWork& work, T* inverse, cudaStream_t stream) {
+cudaError_t inverse_with_vertex_blocks(const coarse::Inputs<T>& c, int64_t base, int64_t scenes, int64_t positions,
+                                       const double* vertex_blocks, const MatrixWork& work, T* inverse,
+                                       cudaStream_t stream) {
   if (scenes * c.plan.cells == 0) return cudaSuccess;
-  add_presses<<<blocks_for(scenes * c.plan.cells), kPairThreads, 0, stream>>>(c, base, scenes, positions, press,
-                                                                              work.matrix);
+  add_vertex_blocks<<<blocks_for(scenes * c.plan.cells, kPairThreads), kPairThreads, 0, stream>>>(
+      c, base, scenes, positions, vertex_blocks, work.matrix);
   MatrixInputs<T> in{};
   in.plan = c.plan, in.scenes = scenes;
   invert_all(in, work, inverse, stream);
@@ -435,29 +435,25 @@ cudaError_t pressed_inverse(const coarse::Inputs<T>& c, int64_t base, int64_t sc
 }
 
 template <class T>
-cudaError_t coarse_inverse_vjp(const MatrixInputs<T>& in, const T* bar, double* turn, T* x_bar, T* stiffness_bar,
+cudaError_t coarse_inverse_vjp(const MatrixInputs<T>& in, const T* bar, double* states, T* x_bar, T* stiffness_bar,
                                T* mass_bar, cudaStream_t stream) {
   const Plan& p = in.plan;
   if (in.scenes * in.vertices == 0) return cudaSuccess;
   const int64_t plane = int64_t{p.width} * p.width;
   if (p.groups > 0 && p.width > 0) {
-    turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, turn);
+    rotate_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, states);
     const int64_t pairs = (in.stiffness.scene == 0 ? 1 : in.scenes) * p.groups * plane;
-    stiffness_vjp<<<blocks_for(pairs), kPairThreads, 0, stream>>>(in, bar, turn, stiffness_bar);
-    turn_groups_vjp<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, bar, turn);
+    stiffness_vjp<<<blocks_for(pairs, kPairThreads), kPairThreads, 0, stream>>>(in, bar, states, stiffness_bar);
+    rotate_groups_vjp<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, bar, states);
   }
-  vertices_vjp<<<blocks_for(in.scenes * in.vertices), kPairThreads, 0, stream>>>(in, turn, x_bar);
-  if (p.cells > 0) mass_vjp<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, bar, mass_bar);
+  vertices_vjp<<<blocks_for(in.scenes * in.vertices, kPairThreads), kPairThreads, 0, stream>>>(in, states, x_bar);
+  if (p.cells > 0)
+    mass_vjp<<<blocks_for(in.scenes * p.cells, kPairThreads), kPairThreads, 0, stream>>>(in, bar, mass_bar);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                \
-  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, bool, cudaStream_t);  \
-  template cudaError_t pressed_inverse<T>(const coarse::Inputs<T>&, int64_t, int64_t, int64_t, const double*, \
-                                          const MatrixWork&, T*, cudaStream_t);                               \
-  template cudaError_t coarse_inverse_vjp<T>(const MatrixInputs<T>&, const T*, double*, T*, T*, T*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(coarse_inverse)
+DIFFVBD_INSTANTIATE(inverse_with_vertex_blocks)
+DIFFVBD_INSTANTIATE(coarse_inverse_vjp)
 
 }  // namespace diffvbd::cuda

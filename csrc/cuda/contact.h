@@ -1,47 +1,37 @@
-// Contact on the device: launchers of the passes of contact/passes.h, for a chunk of scenes.
+// Contact on the device: detection, lists of pairs, and the start of a step.
 #pragma once
 
+#include <cuda_runtime_api.h>
+
+#include <cstddef>
+
+#include "../contact/above_floor_reverse.h"
+#include "../contact/advance.h"
+#include "../contact/candidates.h"
+#include "../contact/coast.h"
+#include "../contact/intersect.h"
+#include "../contact/islands.h"
+#include "../contact/keep.h"
 #include "../contact/lag.h"
+#include "../contact/lowest.h"
+#include "../contact/narrow.h"
+#include "../contact/part.h"
 #include "../contact/passes.h"
-#include "step.h"
+#include "../contact/rooms.h"
+#include "../contact/sweep_rooms.h"
+#include "../contact/translation.h"
+#include "../contact/unsupported.h"
 
 namespace diffvbd::cuda {
 
-// Of the blocks [begin, end) of a color, whose kernel may wait for the one before by itself (`follows`, follow.cuh).
-// Each returns after its launches. Where warps share a vertex, all but reverse() are part of the sweep's kernel; where
-// that has all sweeps, reverse() too.
-template <class T>
-struct ContactPasses {
-  const StepView<T>& s;
-  const ContactView<T>& c;
-  cudaStream_t stream;
-
-  // Before their turn: the pairs' part of the blocks; sweep: in the reverse, else negative.
-  cudaError_t assemble(int sweep, int64_t begin, int64_t end, bool follows) const;
-  // After it: takes back what planes do not let pass of the motion.
-  cudaError_t limit(int sweep, int64_t begin, int64_t end, bool follows) const;
-  // In the reverse, before their turn: what pairs have sent.
-  cudaError_t prepare(int64_t begin, int64_t end, bool follows) const;
-  // And after it: the adjoint of assemble(). few: a warp for each kind of pair of a vertex.
-  cudaError_t reverse(bool few, int64_t begin, int64_t end, bool follows) const;
-  // After the last turn, before the adjoints are stored: what is left for vertices and colliders.
-  cudaError_t collect(const StepAdjoints<T>& out) const;
-  // After the adjoints are stored: those of the start of the step, of kappa.
-  cudaError_t store(const StepAdjoints<T>& out) const;
-
- private:
-  template <class... P, class... A>
-  cudaError_t over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool follows, A... arguments) const;
-};
-
-// After all scenes: the slots of the corners of each lagged pair added up; zero where there is none.
+// After all scenes: sum of the slots of the corners of each lagged pair; zero where there is none.
 template <class T>
 cudaError_t sum_lag(const contact::ContactInputs<T>& in, int64_t scenes, const contact::ContactAdjoints<T>& slots,
                     int64_t pairs, T* lag, cudaStream_t stream);
 
-// contact_lag and its adjoint; `pairs` that the list has room for, `count` on the device at ptr[scenes corners]. The
-// reverse writes `slots` [pairs, kLagSlots], three scalars for each corner and after each of the first three corners
-// one of the pair, and adds them up.
+// Lagged quantities of pairs and their adjoint. pairs: capacity of the list; its length is on the device, at ptr[scenes
+// corners]. The reverse writes `slots` [pairs, kLagSlots] and sums them: three scalars for each corner, and after each
+// of the first three corners one of the pair.
 constexpr int kLagSlots = 16;
 template <class T>
 cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
@@ -49,13 +39,106 @@ cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t sc
 template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
                               const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
-// As cpu/contact_lag.cpp's contact_rubbing; friction and damping may be null.
+// As the CPU operator contact_rubbing; friction and damping may be null.
 template <class T>
-cudaError_t rubbing(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
-                    int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
+cudaError_t lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
+                            int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
 template <class T>
-cudaError_t rubbing_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                             const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
-                             T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
+cudaError_t lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
+                                     const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs,
+                                     T* slots, T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
+
+// Bytes of workspace.
+template <class T>
+size_t detect_workspace_bytes(const contact::Surfaces<T>& in, int64_t capacity);
+
+template <class T>
+cudaError_t detect(const contact::Surfaces<T>& in, const contact::Detected<T>& out, void* workspace,
+                   cudaStream_t stream);
+
+// Bytes of workspace.
+template <class T>
+size_t intersections_workspace_bytes(const contact::Surfaces<T>& in, int64_t capacity);
+
+template <class T>
+cudaError_t find_intersections(const contact::Surfaces<T>& in, const contact::Intersections& out, void* workspace,
+                               cudaStream_t stream);
+
+// Bytes of workspace of find_islands().
+template <class T>
+size_t islands_workspace_bytes(const contact::IslandInputs<T>& in);
+
+// island [B, mesh_bodies]. again: the workspace is that of a call that differed only in radii.
+template <class T>
+cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, void* workspace, cudaStream_t stream,
+                         bool again = false);
+
+// Bytes of workspace for a list of that capacity.
+template <class T>
+int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in, int64_t capacity);
+
+// share, infeasible [1] as on the CPU. capacity: of the list of pairs.
+template <class T>
+cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* infeasible,
+                    void* workspace, int multiprocessors, cudaStream_t stream);
+
+// constants [pairs, 8] (contact/narrow.h).
+template <class T>
+cudaError_t refresh_gaps(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
+
+template <class T>
+int64_t compact_list_bytes(const contact::KeepInputs<T>& in);
+template <class T>
+cudaError_t compact_list(const contact::KeepInputs<T>& in, const contact::Kept<T>& out, void* workspace,
+                         cudaStream_t stream);
+
+// own, out: [B, bodies, planes]
+template <class T>
+cudaError_t support_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out, cudaStream_t stream);
+
+template <class T>
+cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream);
+template <class T>
+cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a,
+                           cudaStream_t stream);
+
+template <class T>
+cudaError_t coast(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
+template <class T>
+cudaError_t reverse_coast(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
+                          cudaStream_t stream);
+
+// islands: memory of islands_workspace_bytes().
+template <class T>
+cudaError_t find_trust_radii(contact::RoomInputs<T> in, const contact::RoomWork<T>& work, void* islands,
+                             cudaStream_t stream);
+
+// Calls act(body, team) for all bodies of all scenes, a block each.
+template <class Act>
+cudaError_t act_on_bodies(const Act& act, cudaStream_t stream);
+// Calls act(scene, vertex) for all vertices of all scenes.
+template <class Act>
+cudaError_t act_on_vertices(const Act& act, cudaStream_t stream);
+
+// u [B, bodies, 3]; sums [B, bodies, 4]: workspace
+template <class T>
+cudaError_t translation(const contact::TranslationInputs<T>& in, T* sums, T* u, cudaStream_t stream);
+
+// zeroed [B bodies (3 + 3 + 7 planes)]: zero workspace for rate, mean and adjoints of the planes by island. x_bar is
+// zero at first.
+template <class T>
+cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed,
+                                 T* move_bar, T* mass_bar, T* x_bar, T* planes_bar, cudaStream_t stream);
+
+// radii [B, V]; wishes [B, bodies], most [B]: workspace
+template <class T>
+cudaError_t sweep_radii(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream);
+
+// out [B, V, 3]
+template <class T>
+cudaError_t residual_acceleration(const contact::UnsupportedInputs<T>& in, T* out, cudaStream_t stream);
+template <class T>
+cudaError_t residual_acceleration_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
+                                           const contact::UnsupportedAdjoints<T>& out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

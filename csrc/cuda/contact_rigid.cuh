@@ -1,4 +1,4 @@
-// What the kernels of the rigid correction of bodies that touch share.
+// Shared definitions of the kernels of the rigid correction of bodies that touch.
 #pragma once
 
 #include "bodies.cuh"
@@ -9,63 +9,58 @@ namespace diffvbd::cuda {
 using namespace contact;
 using rigid::Body;
 
-constexpr int kOne = 128;  // threads of a block where each has an item of its own
+constexpr int kOne = 128;  // threads of a block with one item each
 
-inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kOne - 1) / kOne); }
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
 __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
 
-// Bytes of a part of a workspace, rounded up to what any type needs.
-constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
-
-// Scalars of a lagged pair in the memory of a correction: a Rubbing, the slip, and of a PairPress what is not zero.
-enum RubScalar : int {
+// Scalars of a lagged pair in memory: its load, its tangential motion, and the nonzero parts of its force.
+enum FrictionScalar : int {
   kNormal = 0,
-  kSlipBefore = 3,
+  kTangentialBefore = 3,
   kLoad = 6,
   kDamping,
   kApproach,
-  kSlip,
+  kTangential,
   kAt = 12,
   kWeight = 18,
   kForce = 20,
   kStiffness = 23,
-  kRubScalars = 29
+  kFrictionScalars = 29
 };
-// Memory of a correction. Of rows the listed pairs are the first, then the lagged.
+// Memory of a correction. Rows: first the listed pairs, then the lagged ones.
 struct GroupMemory {
-  int32_t* sides;         // [rows, 2]: bodies, -1 where nothing moves
-  double *press, *steps;  // [listed, kPressDoubles], [B, bodies, 6]
-  double* rubbing;        // [kRubScalars, lagged]: threads next to each other read pairs that are
-  double* bases;          // as the factors
-  // twice the row of a pair that acts, and the side that a body has of it, for all bodies of a group in a row: those of
-  // listed pairs, then those of lagged
-  int32_t *found, *rows;                      // [2 rows] twice: as they come, and in order
-  int32_t *counts, *filled, *begins, *taken;  // [B, bodies, 2] twice, [B, bodies], one number
-  int32_t* floors;                            // [B, V, planes]: where the vertices of bodies are borne, body after body
+  int32_t* sides;          // [rows, 2]: bodies, -1 where nothing moves
+  double *forces, *steps;  // [listed, kPressDoubles], [B, bodies, 6]
+  double* friction;        // [kFrictionScalars, lagged]: neighbouring threads read neighbouring pairs
+  double* bases;           // like the factors
+  // Twice the row of a pair that acts plus the side of the body, for all bodies of a group in a row: first listed
+  // pairs, then lagged ones.
+  int32_t *found, *rows;                      // [2 rows] each: unordered, ordered
+  int32_t *counts, *filled, *begins, *taken;  // [B, bodies, 2] each, [B, bodies], one number
+  int32_t* floors;                            // [B, V, planes]: contacts with planes, body after body
 };
 
-// Whether a list has a row: most have room for many more, whose memory nobody reads.
+// Whether a list has a row; capacities are larger than lists.
 template <class T>
-__device__ bool is_row(const RigidInputs<T>& in, const PairRoom& room, int64_t row) {
-  return row < room.listed ? row < in.first_listed(in.scene.scenes)
-                           : row - room.listed < in.first_lagged(in.scene.scenes) && row < room.rows();
+__device__ bool is_row(const RigidInputs<T>& in, const PairCapacity& capacity, int64_t row) {
+  return row < capacity.listed ? row < in.first_listed(in.scene.scenes)
+                               : row - capacity.listed < in.first_lagged(in.scene.scenes) && row < capacity.rows();
 }
 
-// Motions of bodies and factors of groups: of those with up to kFew bodies, and of larger ones, which are put into the
-// order of their elimination first. lists: whether scenes are one group each, whose rows are yet to be listed.
+// Motions of bodies and factors of groups of up to kFew bodies, and of larger groups, which are ordered for elimination
+// first. lists: scenes are one group each, whose rows are not listed yet.
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool lists,
+cudaError_t solve_few(const RigidInputs<T>& in, const PairCapacity& capacity, const GroupMemory& memory, bool lists,
                       double* center, double* motion, double* factors, cudaStream_t stream);
 template <class T>
-cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory,
+cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairCapacity& capacity, const GroupMemory& memory,
                                  int32_t* ordered, double* center, double* motion, double* factors,
                                  cudaStream_t stream);
 
-// The groups of scenes of many bodies [B, 4, bodies], by sides as of GroupMemory; and x = factor^-T factor^-1 x.
+// Groups of scenes with many bodies [B, 4, bodies], from the sides of GroupMemory; and x = factor^-T factor^-1 x.
 int64_t groups_bytes(int64_t scenes, int64_t bodies);
 template <class T>
-cudaError_t find_groups(const RigidInputs<T>& in, const PairRoom& room, const int32_t* sides, int32_t* groups,
+cudaError_t find_groups(const RigidInputs<T>& in, const PairCapacity& capacity, const int32_t* sides, int32_t* groups,
                         void* workspace, cudaStream_t stream);
 template <class T>
 cudaError_t solve_groups(const RigidInputs<T>& in, const double* factor, double* x, cudaStream_t stream);

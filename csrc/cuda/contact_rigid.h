@@ -1,4 +1,4 @@
-// The rigid correction of bodies that touch (contact/rigid.h), on the device.
+// Rigid correction of bodies that touch (contact/rigid.h).
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -8,39 +8,39 @@
 
 namespace diffvbd::cuda {
 
-// Rows that the lists of a correction have room for.
-struct PairRoom {
+// Capacities of the lists of a correction.
+struct PairCapacity {
   int64_t listed, lagged;
   DIFFVBD_FN int64_t rows() const { return listed + lagged; }
 };
 
-// Bytes that each works in.
+// Bytes of workspace.
 template <class T>
-int64_t rigid_system_bytes(const contact::RigidInputs<T>& in, const PairRoom& room);
+int64_t rigid_system_bytes(const contact::RigidInputs<T>& in, const PairCapacity& capacity);
 template <class T>
-int64_t rigid_move_bytes(const contact::RigidInputs<T>& in, const PairRoom& room);
+int64_t rigid_move_bytes(const contact::RigidInputs<T>& in, const PairCapacity& capacity);
 
 // As cpu/contact_rigid.h.
 template <class T>
-cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, double* center, double* motion,
-                         double* factor, int32_t* groups, void* workspace, cudaStream_t stream);
+cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairCapacity& capacity, double* center,
+                         double* motion, double* factor, int32_t* groups, void* workspace, cudaStream_t stream);
 template <class T>
-cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
+cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairCapacity& capacity, const double* center,
                        const double* motion, T* move, const contact::RigidOutcome<T>& out, T* x, void* workspace,
                        cudaStream_t stream);
 
-// pushing: memory of one number and a number for each listed pair.
+// pushing: workspace of one number and one for each listed pair.
 template <class T>
 cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
                            const contact::RigidWork<T>& out, const contact::PointWork<T>& sums, int32_t* pushing,
                            cudaStream_t stream);
 
-// The adjoint of a correction.
+// Adjoint of a correction.
 template <class T>
 struct RigidReverse {
   const double *motions, *shares, *factor;
   const T* end_bar;   // [B, V, 3]; may be out.vertices.x
-  double* solutions;  // [B, bodies, 6]  memory, as the rest
+  double* solutions;  // [B, bodies, 6]  workspace, as the rest
   T *p, *q, *way;     // as of virtual_motion() and reverse_end()
   contact::RigidWork<T> work;
   contact::PointWork<T> sums;
@@ -48,8 +48,8 @@ struct RigidReverse {
   contact::CorrectionAdjoints<T> out;
 };
 template <class T>
-cudaError_t rigid_reverse(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
-// Its parts before and after rigid_backward(), kernel by kernel.
+cudaError_t rigid_contact_backward(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
+// Its kernels before and after rigid_backward().
 template <class T>
 cudaError_t rigid_end_backward(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
 template <class T>

@@ -1,19 +1,18 @@
-// The rigid correction where few bodies are solved for together: all of Newton's method in one launch, a block for each
-// group.
+// Rigid correction of small groups of bodies: all of Newton's method in one launch, a block for each group.
 #include "../contact/rigid_slip.h"
 #include "cholesky.cuh"
-#include "contact_rigid_presses.cuh"
+#include "cluster.cuh"
+#include "common.cuh"
 #include "contact_rigid_rows.cuh"
-#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kSlots = 2, kLineDoubles = 6;  // slips that a thread keeps while a step looks for its length
+constexpr int kSlots = 2, kLineDoubles = 6;  // tangential motions that a thread stores during a line search
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
-constexpr int kSmall = kUnknowns * kFew;  // unknowns of systems that fit into shared memory
+constexpr int kSmall = kUnknowns * kFew;  // unknowns whose system fits into shared memory
 
-// The system of a group.
+// Newton system of a group.
 template <class T>
 struct System {
   const RigidInputs<T>& in;
@@ -24,7 +23,7 @@ struct System {
   double *center, *motion, *steps;  // of the scene's bodies
   double *base, *matrix, *gradient, *step;
   const GroupRows<T>& rows;
-  const int32_t (*ranges)[3];  // [count] where the rows of a body begin, those that rub among them, and where they end
+  const int32_t (*ranges)[3];  // [count] begin of the rows of a body, of its lagged rows, and end
   uint8_t* touching;           // [count, count]
   Pivots& pivots;
   double (*slots)[kLineDoubles][kThreads];
@@ -45,29 +44,29 @@ struct System {
     return of[size() * (kUnknowns * b + i) + kUnknowns * c + j];
   }
 
-  // The rows of body b of those that press: from where, and how many.
-  template <class Presses>
-  __device__ int2 rows_of(const Presses&, int32_t b) const {
-    const int32_t from = ranges[b][Presses::rubs ? 1 : 0];
-    return {from, ranges[b][Presses::rubs ? 2 : 1] - from};
+  // Begin and number of the rows of body b.
+  template <class Forces>
+  __device__ int2 rows_of(const Forces&, int32_t b) const {
+    const int32_t from = ranges[b][Forces::lagged ? 1 : 0];
+    return {from, ranges[b][Forces::lagged ? 2 : 1] - from};
   }
 
-  // What a row adds to the gradient of its body b and to that body's own part of the matrix.
-  template <class Presses>
-  __device__ void add_own(const Presses& presses, int32_t b, int32_t entry, double* out) const {
+  // Contribution of a row to the gradient of body b and to its diagonal block.
+  template <class Forces>
+  __device__ void add_own(const Forces& forces, int32_t b, int32_t entry, double* out) const {
     const Vector c = center_of(b);
     const int side = entry & 1;
-    const PairPress a = presses(entry >> 1, side);
+    const PairPress a = forces(entry >> 1, side);
     const double share = borne(in, scene, a);
 #pragma unroll
     for (int j = 0; j < kUnknowns; ++j) {
       out[j] += a.gradient(side, j, c);
-      const Vector pressed = share * (a.stiffness * a.map(side, j, c));
+      const Vector force = share * (a.stiffness * a.map(side, j, c));
 #pragma unroll
-      for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
+      for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), force);
     }
   }
-  // The one of n numbers that a thread is to put somewhere. Chosen by comparison, as in PairPress.
+  // Number that a thread stores. Chosen by comparison, which keeps the array in registers.
   template <int n>
   __device__ static double own_of(const double* total, int thread = static_cast<int>(threadIdx.x)) {
     double out = 0;
@@ -75,7 +74,7 @@ struct System {
     for (int k = 0; k < n; ++k) out = thread == k ? total[k] : out;
     return out;
   }
-  // Adds the sums of a team, a number by each of its first threads.
+  // Adds the sums of a team, one number by each of its first threads.
   __device__ void put_own(const double* total, int32_t b, double* to, double* gradients,
                           int thread = static_cast<int>(threadIdx.x)) const {
     const double value = own_of<kOwn>(total, thread);
@@ -88,26 +87,26 @@ struct System {
     at(to, b, i, b, j) += value;
     if (j < i) at(to, b, j, b, i) += value;
   }
-  // And to the part between two bodies, half of its rows at a time.
-  template <class Presses>
-  __device__ void add_between(const Presses& presses, double* to) const {
+  // Contribution to the block of two bodies, half of its rows at a time.
+  template <class Forces>
+  __device__ void add_between(const Forces& forces, double* to) const {
     for (int32_t b = 0; b < count; ++b) {
       for (int32_t other = b + 1; other < count; ++other) {
         if (!touching[count * b + other]) continue;
         const Vector c = center_of(b), d = center_of(other);
         for (int half = 0; half < 2; ++half) {
           double total[kHalf];
-          const int2 range = rows_of(presses, b);
+          const int2 range = rows_of(forces, b);
           team.template sum<kHalf>(range.y, total, [&](int32_t e, double* out) {
             const int32_t entry = rows.memory.rows[range.x + e];
             if (rows.memory.sides[entry ^ 1] != member(other)) return;
             const int side = entry & 1;
-            const PairPress a = presses(entry >> 1, side);
+            const PairPress a = forces(entry >> 1, side);
 #pragma unroll
             for (int j = 0; j < kUnknowns; ++j) {
-              const Vector pressed = a.stiffness * a.map(1 - side, j, d);
+              const Vector force = a.stiffness * a.map(1 - side, j, d);
 #pragma unroll
-              for (int i = 0; i < 3; ++i) out[kUnknowns * i + j] += dot(a.map(side, 3 * half + i, c), pressed);
+              for (int i = 0; i < 3; ++i) out[kUnknowns * i + j] += dot(a.map(side, 3 * half + i, c), force);
             }
           });
           const double value = own_of<kHalf>(total);
@@ -119,8 +118,7 @@ struct System {
     }
   }
 
-  // The center of a body, what acts on its vertices alone but for friction, and what keeps its part of the matrix
-  // regular.
+  // Center of a body, forces on its vertices except friction, and the regularization of its diagonal block.
   template <class By>
   __device__ void add_vertices(int32_t b, const By& by) const {
     const Body<T> own = body(b);
@@ -143,8 +141,8 @@ struct System {
     }
     put_own(total, b, base, gradient, by.number());
   }
-  // What does not change as bodies move: all but friction and damping.
-  __device__ void assemble(const Barriers<T>& barriers) const {
+  // Terms that do not change as bodies move: all but friction and damping.
+  __device__ void assemble(const BarrierForces<T>& barriers) const {
     team.each(size() * size(), [&](int32_t i) { base[i] = 0; });
     team.each(size(), [&](int32_t i) { gradient[i] = 0; });
     team.meet();
@@ -162,19 +160,19 @@ struct System {
     add_between(barriers, base);
     team.meet();
   }
-  // And these, linear about where bodies have gone.
-  __device__ void add_friction(const Rubs<T>& rubs) const {
+  // Friction and damping, linearized about the current motion.
+  __device__ void add_friction(const LaggedForces<T>& friction) const {
     if (!in.lag && in.planes == 0) return;
     for (int32_t b = 0; b < count; ++b) {
       const Body<T> own = body(b);
       if (!in.free[own.body]) continue;
       const Vector c = center_of(b);
       double total[kOwn];
-      const int2 range = rows_of(rubs, b);
+      const int2 range = rows_of(friction, b);
       const int32_t borne = in.planes > 0 ? own.size() : 0;
       if (borne + range.y == 0) continue;
       team.template sum<kOwn>(borne + range.y, total, [&](int32_t item, double* out) {
-        if (item >= borne) return add_own(rubs, b, rows.memory.rows[range.x + item - borne], out);
+        if (item >= borne) return add_own(friction, b, rows.memory.rows[range.x + item - borne], out);
         const int32_t v = own.vertex(item);
         bool any = false;
         for (int k = 0; k < in.planes; ++k) any = bears(in, own, v, k) || any;
@@ -187,11 +185,11 @@ struct System {
       });
       put_own(total, b, matrix, step);
     }
-    if (in.lag) add_between(rubs, matrix);
+    if (in.lag) add_between(friction, matrix);
     team.meet();
   }
 
-  // Of the matrix, of the step and of the motion after it: half of the first is what the step lowers the potential by.
+  // Energy norms of the step and of the motion after it; half of the first is the expected decrease.
   __device__ void energies(double* total) const {
     team.template sum<2>(size(), total, [&](int32_t j, double* out) {
       double one = 0, whole = 0;
@@ -202,18 +200,18 @@ struct System {
       out[0] += one * one, out[1] += whole * whole;
     });
   }
-  // Calls f(line) for what slips, in a thread's share.
+  // Calls f(line) for the tangential motions of a thread.
   template <class F>
-  __device__ void each_line(const Rubs<T>& rubs, const F& f) const {
+  __device__ void each_line(const LaggedForces<T>& friction, const F& f) const {
     for (int32_t b = 0; b < count; ++b) {
       const Body<T> own = body(b);
       if (!in.free[own.body]) continue;
-      const int2 range = rows_of(rubs, b);
+      const int2 range = rows_of(friction, b);
       team.each(range.y, [&](int32_t e) {
         const int32_t entry = rows.memory.rows[range.x + e];
-        const PairPress a = rubs(entry >> 1, entry & 1);
+        const PairPress a = friction(entry >> 1, entry & 1);
         if ((entry & 1) == (a.body[0] < 0 ? 1 : 0))
-          f(slip_line(in, (entry >> 1) - rubs.listed, a, center, steps));  // once
+          f(slip_line(in, (entry >> 1) - friction.listed, a, center, steps));  // once
       });
       team.each(own.size() * in.planes, [&](int32_t i) {
         const int32_t v = own.vertex(i / in.planes), k = i % in.planes;
@@ -223,18 +221,18 @@ struct System {
       });
     }
   }
-  // How many lines a thread has, of which it leaves the first ones in its slots.
-  __device__ int keep_lines(const Rubs<T>& rubs) const {
+  // Number of lines of a thread; the first ones are stored in its slots.
+  __device__ int keep_lines(const LaggedForces<T>& friction) const {
     int lines = 0;
-    each_line(rubs, [&](const SlipLine& a) {
+    each_line(friction, [&](const SlipLine& a) {
       const double values[] = {a.start, a.along, a.way, a.size, a.rate, a.bend};
       for (int i = 0; lines < kSlots && i < kLineDoubles; ++i) slots[lines][i][threadIdx.x] = values[i];
       ++lines;
     });
     return lines;
   }
-  __device__ double share(const Rubs<T>& rubs, double fall) const {
-    const int lines = keep_lines(rubs);
+  __device__ double share(const LaggedForces<T>& friction, double fall) const {
+    const int lines = keep_lines(friction);
     return slip_share(fall, [&](double tried) {
       double total[1] = {0};
       for (int l = 0; l < lines && l < kSlots; ++l) {
@@ -246,7 +244,7 @@ struct System {
       }
       if (lines > kSlots) {
         int seen = 0;
-        each_line(rubs, [&](const SlipLine& line) {
+        each_line(friction, [&](const SlipLine& line) {
           if (seen++ >= kSlots) total[0] += line.excess(tried, in.friction_eps);
         });
       }
@@ -255,14 +253,14 @@ struct System {
     });
   }
 
-  __device__ void solve(const Rubs<T>& rubs) const {
+  __device__ void solve(const LaggedForces<T>& friction) const {
     Settling state = kOnItsWay;  // the same for all threads
-    const bool slips = in.rubs(scene);
+    const bool has_friction = in.rubs(scene);
     for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
       team.each(size() * size(), [&](int32_t i) { matrix[i] = base[i]; });
       team.each(size(), [&](int32_t i) { step[i] = gradient[i]; });
       team.meet();
-      add_friction(rubs);
+      add_friction(friction);
       if (iteration > 0) {
         team.each(size(), [&](int32_t i) {
           for (int32_t j = 0; j < size(); ++j) step[i] += matrix[size() * i + j] * unknown(motion, j);
@@ -278,8 +276,9 @@ struct System {
       team.each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });
       team.meet();
       double of[2] = {0, 0};
-      if (slips) energies(of);
-      const double taken = settle(state, slips, of[0], of[1], [&](double fall) { return share(rubs, fall); });
+      if (has_friction) energies(of);
+      const double taken =
+          settle(state, has_friction, of[0], of[1], [&](double fall) { return share(friction, fall); });
       team.each(size(), [&](int32_t i) { unknown(motion, i) += taken * step[i]; });
       team.meet();
     }
@@ -288,9 +287,9 @@ struct System {
 
 // A block for each place where a group may begin.
 template <class T>
-__global__ void __launch_bounds__(kThreads)
-    few_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory,
-               bool lists, double* center, double* motion, double* factors) {
+__global__ void __launch_bounds__(kThreads) few_kernel(const __grid_constant__ RigidInputs<T> in, PairCapacity capacity,
+                                                       const __grid_constant__ GroupMemory memory, bool lists,
+                                                       double* center, double* motion, double* factors) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
   __shared__ int32_t ranges[kFew][3];
@@ -305,7 +304,7 @@ __global__ void __launch_bounds__(kThreads)
   const int32_t count = groups.count(first), size = kUnknowns * count;
   if (count == 0 || (kFew < count && count <= in.room)) return;
   double* factor = factors + in.matrix_size() * scene + groups.matrix(first);
-  const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
+  const GroupRows<T> rows{in, capacity, memory, scene, groups, first, count};
   const System<T> system{in,
                          team,
                          scene,
@@ -331,14 +330,14 @@ __global__ void __launch_bounds__(kThreads)
       if (by.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
     };
     system.each_body(find_center);
-    if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
+    if (threadIdx.x == 0) *factor = CUDART_NAN;  // solving with it gives NaN
     return;
   }
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });
-  if (lists) list_rows(in, room, memory, team, scene);
+  if (lists) list_rows(in, capacity, memory, team, scene);
   team.meet();
-  const Barriers<T> barriers{memory.sides, memory.press};
-  const Rubs<T> rubs{in, room.listed, {system.center, system.motion}};
+  const BarrierForces<T> barriers{memory.sides, memory.forces};
+  const LaggedForces<T> friction{in, capacity.listed, {system.center, system.motion}};
   rows.template sort<kThreads>([&](int32_t body, int32_t other) {
     if (groups.first(other) == first) touching[count * groups.rank(body) + groups.rank(other)] = 1;
   });
@@ -348,7 +347,7 @@ __global__ void __launch_bounds__(kThreads)
   });
   team.meet();
   system.assemble(barriers);
-  system.solve(rubs);
+  system.solve(friction);
   team.each(size * size, [&](int32_t i) { factor[i] = system.matrix[i]; });
   if (!in.moving || !in.together()) return;
   bool moves[kFew];
@@ -361,18 +360,13 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool lists,
+cudaError_t solve_few(const RigidInputs<T>& in, const PairCapacity& capacity, const GroupMemory& memory, bool lists,
                       double* center, double* motion, double* factors, cudaStream_t stream) {
   const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
-  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, memory, lists, center, motion, factors);
+  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, capacity, memory, lists, center, motion, factors);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                 \
-  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, bool, double*, \
-                                    double*, double*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(solve_few)
 
 }  // namespace diffvbd::cuda

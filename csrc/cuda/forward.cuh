@@ -1,4 +1,4 @@
-// The sweeps, one instantiation for each set of energies and number of threads per vertex.
+// Sweeps: an instance for each set of energies and number of threads per vertex.
 #pragma once
 
 #include <utility>
@@ -9,12 +9,12 @@
 namespace diffvbd::cuda {
 namespace {
 
-// What the threads of a warp do at one turn.
+// Vertices of a warp at one turn.
 struct Turn {
   int64_t scene;
   int sweep, block, part;
   int begin, end;      // blocks of the color
-  bool apart = false;  // whether sweeps of this launch have left all vertices in the rows of those that have moved
+  bool apart = false;  // whether earlier sweeps of this launch left all vertices in the rows of moved ones
   template <class T>
   __device__ __forceinline__ MovingRows<T> rows(const StepView<T>& s) const {
     return apart ? MovingRows<T>{s.w.moved, s.w.x} : MovingRows<T>{s.w.x, s.w.moved};
@@ -22,22 +22,22 @@ struct Turn {
   __device__ __forceinline__ int64_t first() const { return int64_t{begin} * kSlice; }
 };
 
-// From where to where an update goes.
+// Start and end of an update.
 template <class T>
-struct Way {
+struct Path {
   Vec3<T> from, to;
 };
 
-// Updates a warp's vertices; false, and nothing is done, where a usual set finds a block that it does not suit. A set
-// with contact leaves it to the caller to move them.
+// Updates a warp's vertices. Returns false and does nothing where a well-conditioned set meets a block that it does not
+// suit. With contact the caller moves the vertices.
 template <class Set, class T, int lanes>
 __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T>& pairs,
-                                       Way<T>& way) {
-  const Place<lanes> at(turn.scene, turn.block, turn.part);
+                                       Path<T>& path) {
+  const LaneLayout<lanes> at(turn.scene, turn.block, turn.part);
   const Span ranks = span_of(s.plan.block_rank, at.block);
   const StarSpans spans = spans_of(s.plan, at.block);
   const int rank = ranks.begin + at.v, end_rank = ranks.end;
-  if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
+  if (rank - at.group >= end_rank) return true;  // a warp of phantoms
   GroupStar<T, lanes> star(s, at, spans, shared);
   star.pairs = &pairs;
   const MovingRows<T> rows = Set::contact ? turn.rows(s) : MovingRows<T>{s.w.x, s.w.x};
@@ -53,8 +53,8 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   }
   const Update<T> u = update_of<Set>(b, newton, q);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
-  way = {b.state.x, moved<Set>(b.state.x, u)};
-  if (!Set::contact && at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, way.to);
+  path = {b.state.x, moved<Set>(b.state.x, u)};
+  if (!Set::contact && at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, path.to);
   if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
     T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * s.tape_rows * s.plan.num_active + rank;
     const auto put = [&](const T& value) {
@@ -66,66 +66,67 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   return true;
 }
 
-// Out of line, so that what few vertices need takes no registers from the others.
+// Out of line, so that the few vertices that need it cost the others no registers.
 template <class Set, class T, int lanes>
-__device__ __noinline__ Way<T> rare_update(const StepView<T>& s, T* shared, Turn turn, PairTerm<T> pairs) {
-  Way<T> way{};
-  update<Set, T, lanes>(s, shared, turn, pairs, way);
-  return way;
+__device__ __noinline__ Path<T> ill_conditioned_update(const StepView<T>& s, T* shared, Turn turn, PairTerm<T> pairs) {
+  Path<T> path{};
+  update<Set, T, lanes>(s, shared, turn, pairs, path);
+  return path;
 }
 
 template <class Set, class T, int lanes>
-__device__ __forceinline__ Way<T> update_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
-  Way<T> way{};
-  if (!update<Usual<Set>, T, lanes>(s, shared, turn, pairs, way)) {
-    way = rare_update<Set, T, lanes>(s, shared, turn, pairs);
+__device__ __forceinline__ Path<T> update_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
+  Path<T> path{};
+  if (!update<Usual<Set>, T, lanes>(s, shared, turn, pairs, path)) {
+    path = ill_conditioned_update<Set, T, lanes>(s, shared, turn, pairs);
   }
-  return way;
+  return path;
 }
 
-// Of a set with contact, a block for a vertex: the first warp updates it, the others look at its pairs.
+// With contact, a block for a vertex: the first warp updates it, the others evaluate its pairs.
 template <class Set, class T>
-__device__ __forceinline__ void update_among(const StepView<T>& s, const ContactView<T>& c, T* shared,
-                                             const Turn& turn) {
-  const Place<kManyLanes> at(turn.scene, turn.block, turn.part);
+__device__ __forceinline__ void update_cooperative(const StepView<T>& s, const ContactView<T>& c, T* shared,
+                                                   const Turn& turn) {
+  const LaneLayout<kManyLanes> at(turn.scene, turn.block, turn.part);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   const int vertex = __ldg(s.plan.order + position), role = static_cast<int>(threadIdx.x / kSlice) - 1;
   if (vertex < 0) return;
-  Among<T>& told = among_memory<T>();
+  Messages<T>& message = message_memory<T>();
   if (role >= 0) {
     const SweepRows<T> rows = sweep_rows(s, at.scene, turn.begin, turn.end, turn.rows(s));
     PairsOf<T, kManyLanes, SweepRows<T>> pairs(s, c.in, at, rows, role);
-    const contact::OwnRoom<T> room = pairs.room();  // asked for long before it is needed
-    pairs.gather(told.term[role]);
-    meet_among();  // what pairs add is there
-    meet_among();  // where the update goes is there
+    const contact::OwnRoom<T> region = pairs.trust_region();  // loaded long before it is needed
+    pairs.gather(message.term[role]);
+    sync_cooperative();  // pair terms are ready
+    sync_cooperative();  // the end of the update is ready
     if (role != kLagged) {
-      const Vec3<T> from = contact::vector_at(told.from);
-      const int exponent = pairs.limit(room, from, contact::vector_at(told.to) - from);
-      if (at.lane == 0) told.exponents[role] = exponent;
+      const Vec3<T> from = contact::vector_at(message.from);
+      const int exponent = pairs.limit(region, from, contact::vector_at(message.to) - from);
+      if (at.lane == 0) message.exponents[role] = exponent;
     }
-    meet_among();  // how far it may go is there
+    sync_cooperative();  // the exponents are ready
     return;
   }
-  Way<T> way = update_any<Set, T, kManyLanes>(s, shared, turn, {told.term[0], kRoles, nullptr, true});
+  Path<T> path = update_any<Set, T, kManyLanes>(s, shared, turn, {message.term[0], kRoles, nullptr, true});
   if (at.lane == 0) {
-    told.from[0] = way.from.x, told.from[1] = way.from.y, told.from[2] = way.from.z;
-    told.to[0] = way.to.x, told.to[1] = way.to.y, told.to[2] = way.to.z;
+    message.from[0] = path.from.x, message.from[1] = path.from.y, message.from[2] = path.from.z;
+    message.to[0] = path.to.x, message.to[1] = path.to.y, message.to[2] = path.to.z;
   }
-  meet_among();
-  meet_among();
+  sync_cooperative();
+  sync_cooperative();
   if (at.lane != 0) return;
-  const int exponent = max(told.exponents[kPoints], told.exponents[kEdges]);
-  if (exponent > 0) way.to = way.from + contact::limit_of<T>(exponent) * (way.to - way.from);
-  store_row(turn.rows(s).moved, at.scene * s.positions + position, way.to);
-  c.cut[((s.base + at.scene) * s.sweeps + turn.sweep) * c.in.num_vertices + vertex] = static_cast<uint8_t>(exponent);
+  const int exponent = max(message.exponents[kPoints], message.exponents[kEdges]);
+  if (exponent > 0) path.to = path.from + contact::limit_of<T>(exponent) * (path.to - path.from);
+  store_row(turn.rows(s).moved, at.scene * s.positions + position, path.to);
+  c.truncations[((s.base + at.scene) * s.sweeps + turn.sweep) * c.in.num_vertices + vertex] =
+      static_cast<uint8_t>(exponent);
 }
 
-// What the usual blocks take: the rare ones must do with as many.
+// Registers of well-conditioned blocks; the ill-conditioned ones make do with as many.
 template <class T, class Set, int lanes>
 constexpr int forward_registers() {
   if (sizeof(T) == sizeof(float)) return Set::contact ? 96 : 80;
-  if (lanes >= kManyLanes) return 168;  // of whose warps there are never many
+  if (lanes >= kManyLanes) return 168;  // such warps are few
   return Set::contact ? 168 : Set::filters ? 144 : 128;
 }
 
@@ -140,7 +141,7 @@ __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, lanes>()))
     __syncwarp();
   });
 }
-// Of a set with contact: the pairs' part has been summed up, and planes have yet to let the vertices pass.
+// With contact: pair terms have been assembled, and limits follow.
 template <class T, int mask, int lanes>
 __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, lanes>()))
     sweep_between(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
@@ -148,25 +149,26 @@ __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, lanes>()))
   T* const shared = memory_of_warp<T, lanes>(s, false);
   wait_for_previous();
   each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part, int begin, int end) {
-    const Place<lanes> at(scene, block, part);
+    const LaneLayout<lanes> at(scene, block, part);
     const int64_t row = scene * s.positions + static_cast<int64_t>(block) * kSlice + at.v;
     const PairTerm<T> pairs{s.w.contact + row * kContactScalars, 1};
-    const Way<T> way = update_any<EnergySet<mask>, T, lanes>(s, shared, {scene, sweep, block, part, begin, end}, pairs);
+    const Path<T> path =
+        update_any<EnergySet<mask>, T, lanes>(s, shared, {scene, sweep, block, part, begin, end}, pairs);
     const bool real = __ldg(s.plan.order + static_cast<int64_t>(block) * kSlice + at.v) >= 0;
-    if (at.lane == 0 && real) store_row(s.w.moved, row, way.to);
+    if (at.lane == 0 && real) store_row(s.w.moved, row, path.to);
     __syncwarp();
   });
 }
 // A block for each vertex, in one launch for all sweeps or for each color.
 template <class T, int mask>
 __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, kManyLanes>()))
-    sweep_among(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
-                const __grid_constant__ ContactView<T> c) {
+    sweep_cooperative(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
+                      const __grid_constant__ ContactView<T> c) {
   T* const shared = memory_of_warp<T, kManyLanes>(s, false);  // of the first warp
   wait_for_previous();
   const auto visit = [&](int64_t scene, int sweep, int block, int part, int begin, int end) {
     const bool apart = (sweep - range.first_sweep) % 2 != 0;
-    update_among<EnergySet<mask>>(s, c, shared, Turn{scene, sweep, block, part, begin, end, apart});
+    update_cooperative<EnergySet<mask>>(s, c, shared, Turn{scene, sweep, block, part, begin, end, apart});
   };
   each_color_by_blocks(s, range, false, visit, nullptr);
 }
@@ -176,7 +178,7 @@ SweepKernel forward_variant() {
   if constexpr (!is_built(mask, lanes)) {
     return nullptr;
   } else if constexpr (EnergySet<mask>::contact && lanes == kManyLanes) {
-    return reinterpret_cast<SweepKernel>(&sweep_among<T, mask>);
+    return reinterpret_cast<SweepKernel>(&sweep_cooperative<T, mask>);
   } else if constexpr (EnergySet<mask>::contact) {
     return reinterpret_cast<SweepKernel>(&sweep_between<T, mask, lanes>);
   } else {
@@ -209,5 +211,3 @@ SweepKernel forward_kernel(int energies, int lanes) {
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_FORWARD(T) template diffvbd::cuda::SweepKernel diffvbd::cuda::forward_kernel<T>(int, int);

@@ -1,6 +1,7 @@
-// What surrounds the sweeps: from the user's arrays to sweep order and back, once a step, one thread per vertex or tet.
+// Copies between the user's arrays and sweep order, once a step, a thread for each vertex or tet.
 #pragma once
 
+#include "common.cuh"
 #include "group.cuh"
 
 namespace diffvbd::cuda {
@@ -20,7 +21,7 @@ __device__ __forceinline__ void store_user(T* p, int64_t index, const Vec3<T>& a
   p[1] = a.y;
   p[2] = a.z;
 }
-// y = x + h v + h^2 a; a pinned vertex goes where it is prescribed
+// y = x + h v + h^2 a; a pinned vertex goes where it is prescribed.
 template <class T>
 __device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scene, int64_t vertex, bool pinned) {
   const Vec3<T> x = load_user(in.x_prev, scene, vertex);
@@ -30,20 +31,19 @@ __device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scen
   return x + h * v + (h * h) * a;
 }
 
-// Fills a chunk's arrays in sweep order. Forward: x is where the sweeps start. Reverse: x is where they ended (`ends`),
-// and x_bar comes with it.
+// Fills a chunk's arrays in sweep order. Forward: x is the start of the sweeps. Reverse: x is their end (`ends`), with
+// x_bar.
 template <class T>
 __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                               int64_t base, const T* ends, const T* x_bar, const T* v_bar, unsigned* barrier) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (i == 0) *barrier = 0;  // of the cooperative grid that comes next
+  const int64_t i = own_item();
+  if (i == 0) *barrier = 0;  // of the next cooperative grid
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
   const int64_t block = position / kSlice;
   const int v = static_cast<int>(position % kSlice);
   int64_t vertex = __ldg(s.plan.order + position);
-  const bool phantom =
-      vertex < 0;  // it copies the first vertex of its block, so that it never meets an undefined state
+  const bool phantom = vertex < 0;  // a copy of the first vertex of its block: always a defined state
   if (phantom) vertex = __ldg(s.plan.order + block * kSlice);
   const bool pinned = block >= __ldg(s.plan.color_block + s.plan.colors);
   const int64_t vectors = local * s.positions * 3;
@@ -63,7 +63,7 @@ __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __
   } else {
     const Vec3<T> x = in.fused ? y : load_user(in.x_start, scene, vertex);
     store_row(s.w.x, i, x);
-    if (s.w.moved) store_row(s.w.moved, i, x);  // what is pinned stays there
+    if (s.w.moved) store_row(s.w.moved, i, x);  // pinned vertices stay there
   }
   if (s.w.x_prev) store3(s.w.x_prev + vectors, block, v, load_user(in.x_prev, scene, vertex));
   if (s.w.origin) store3(s.w.origin + vectors, block, v, load_user(in.origin, scene, vertex));
@@ -75,7 +75,7 @@ __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __
 template <class T>
 __global__ void store_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                                int64_t base, T* x, T* velocity) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local;
   const int64_t vertex = __ldg(s.plan.order + (i - local * s.positions));
@@ -87,12 +87,12 @@ __global__ void store_vertices(const __grid_constant__ StepInputs<T> in, const _
     store_user(velocity, own, (T(1) / in.parameters.time_step) * (end - load_user(in.x_prev, scene, vertex)));
 }
 
-// The pairs' copies of a material that differs from tet to tet.
+// Material of each pair, where it differs from tet to tet.
 template <class T>
 __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                               int64_t base, int64_t scenes) {
   const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice;
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= scenes * pairs) return;
   const int64_t local = i / pairs, scene = base + local;
   const int pair = max(0, __ldg(s.plan.pair + (i - local * pairs)));
@@ -104,11 +104,11 @@ __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __
   }
 }
 
-// What is left in the rows after the last reversed update: of lower colors for a vertex that has had its turn,
-// everything for what is pinned.
+// Adjoints left in the rows after the last reversed update: of lower colors for a vertex that moves, of all for a
+// pinned one.
 template <class T>
 __device__ __forceinline__ Vec3<T> rows_left(const StepView<T>& s, int64_t scene, int block, int v, bool pinned) {
-  Place<1> at(scene, block, 0);
+  LaneLayout<1> at(scene, block, 0);
   at.v = v;
   if (pinned) return pull_rows<true>(s, at, span_of(s.plan.block_incoming, block));
   int color = 0;
@@ -120,7 +120,7 @@ __device__ __forceinline__ Vec3<T> rows_left(const StepView<T>& s, int64_t scene
 template <class T>
 __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
                                int64_t base, const __grid_constant__ StepAdjoints<T> out) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
   const int64_t vertex = __ldg(s.plan.order + position);
@@ -139,13 +139,13 @@ __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const _
   } else {
     const T h = in.parameters.time_step;
     const Vec3<T> all = start + y, none = zero3<T>();
-    const bool follows = pinned && in.prescribed.data != nullptr;
-    Vec3<T> x = follows ? none : all;
+    const bool prescribed = pinned && in.prescribed.data != nullptr;
+    Vec3<T> x = prescribed ? none : all;
     if (out.v_bar) x -= (T(1) / h) * Vec3<T>{out.v_bar[3 * own], out.v_bar[3 * own + 1], out.v_bar[3 * own + 2]};
     if (out.x) store_user(out.x, own, x);
     if (out.v) store_user(out.v, own, pinned ? none : h * all);
     if (out.acceleration) store_user(out.acceleration, own, pinned ? none : (h * h) * all);
-    if (out.prescribed) store_user(out.prescribed, own, follows ? all : none);
+    if (out.prescribed) store_user(out.prescribed, own, prescribed ? all : none);
   }
   for (int k = 0; out.data && k < kVertexEnergies; ++k) {
     if (is_per_vertex(k, VertexEnergies{})) {
@@ -157,11 +157,11 @@ __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const _
   }
 }
 
-// A tet's four pairs, added in the order of its corners.
+// Sums over a tet's four pairs, in the order of its corners.
 template <class T>
 __global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
                            const __grid_constant__ StepAdjoints<T> out, bool material) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = own_item();
   if (i >= s.scenes * s.plan.num_tets) return;
   const int64_t local = i / s.plan.num_tets, scene = base + local, tet = i - local * s.plan.num_tets;
   const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice, to = scene * s.plan.num_tets + tet;
@@ -185,7 +185,7 @@ __global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
   for (int k = 0; out.rest && k < kRestScalars; ++k) out.rest[to * kRestScalars + k] = rest[k];
 }
 
-// out[r] = sum over i of values[r stride + i step], i < count: one block for a row, in an order fixed by the count
+// out[r] = sum over i < count of values[r stride + i step], a block for each row, in an order fixed by the count.
 template <class T>
 __global__ void sum_rows(const T* values, int64_t stride, int64_t step, int64_t count, T* out, int64_t out_stride) {
   __shared__ T part[kFrameThreads];
@@ -193,10 +193,7 @@ __global__ void sum_rows(const T* values, int64_t stride, int64_t step, int64_t 
   T sum = T(0);
   for (int64_t i = threadIdx.x; i < count; i += kFrameThreads) sum += row[i * step];
   part[threadIdx.x] = sum;
-  for (int half = kFrameThreads / 2; half > 0; half /= 2) {
-    __syncthreads();
-    if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
-  }
+  reduce_block<kFrameThreads>(part, [](T& own, const T& other) { own += other; });
   if (threadIdx.x == 0) out[blockIdx.x * out_stride] = part[0];
 }
 

@@ -1,21 +1,55 @@
-// A group of threads of one warp shares a vertex: memory and sums, so that sweep/vertex.h runs unchanged.
+// Star of a vertex that a group of threads of one warp shares: memory and sums, so that sweep/vertex.h runs unchanged.
 #pragma once
 
+#include "../sweep/block.h"
 #include "../sweep/vertex.h"
-#include "pair_term.cuh"
 #include "records.cuh"
+#include "step.h"
 
 namespace diffvbd::cuda {
 
-// Rows of a vertex that a thread asks for at once; in the reverse, which has the registers, all of a usual mesh: a warp
-// waits a microsecond each time.
+constexpr int kRoles = 3, kCooperativeWarps = 1 + kRoles;
+
+// Barrier of the warps that share a vertex, from different places in the code.
+__device__ __forceinline__ void sync_cooperative() {
+  asm volatile("barrier.sync 1, %0;" ::"n"(kCooperativeWarps * kSlice) : "memory");
+}
+
+template <class T>
+struct PairTerm {
+  const T* at = nullptr;  // [count, kContactScalars]
+  int count = 0;
+  const T* bar = nullptr;  // [3]  in the reverse: adjoint that pairs scattered, or null
+  bool meets = false;      // the values are ready after the barrier
+  __device__ __forceinline__ void meet() {
+    if (meets) sync_cooperative();
+    meets = false;
+  }
+  __device__ __forceinline__ ContactTerm<T> sum() {
+    meet();
+    ContactTerm<T> out{zero3<T>(), diagonal(T(0))};
+    for (int i = 0; i < count; ++i) {
+      const T* a = at + i * kContactScalars;
+      out.g += Vec3<T>{a[0], a[1], a[2]};
+      out.H += Sym3<T>{a[3], a[4], a[5], a[6], a[7], a[8]};
+    }
+    return out;
+  }
+  __device__ __forceinline__ Vec3<T> scattered() {
+    meet();
+    return bar ? Vec3<T>{bar[0], bar[1], bar[2]} : zero3<T>();
+  }
+};
+
+// Rows that a thread loads at once; in the reverse, which has the registers, all of a common mesh: each wait costs a
+// microsecond.
 DIFFVBD_FN constexpr int rows_at_once(int lanes, bool reverse) {
   if (lanes >= kManyLanes) return 1;
   if (reverse && lanes > 1) return lanes == kFewLanes ? 9 : 5;
   return lanes == kSomeLanes ? 3 : 4;
 }
 
-// A warp's own memory for the stars of its vertices.
+// Shared memory of a warp for the stars of its vertices.
 template <class T, int lanes>
 __device__ __forceinline__ T* memory_of_warp(const StepView<T>& s, bool reverse) {
   extern __shared__ __align__(16) unsigned char memory[];
@@ -25,15 +59,15 @@ __device__ __forceinline__ T* memory_of_warp(const StepView<T>& s, bool reverse)
   return reinterpret_cast<T*>(memory) + warp * size;
 }
 
-// The incident tets of a group's vertex. The warp's own shared memory has, in this order: the stages of their records;
-// `near`, the neighbours' positions, [degree, 3, groups]; `sums`, what a reversed update adds to them, [degree, 3,
-// kSlice], each thread its own, or to each corner of each pair, [3 valence + 1, 3, groups].
+// Incident tets of a group's vertex. Shared memory of the warp, in this order: the stages of their records; `near`, the
+// neighbours' positions [degree, 3, groups]; `sums`, the adjoints of these: of each thread [degree, 3, kSlice], or of
+// each corner of each pair [3 valence + 1, 3, groups].
 template <class T, int lanes_, bool reverse = false>
 struct GroupStar : Records<T, lanes_, reverse> {
   using Base = Records<T, lanes_, reverse>;
   static constexpr int lanes = Base::lanes;
   static constexpr bool gather = gathers(lanes_);
-  using P = Place<lanes_>;
+  using P = LaneLayout<lanes_>;
   using Base::at;
   using Base::real;
   using Base::s;
@@ -49,7 +83,7 @@ struct GroupStar : Records<T, lanes_, reverse> {
     if (s.has_tets && degree > 0) ask_places(at.lane);
   }
 
-  // Where the neighbours that a thread fetches next stand in the rows: asked for long before they are needed.
+  // Rows of the neighbours that a thread loads next, requested early.
   static constexpr int kAtOnce = rows_at_once(lanes, reverse);
   int32_t places[kAtOnce];
   __device__ __forceinline__ void ask_places(int start) {
@@ -60,7 +94,7 @@ struct GroupStar : Records<T, lanes_, reverse> {
     }
   }
   __device__ __forceinline__ void fetch_neighbours(bool own) { fetch_neighbours<false>(own, {s.w.x, s.w.x}, 0); }
-  // Where colors move into other rows (`apart`), those of positions below `first` have.
+  // With `apart`, colors move into other rows: positions below `first` have moved.
   template <bool apart>
   __device__ __forceinline__ void fetch_neighbours(bool own, const MovingRows<T>& rows, int64_t first) {
     const T *x = rows.x + at.scene * s.positions * kRow, *moved = rows.moved + at.scene * s.positions * kRow;
@@ -86,19 +120,19 @@ struct GroupStar : Records<T, lanes_, reverse> {
     __syncwarp();
   }
   __device__ __forceinline__ int first_pinned() const { return __ldg(s.plan.color_block + s.plan.colors) * kSlice; }
-  unsigned leads_to_pinned = 0;  // a bit for each of the first 32 edges of a thread
+  unsigned leads_to_pinned = 0;  // bit set of the first 32 edges of a thread
   __device__ __forceinline__ void clear_sums(T* shared) {
     shared += Base::shared_scalars();
     if constexpr (gather) {
       sums = shared + s.degree * 3 * P::groups + at.group;
-      if (at.lane < 3) sums[(9 * Base::count() + at.lane) * P::groups] = T(0);  // what padding adds
+      if (at.lane < 3) sums[(9 * Base::count() + at.lane) * P::groups] = T(0);  // for padding
     } else {
       sums = shared + s.degree * 3 * P::groups + threadIdx.x % kSlice;
       for (int a = 0; a < 3 * degree; ++a) sums[a * kSlice] = T(0);
     }
   }
 
-  mutable int where;  // of the pair at work
+  mutable int where;  // of the current pair
   __device__ __forceinline__ Vec3<T> neighbour(int a) const {
     const T* from = near + a * 3 * P::groups;
     return {from[0], from[P::groups], from[2 * P::groups]};
@@ -116,7 +150,7 @@ struct GroupStar : Records<T, lanes_, reverse> {
 #pragma unroll
     for (int i = 0; i < kTetScalars; ++i) out.material[i] = now.material[i];
     if constexpr (reverse) {
-      if (s.w.material_bar && !s.one_material && !Base::repeats) {  // long before it is added to
+      if (s.w.material_bar && !s.one_material && !Base::repeats) {  // loaded long before the addition
         const T* before = s.w.material_bar + pair_index(e) * kTetScalars;
 #pragma unroll
         for (int i = 0; i < kTetScalars; ++i) material_bar[i] = before[i];
@@ -129,10 +163,10 @@ struct GroupStar : Records<T, lanes_, reverse> {
     if constexpr (lanes > 1) P::template sum<T>(values...);
   }
 
-  // the threads of a warp visit stars together, so one that must go the longer way takes all along
+  // The threads of a warp visit stars together, so one ill-conditioned block takes all along.
   __device__ __forceinline__ bool any(bool condition) const { return __any_sync(kWholeWarp, condition); }
   __device__ __forceinline__ void rewind() const { Base::begin(); }
-  // the sums of a copy
+  // Takes the sums of a copy.
   __device__ __forceinline__ void adopt(const GroupStar& a) const {
 #pragma unroll
     for (int i = 0; i < kTetScalars; ++i) material_bar[i] = a.material_bar[i];
@@ -147,13 +181,13 @@ struct GroupStar : Records<T, lanes_, reverse> {
     to[P::groups] = v.y;
     to[2 * P::groups] = v.z;
   }
-  __device__ __forceinline__ void send(int neighbour, const Vec3<T>& v) const {
+  __device__ __forceinline__ void scatter(int neighbour, const Vec3<T>& v) const {
     T* to = sums + neighbour * 3 * kSlice;
     to[0] += v.x;
     to[kSlice] += v.y;
     to[2 * kSlice] += v.z;
   }
-  __device__ __forceinline__ const GroupStar& local() const { return *this; }  // it has sums
+  __device__ __forceinline__ const GroupStar& local() const { return *this; }  // it has the sums
   template <class Law, int wanted>
   __device__ __forceinline__ Vec3<T> reverse_tets(const Reversed<T>& update) const {
     return diffvbd::reverse_tets<Law, wanted>(*this, update);
@@ -167,9 +201,9 @@ struct GroupStar : Records<T, lanes_, reverse> {
       const int row = 3 * (e * lanes + at.lane);
       if (real(e)) put(row, a.xj), put(row + 1, a.xk), put(row + 2, a.xl);
     } else {
-      send(where & kMaxDegree, a.xj);
-      send(where >> kLocalBits & kMaxDegree, a.xk);
-      send(where >> 2 * kLocalBits, a.xl);
+      scatter(where & kMaxDegree, a.xj);
+      scatter(where >> kLocalBits & kMaxDegree, a.xk);
+      scatter(where >> 2 * kLocalBits, a.xl);
     }
   }
   __device__ __forceinline__ int64_t pair_index(int e) const {
@@ -191,17 +225,17 @@ struct GroupStar : Records<T, lanes_, reverse> {
 #pragma unroll
     for (int i = 0; i < kPairRest; ++i) to[i] += bar[i];
   }
-  mutable T material_bar[kTetScalars] = {};  // of a scene with one material; else that of the pair at work
+  mutable T material_bar[kTetScalars] = {};  // of a scene with one material; otherwise of the current pair
 
-  // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its
-  // own: rows that lead to it add up over the sweeps.
-  __device__ __forceinline__ void send_rows() const {
+  // Writes the rows of the vertex's edges: sums over its threads in their order. Pinned vertices have no turn; rows
+  // that lead to them accumulate over the sweeps.
+  __device__ __forceinline__ void scatter_rows() const {
     __syncwarp();
     T* rows = s.w.rows + at.scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
     if constexpr (gather) {
-      for (int a = at.lane; a - at.lane < degree; a += lanes) {  // the warp stays together: it has one vertex
+      for (int a = at.lane; a - at.lane < degree; a += lanes) {  // the warp of one vertex stays together
         const Vec3<T> sum = gathered(first_edge + min(a, degree - 1), a < degree);
-        if (a < degree) send_row(rows, a, sum);
+        if (a < degree) scatter_row(rows, a, sum);
       }
     } else {
       for (int a = at.lane; a < degree; a += lanes) {
@@ -212,23 +246,22 @@ struct GroupStar : Records<T, lanes_, reverse> {
           const T* p = from + l * P::groups;
           sum += Vec3<T>{p[0], p[kSlice], p[2 * kSlice]};
         }
-        send_row(rows, a, sum);
+        scatter_row(rows, a, sum);
       }
     }
   }
 
  private:
-  __device__ __forceinline__ void send_row(T* rows, int a, Vec3<T> sum) const {
+  __device__ __forceinline__ void scatter_row(T* rows, int a, Vec3<T> sum) const {
     const int64_t edge = static_cast<int64_t>(first_edge + a) * kSlice + at.v;
     const bool adds =
         a / lanes < kSlice ? (leads_to_pinned >> a / lanes & 1) != 0 : __ldg(s.plan.adjacent + edge) >= first_pinned();
     if (adds) sum += load_row(rows, edge);
     store_row(rows, edge, sum);
   }
-  // The sum of what the threads have put for an edge, in the order of its entries. All threads of the warp must call
-  // it.
+  // Sum of the contributions to an edge, in the order of its entries. All threads of the warp must call it.
   __device__ __forceinline__ Vec3<T> gathered(int edge, bool there) const {
-    constexpr int kAhead = 4;  // entries that are asked for at once
+    constexpr int kAhead = 4;  // entries loaded at once
     const int begin = __ldg(s.plan.edge_entry + edge), end = __ldg(s.plan.edge_entry + edge + 1);
     const int most = __reduce_max_sync(kWholeWarp, there ? end - begin : 0);
     Vec3<T> sum = zero3<T>();
@@ -248,16 +281,16 @@ struct GroupStar : Records<T, lanes_, reverse> {
   }
 };
 
-// What the neighbours' updates have added to a vertex since its last turn (as in cpu/scene.h); of all rows, or of those
-// below a bound.
+// Adjoints that the neighbours' updates added to a vertex since its last turn (as in cpu/scene.h): of all rows, or of
+// those below a bound.
 template <bool all, class T, int lanes_>
-__device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<lanes_>& at, const Span& incoming,
+__device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const LaneLayout<lanes_>& at, const Span& incoming,
                                              int below = 0) {
   constexpr int lanes = threads_of(lanes_), batch = rows_at_once(lanes, true);
-  const int none = s.plan.edge_slots * kSlice;  // the row that stays zero
+  const int none = s.plan.edge_slots * kSlice;  // row that stays zero
   const T* rows = s.w.rows + at.scene * (static_cast<int64_t>(none) + 1) * kRow;
   Vec3<T> sum = zero3<T>();
-  // A warp that has one vertex stays together in the loop: the sum below would wait for the last thread to leave it.
+  // A warp of one vertex stays together in the loop; otherwise the sum below would wait for its last thread.
   const int own = lanes == kSlice ? 0 : at.lane, after = at.lane - own;
   for (int start = incoming.begin + own; start < incoming.end; start += batch * lanes) {
     int row[batch];
@@ -274,15 +307,16 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
     for (int u = 0; u < batch; ++u) sum += part[u];
   }
   if constexpr (lanes > 1) {
-    __syncwarp();  // threads of several vertices leave the loop one by one, and shuffles of some of a warp take longer
-    Place<lanes_>::template sum<T>(sum);
+    __syncwarp();  // threads of several vertices leave the loop one by one, and partial shuffles are slower
+    LaneLayout<lanes_>::template sum<T>(sum);
   }
   return sum;
 }
 
-// x: rows in which the vertices of the color are.
+// x: rows of the color.
 template <class Set, class T, int lanes>
-__device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place<lanes>& at, bool own, const T* x) {
+__device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const LaneLayout<lanes>& at, bool own,
+                                               const T* x) {
   Block<T> out;
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   const int64_t vectors = at.scene * s.positions * 3;

@@ -1,6 +1,5 @@
-#include <type_traits>
-
-#include "intersect.h"
+#include "common.cuh"
+#include "contact.h"
 #include "tree.cuh"
 
 namespace diffvbd::cuda {
@@ -8,32 +7,26 @@ namespace {
 
 using namespace contact;
 
-constexpr size_t kAlignment = 256;
-
-// Views of the workspace; without memory, its size.
+// Parts of the workspace; without memory, its size.
 struct Workspace {
   Forest forest{};
   unsigned long long (*first)[2];          // [B] smallest key of a crossing, and of a point behind a plane
   unsigned long long* listed;              // number of crossings of all scenes
   unsigned long long *keys, *sorted_keys;  // [capacity]
-  void* sort;
+  unsigned char* sort;
   size_t sort_bytes = 0, bytes = 0;
 
   template <class T>
   Workspace(const Surfaces<T>& in, int64_t capacity, void* memory) {
-    auto* at = static_cast<unsigned char*>(memory);
-    const auto take = [&](auto*& pointer, int64_t items) {
-      pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at + bytes);
-      bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
-    };
+    Parts<> take(memory);
     forest.lay_out(in, take);
     take(first, in.scenes), take(listed, 1), take(keys, capacity), take(sorted_keys, capacity);
     size_t of_keys = 0;
     cub::DeviceRadixSort::SortKeys(nullptr, of_keys, keys, sorted_keys, capacity);
     sort_bytes = forest.sort_bytes();
     sort_bytes = sort_bytes > of_keys ? sort_bytes : of_keys;
-    sort = at + bytes;
-    bytes += sort_bytes;
+    take(sort, sort_bytes);
+    bytes = take.bytes;
   }
 };
 
@@ -41,7 +34,7 @@ __device__ __forceinline__ unsigned long long* count_of(const Intersections& out
   return reinterpret_cast<unsigned long long*>(out.counts + 2 * scene + kind);
 }
 
-// unused: the key of rows that no crossing fills, above those of all crossings
+// unused: key of empty rows, above those of all crossings.
 static __global__ void start_intersections(Workspace work, Intersections out, int64_t scenes, uint64_t unused) {
   const int64_t i = own_item();
   if (i < out.capacity) work.keys[i] = unused;
@@ -107,11 +100,11 @@ cudaError_t find_intersections(const Surfaces<T>& in, const Intersections& out, 
   const Workspace work(in, out.capacity, memory);
   const uint64_t unused = crossing_keys(in, in.scenes);
   const int64_t most = in.scenes > out.capacity ? in.scenes : out.capacity;
-  start_intersections<<<blocks_for(most + 1), kThreads, 0, stream>>>(work, out, in.scenes, unused);
+  start_intersections<<<blocks_for(most + 1, kThreads), kThreads, 0, stream>>>(work, out, in.scenes, unused);
   if (auto error = build_forest(in, work.forest, work.sort, work.sort_bytes, stream)) return error;
   const int64_t queries = in.scenes * (int64_t{in.num_edges} + in.num_points);
   if (queries > 0) {
-    intersections_kernel<<<blocks_for(queries), kThreads, 0, stream>>>(in, work, out);
+    intersections_kernel<<<blocks_for(queries, kThreads), kThreads, 0, stream>>>(in, work, out);
   }
   if (out.capacity > 0) {
     size_t bytes = work.sort_bytes;
@@ -119,15 +112,11 @@ cudaError_t find_intersections(const Surfaces<T>& in, const Intersections& out, 
                                                     bits_of(unused), stream))
       return error;
   }
-  store_intersections<<<blocks_for(most + 1), kThreads, 0, stream>>>(in, work, out, unused);
+  store_intersections<<<blocks_for(most + 1, kThreads), kThreads, 0, stream>>>(in, work, out, unused);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                   \
-  template size_t intersections_workspace_bytes<T>(const Surfaces<T>&, int64_t); \
-  template cudaError_t find_intersections<T>(const Surfaces<T>&, const Intersections&, void*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(intersections_workspace_bytes)
+DIFFVBD_INSTANTIATE(find_intersections)
 
 }  // namespace diffvbd::cuda

@@ -1,17 +1,15 @@
 #include <algorithm>
 
+#include "common.cuh"
 #include "islands.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
-constexpr int32_t kCompared = 32;              // bodies that one thread compares with one
+constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; otherwise kThreads
+constexpr int32_t kCompared = 32;              // bodies that a thread compares with one
 
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
 int threads_for(int64_t items, int64_t segments) { return items > kLongSegment * segments ? kThreads : kWarp; }
-
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
 
 template <class T>
 __global__ void start_kernel(const IslandInputs<T> in, IslandWork<T> work) {
@@ -62,7 +60,7 @@ __global__ void bodies_sync_kernel(const IslandInputs<T> in, IslandWork<T> work)
   if (threadIdx.x == 0) work.bodies[blockIdx.x] = sum;
 }
 
-// A block for each island, those of other bodies have nothing to do.
+// A block for each island; blocks of other bodies do nothing.
 template <class T>
 __global__ void islands_sync_kernel(const IslandInputs<T> in, IslandWork<T> work) {
   __shared__ BodySum<T> part[kThreads];
@@ -83,7 +81,7 @@ __global__ void sweep_kernel(const IslandInputs<T> in, IslandWork<T> work) {
   if (i < in.scenes * in.mesh_bodies) sweep_body(in, work, i, work.label[i]);
 }
 
-// A thread for each body and each tile of others: joins their islands, or says in the end that they would have to be.
+// A thread for each body and tile of other bodies: joins islands that overlap; the last round only reports them.
 template <class T>
 __global__ void join_kernel(const IslandInputs<T> in, IslandWork<T> work, bool joins) {
   const int32_t n = in.mesh_bodies;
@@ -119,7 +117,7 @@ __global__ void finish_kernel(const IslandInputs<T> in, IslandWork<T> work, int3
   island[i] = work.islands[first + work.label[i]].blocked ? -1 : work.label[i];
 }
 
-// All of it for a scene of few bodies: a block.
+// All islands of a scene of few bodies, by a block.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_sync_kernel(const __grid_constant__ IslandInputs<T> in, const __grid_constant__ IslandWork<T> work,
@@ -141,36 +139,33 @@ cudaError_t find_islands(const IslandInputs<T>& in, int32_t* island, void* memor
   if (n == 0) return cudaSuccess;
   const auto blocks = static_cast<unsigned>(n);
   if (!again) {
-    start_kernel<<<blocks_for(std::max(points, in.scenes)), kThreads, 0, stream>>>(in, work);
-    if (points > 0) colliders_kernel<<<blocks_for(points), kThreads, 0, stream>>>(in, work);
-    if (in.num_planes > 0) planes_kernel<<<blocks_for(in.scenes * in.num_planes), kThreads, 0, stream>>>(in, work);
+    start_kernel<<<blocks_for(std::max(points, in.scenes), kThreads), kThreads, 0, stream>>>(in, work);
+    if (points > 0) colliders_kernel<<<blocks_for(points, kThreads), kThreads, 0, stream>>>(in, work);
+    if (in.num_planes > 0)
+      planes_kernel<<<blocks_for(in.scenes * in.num_planes, kThreads), kThreads, 0, stream>>>(in, work);
     bodies_sync_kernel<<<blocks, threads_for(in.vertices, in.mesh_bodies), 0, stream>>>(in, work);
   }
   if (in.mesh_bodies <= kFewBodies) {
     scene_sync_kernel<<<static_cast<unsigned>(in.scenes), kThreads, 0, stream>>>(in, work, island);
     return cudaGetLastError();
   }
-  apart_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+  apart_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
   const int64_t comparisons = n * ((in.mesh_bodies + kCompared - 1) / kCompared);
-  // One round more than the joins: it finds out whether they have settled, and if not makes one island of the scene.
+  // One round more than the joins: it detects that they have not settled, and then makes the scene one island.
   for (int round = 0; round <= kJoins; ++round) {
     islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
-    sweep_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
-    join_kernel<<<blocks_for(comparisons), kThreads, 0, stream>>>(in, work, round < kJoins);
-    label_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+    sweep_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
+    join_kernel<<<blocks_for(comparisons, kThreads), kThreads, 0, stream>>>(in, work, round < kJoins);
+    label_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
   }
   islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
-  sweep_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+  sweep_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work);
   islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
-  finish_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work, island);
+  finish_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, work, island);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                        \
-  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&); \
-  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t, bool);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(islands_workspace_bytes)
+DIFFVBD_INSTANTIATE(find_islands)
 
 }  // namespace diffvbd::cuda

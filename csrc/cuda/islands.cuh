@@ -1,55 +1,48 @@
-// Islands of the bodies of a scene: what its kernels share, and all of it by one block.
+// Islands of the bodies of a scene: parts of the kernels, and all of it by one block.
 #pragma once
 
-#include <type_traits>
-
-#include "block_sum.cuh"
+#include "atomics.cuh"
 #include "bodies.cuh"
-#include "islands.h"
-#include "ordered.cuh"
-#include "union.cuh"
+#include "contact.h"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
 using namespace contact;
 
-constexpr int32_t kFewBodies = 512;  // of a scene, up to which a block finds all its islands
-constexpr size_t kAlignment = 256;
+constexpr int32_t kFewBodies = 512;  // bodies of a scene up to which one block finds all islands
 
-// Views of the workspace; without memory, its size.
+// Parts of the workspace; without memory, its size.
 template <class T>
 struct IslandWork {
   BodySum<T>*bodies, *islands;  // [B, bodies]; of islands, at their smallest body
   Bounds<T>* boxes;             // [B, bodies] swept
   int32_t* label;               // [B, bodies] toward the smallest body of the island
-  bool* stays;                  // [B, bodies] bodies that must, as the rooms are
+  bool* stays;                  // [B, bodies] bodies that must stay, with the current radii
   int32_t* unsettled;           // [B]
   Ordered<T> (*colliders)[6];   // [B, Vc] boxes of collider objects, as ordered bits
-  int32_t* objects;             // [B] how many of those there are
+  int32_t* objects;             // [B] number of collider objects
   size_t bytes = 0;
 
   IslandWork(const IslandInputs<T>& in, void* memory) {
-    auto* at = static_cast<unsigned char*>(memory);
-    const auto take = [&](auto*& pointer, int64_t items) {
-      pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at + bytes);
-      bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
-    };
+    Parts<> take(memory);
     const int64_t n = in.scenes * in.mesh_bodies;
     take(bodies, n), take(islands, n), take(boxes, n), take(label, n), take(stays, n);
     take(unsettled, in.scenes);
     take(colliders, in.scenes * in.colliders()), take(objects, in.scenes);
+    bytes = take.bytes;
   }
 };
 
-// Of the i-th box of a scene's collider objects: none yet.
+// Makes the i-th box of a scene's collider objects empty.
 template <class T>
 __device__ void bound_nothing(const IslandWork<T>& work, int64_t i) {
   const T far = std::numeric_limits<T>::infinity();
   for (int k = 0; k < 6; ++k) work.colliders[i][k] = ordered(k < 3 ? far : -far);
 }
 
-// The j-th point of a scene's colliders in the box of its object.
+// Adds the j-th point of a scene's colliders to the box of its object.
 template <class T>
 __device__ void bound_collider(const IslandInputs<T>& in, const IslandWork<T>& work, int64_t scene, int32_t j) {
   const int32_t object = in.body[in.vertices + j] - in.mesh_bodies;
@@ -60,7 +53,7 @@ __device__ void bound_collider(const IslandInputs<T>& in, const IslandWork<T>& w
   raise(bits + 3, ordered(box.hi.x)), raise(bits + 4, ordered(box.hi.y)), raise(bits + 5, ordered(box.hi.z));
 }
 
-// The points of a plane span it; they bound nothing.
+// Planes have no box: their points only span them.
 template <class T>
 __device__ void unbound_plane(const IslandInputs<T>& in, const IslandWork<T>& work, int64_t scene, int32_t plane) {
   const int32_t object = in.body[in.planes[3 * plane]] - in.mesh_bodies;
@@ -74,7 +67,7 @@ __device__ BodySum<T> body_of(const IslandWork<T>& work, int64_t i) {
   return out;
 }
 
-// What a body sweeps, and whether it must stay from now on.
+// Swept box of a body, and whether the body must stay from now on.
 template <class T>
 __device__ void sweep_body(const IslandInputs<T>& in, const IslandWork<T>& work, int64_t i, int32_t label) {
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
@@ -91,10 +84,10 @@ __device__ void sweep_body(const IslandInputs<T>& in, const IslandWork<T>& work,
   if (blocked) work.stays[i] = true;
 }
 
-// A scene of few bodies, by the threads of a block.
+// Islands of a scene of few bodies, by the threads of a block.
 template <class T>
 struct SceneIslands {
-  // of islands; then what bodies sweep
+  // sums of islands; later swept boxes
   static constexpr size_t kBytes = kThreads * sizeof(BodySum<T>), kBoxes = kFewBodies * sizeof(Bounds<T>);
   struct Memory {
     int32_t label[kFewBodies];
@@ -113,7 +106,7 @@ struct SceneIslands {
     for (auto i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) f(i);
     __syncthreads();
   }
-  // The sum of what the lanes of a warp have, at its first.
+  // Sum over the lanes of a warp; the first lane has it.
   __device__ BodySum<T> sum_of_warp(const BodySum<T>& own) const {
     const auto lane = static_cast<int32_t>(threadIdx.x % 32);
     BodySum<T>* const all = part() + threadIdx.x;
@@ -128,7 +121,7 @@ struct SceneIslands {
   __device__ BodySum<T> sum_of(const BlockTeam&, const BodySum<T>& own) const {
     return block_sum(own, part(), [](BodySum<T>& to, const BodySum<T>& of) { to.add(of); });
   }
-  // What of bodies and colliders does not depend on rooms: a warp for each body, or the block where they are large.
+  // Bounds of bodies and colliders, which do not depend on radii: a warp for each body, or the block for large ones.
   __device__ void bound() const {
     each(in.colliders(), [&](int32_t j) { bound_nothing(work, scene * in.colliders() + j); });
     if (threadIdx.x == 0) work.objects[scene] = 0;
@@ -159,7 +152,7 @@ struct SceneIslands {
     }
     __syncthreads();
   }
-  // Whether a body stays that did not before, as a thread sees it.
+  // Whether a body of this thread stays that did not before.
   __device__ bool sweep() const {
     bool changes = false;
     each(in.mesh_bodies, [&](int32_t i) {
@@ -174,7 +167,7 @@ struct SceneIslands {
     const int32_t n = in.mesh_bodies;
     int32_t* const label = memory.label;
     auto* const boxes = reinterpret_cast<Bounds<T>*>(memory.bytes);
-    bool unsettled = false;  // as a thread sees it
+    bool unsettled = false;  // of this thread
     each(n, [&](int32_t i) { label[i] = i, work.stays[first() + i] = false; });
     for (int round = 0; round <= kJoins; ++round) {
       sum();
@@ -191,7 +184,7 @@ struct SceneIslands {
           }
         }
       }
-      if (!__syncthreads_or(changes)) break;  // nor will the next round
+      if (!__syncthreads_or(changes)) break;  // the next round would change nothing
       const bool one = __syncthreads_or(unsettled);
       static_assert(kFewBodies % kThreads == 0);
       int32_t root[kFewBodies / kThreads];  // all are read before any is written

@@ -1,11 +1,12 @@
+#include "cluster.cuh"
+#include "common.cuh"
+#include "contact.h"
 #include "islands.cuh"
-#include "motion.h"
-#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int32_t kMostOfBlock = 16;  // bodies of a scene, up to which one block has them all
+constexpr int32_t kMostOfBlock = 16;  // bodies of a scene up to which one block takes all of them
 
 // A block for each body of each scene.
 template <class T, class Act>
@@ -37,7 +38,7 @@ struct Reverse {
   }
 };
 template <class T>
-struct Coast {
+struct Extrapolate {
   double chord;
   T* coasted;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
@@ -45,7 +46,7 @@ struct Coast {
   }
 };
 template <class T>
-struct ReverseCoast {
+struct ReverseExtrapolate {
   double chord;
   MotionAdjoints<T> a;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
@@ -53,13 +54,13 @@ struct ReverseCoast {
   }
 };
 template <class T>
-struct Wish {
+struct WantedRadius {
   RoomInputs<T> in;
   RoomWork<T> work;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const { wish_of_body(in, b, team, work); }
 };
 template <class T>
-struct BesideIsland {
+struct IslandRadius {
   RoomInputs<T> in;
   RoomWork<T> work;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
@@ -82,17 +83,16 @@ __global__ void __launch_bounds__(kThreads)
 // A thread for each body.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    among_others(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
-  const int64_t place = int64_t{blockIdx.x} * kThreads + threadIdx.x, bodies = in.motion.bodies;
+    others_kernel(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
+  const int64_t place = own_item(kThreads), bodies = in.motion.bodies;
   if (place >= in.motion.scenes * bodies) return;
   room_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
 }
 
-// All of it for a small scene: a block, and a warp for each of its bodies in turn. It ends once no room changes:
-// another round would change nothing.
+// All radii of a small scene, by a block with a warp for each of its bodies in turn. It ends once no radius changes.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    rooms_of_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work,
+    radii_of_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work,
                    const __grid_constant__ IslandWork<T> of_islands) {
   __shared__ double part[kWarps][kMostSums];
   const SceneIslands<T> islands{in.islands, of_islands, blockIdx.x, islands_memory<T>()};
@@ -111,7 +111,7 @@ __global__ void __launch_bounds__(kThreads)
   for_each_body([&](const MovingBody<T>& b, const auto& by) { wish_of_body(in, b, by, work); });
   islands.bound();
   bool changes = true;
-  for (int round = -1;; ++round) {  // -1: to the rooms that they have among others; then to those beside islands
+  for (int round = -1;; ++round) {  // -1: radii among other bodies; then next to islands
     if (changes) islands.find(work.island);
     if (round == kRoomRounds) break;
     changes = false;
@@ -123,7 +123,7 @@ __global__ void __launch_bounds__(kThreads)
       });
     } else {
       for_each_body([&](const MovingBody<T>& b, const auto& by) {
-        const T before = by.leads() ? room(b.body) : T(0);  // of which the leader is the only writer
+        const T before = by.leads() ? room(b.body) : T(0);  // only the leader writes it
         room_beside_island(in, b, by, work);
         if (by.leads()) changes = changes || !(room(b.body) == before);
       });
@@ -148,16 +148,16 @@ cudaError_t reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a
 
 template <class T>
 cudaError_t coast(const MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream) {
-  return for_bodies(in, Coast<T>{chord, coasted}, stream);
+  return for_bodies(in, Extrapolate<T>{chord, coasted}, stream);
 }
 
 template <class T>
 cudaError_t reverse_coast(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a, cudaStream_t stream) {
-  return for_bodies(in, ReverseCoast<T>{chord, a}, stream);
+  return for_bodies(in, ReverseExtrapolate<T>{chord, a}, stream);
 }
 
 template <class T>
-cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands, cudaStream_t stream) {
+cudaError_t find_trust_radii(RoomInputs<T> in, const RoomWork<T>& work, void* islands, cudaStream_t stream) {
   const auto scenes = static_cast<unsigned>(in.motion.scenes);
   const int64_t bodies = in.motion.scenes * in.motion.bodies;
   if (scenes == 0) return cudaSuccess;
@@ -165,17 +165,17 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   const int64_t of_scene = in.motion.bodies;
   if (0 < of_scene && of_scene <= kMostOfBlock && in.motion.vertices <= kSmallScene &&
       in.islands.colliders() <= kSmallScene) {
-    rooms_of_scene<T><<<scenes, kThreads, 0, stream>>>(in, work, IslandWork<T>(in.islands, islands));
+    radii_of_scene<T><<<scenes, kThreads, 0, stream>>>(in, work, IslandWork<T>(in.islands, islands));
     return cudaGetLastError();
   }
   each_scene<T, true><<<scenes, kThreads, 0, stream>>>(in, work);
   if (bodies > 0) {
-    if (const auto error = for_bodies(in.motion, Wish<T>{in, work}, stream)) return error;
+    if (const auto error = for_bodies(in.motion, WantedRadius<T>{in, work}, stream)) return error;
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
-    among_others<T><<<static_cast<unsigned>((bodies + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, work);
+    others_kernel<T><<<blocks_for(bodies, kThreads), kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     for (int round = 0; round < kRoomRounds; ++round) {
-      if (const auto error = for_bodies(in.motion, BesideIsland<T>{in, work}, stream)) return error;
+      if (const auto error = for_bodies(in.motion, IslandRadius<T>{in, work}, stream)) return error;
       if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     }
   }
@@ -183,14 +183,10 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                   \
-  template cudaError_t find_motion<T>(const MotionInputs<T>&, T*, T*, T*, cudaStream_t);                         \
-  template cudaError_t reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&, cudaStream_t);        \
-  template cudaError_t coast<T>(const MotionInputs<T>&, double, T*, cudaStream_t);                               \
-  template cudaError_t reverse_coast<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&, cudaStream_t); \
-  template cudaError_t find_rooms<T>(RoomInputs<T>, const RoomWork<T>&, void*, cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(find_motion)
+DIFFVBD_INSTANTIATE(reverse_motion)
+DIFFVBD_INSTANTIATE(coast)
+DIFFVBD_INSTANTIATE(reverse_coast)
+DIFFVBD_INSTANTIATE(find_trust_radii)
 
 }  // namespace diffvbd::cuda

@@ -1,38 +1,29 @@
 #include <cub/device/device_scan.cuh>
-#include <type_traits>
 
 #include "../core/hash_grid.h"
+#include "common.cuh"
 #include "neighbors.h"
 
 namespace diffvbd::cuda {
 namespace {
 
 constexpr int kThreads = 128;
-constexpr int kShortList = 24;  // neighbors of a point that are sorted in its thread's own memory
-constexpr size_t kAlignment = 256;
+constexpr int kShortList = 24;  // neighbors of a point that a thread sorts in its own memory
 
-unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
-
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
-
-// Views of the workspace; without memory, its size.
+// Parts of the workspace; without memory, its size.
 template <class T>
 struct Workspace {
   int32_t* start;  // of each bucket
-  int64_t* first;  // of the pairs of each row; until they are summed, their number
+  int64_t* first;  // of the pairs of each row; before the sum, their number
   int32_t* rank;   // of each row among those of its bucket
   uint32_t* bucket;
   GridPoint<T>* sorted;
   int32_t* infinite;  // whether a coordinate is not finite
-  void* scan;
+  unsigned char* scan;
   size_t scan_bytes = 0, bytes = 0;
 
   Workspace(const HashGrid& grid, int64_t rows, void* memory) {
-    auto* at = static_cast<unsigned char*>(memory);
-    const auto take = [&](auto*& pointer, int64_t items) {
-      pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at + bytes);
-      bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
-    };
+    Parts<> take(memory);
     take(start, int64_t{grid.buckets()} + 1);
     take(infinite, 1);
     take(first, rows + 1);
@@ -43,8 +34,8 @@ struct Workspace {
     cub::DeviceScan::ExclusiveSum(nullptr, of_buckets, start, start, int64_t{grid.buckets()} + 1);
     cub::DeviceScan::ExclusiveSum(nullptr, of_rows, first, first, rows + 1);
     scan_bytes = of_buckets > of_rows ? of_buckets : of_rows;
-    scan = at + bytes;
-    bytes += scan_bytes;
+    take(scan, scan_bytes);
+    bytes = take.bytes;
   }
 };
 
@@ -56,7 +47,7 @@ __global__ void count_buckets(const T* points, int32_t n, int64_t rows, HashGrid
   if (!isfinite(p[0]) || !isfinite(p[1]) || !isfinite(p[2])) *work.infinite = 1;
   const uint32_t bucket = grid.bucket(p, static_cast<uint32_t>(row / n));
   work.bucket[row] = bucket;
-  // In no fixed order; the list of each point is sorted in the end.
+  // In any order; the list of each point is sorted in the end.
   work.rank[row] = atomicAdd(&work.start[bucket], 1);
 }
 
@@ -68,7 +59,7 @@ __global__ void sort_points(const T* points, int64_t rows, Workspace<T> work) {
   work.sorted[work.start[work.bucket[row]] + work.rank[row]] = {p[0], p[1], p[2], static_cast<int32_t>(row)};
 }
 
-// visit(row) for each later neighbor of a point in its scene.
+// Calls visit(row) for each later neighbor of a point in its scene.
 template <class T, class F>
 __device__ __forceinline__ void each_later_neighbor(const GridPoint<T>& p, int32_t n, T squared, const HashGrid& grid,
                                                     const Workspace<T>& work, const F& visit) {
@@ -81,7 +72,7 @@ __device__ __forceinline__ void each_later_neighbor(const GridPoint<T>& p, int32
   });
 }
 
-// One thread for a point, in sorted order: neighboring threads read the same memory.
+// A thread for each point in sorted order: neighboring threads read the same memory.
 template <class T>
 __global__ void count_pairs(int32_t n, int64_t rows, T squared, HashGrid grid, Workspace<T> work) {
   const int64_t at = own_item();
@@ -156,7 +147,7 @@ template <class T>
 cudaError_t neighbor_pairs(const T* points, int64_t scenes, int64_t n, double radius, int32_t* pairs, int64_t max_pairs,
                            int64_t* count, void* workspace, cudaStream_t stream) {
   const int64_t rows = scenes * n;
-  const auto of_scene = static_cast<int32_t>(n);  // as rows fit, and 32-bit division is the faster
+  const auto of_scene = static_cast<int32_t>(n);  // rows fit, and 32-bit division is faster
   const HashGrid grid(radius, rows);
   Workspace<T> work(grid, rows, workspace);
   const T squared = static_cast<T>(radius) * static_cast<T>(radius);
@@ -168,26 +159,22 @@ cudaError_t neighbor_pairs(const T* points, int64_t scenes, int64_t n, double ra
   if (auto error = cudaMemsetAsync(work.start, 0, starts * sizeof(int32_t), stream)) return error;
   if (auto error = cudaMemsetAsync(work.infinite, 0, sizeof(int32_t), stream)) return error;
   if (auto error = cudaMemsetAsync(work.first + rows, 0, sizeof(int64_t), stream)) return error;
-  count_buckets<<<blocks_for(rows), kThreads, 0, stream>>>(points, of_scene, rows, grid, work);
+  count_buckets<<<blocks_for(rows, kThreads), kThreads, 0, stream>>>(points, of_scene, rows, grid, work);
   size_t bytes = work.scan_bytes;
   if (auto error = cub::DeviceScan::ExclusiveSum(work.scan, bytes, work.start, work.start, starts, stream))
     return error;
-  sort_points<<<blocks_for(rows), kThreads, 0, stream>>>(points, rows, work);
-  count_pairs<<<blocks_for(rows), kThreads, 0, stream>>>(of_scene, rows, squared, grid, work);
+  sort_points<<<blocks_for(rows, kThreads), kThreads, 0, stream>>>(points, rows, work);
+  count_pairs<<<blocks_for(rows, kThreads), kThreads, 0, stream>>>(of_scene, rows, squared, grid, work);
   bytes = work.scan_bytes;
   if (auto error = cub::DeviceScan::ExclusiveSum(work.scan, bytes, work.first, work.first, rows + 1, stream))
     return error;
   report_count<<<1, 1, 0, stream>>>(work.first + rows, work.infinite, count);
-  write_pairs<<<blocks_for(rows), kThreads, 0, stream>>>(of_scene, rows, squared, grid, work, count, max_pairs, pairs);
+  write_pairs<<<blocks_for(rows, kThreads), kThreads, 0, stream>>>(of_scene, rows, squared, grid, work, count,
+                                                                   max_pairs, pairs);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                   \
-  template size_t neighbor_workspace_bytes<T>(int64_t);                                                          \
-  template cudaError_t neighbor_pairs<T>(const T*, int64_t, int64_t, double, int32_t*, int64_t, int64_t*, void*, \
-                                         cudaStream_t);
-DIFFVBD_INSTANTIATE(float)
-DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
+DIFFVBD_INSTANTIATE(neighbor_workspace_bytes)
+DIFFVBD_INSTANTIATE(neighbor_pairs)
 
 }  // namespace diffvbd::cuda

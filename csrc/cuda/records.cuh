@@ -1,30 +1,29 @@
-// What the mesh says of the pairs of a vertex, asked for before it is needed: it comes from far away, and a warp that
-// waits for each would wait most of the time.
+// Records of the pairs of a vertex, prefetched: a warp that waited for each would wait most of the time.
 #pragma once
 
-#include "place.cuh"
+#include "lane_layout.cuh"
 
 namespace diffvbd::cuda {
 
-// Of one (vertex, tet) pair.
+// Record of a (vertex, tet) pair.
 template <class T>
 struct PairRecord {
-  int where;  // which of the vertex's neighbours the other corners are
+  int where;  // indices of the other corners among the vertex's neighbours
   T rest[kRestRow], material[kTetScalars];
 };
 
-// The records of a vertex, each thread its own: lane, lane + lanes, ... One is under way while another is worked on, in
-// registers; in the reverse with few threads one or three, in the warp's own shared memory, where they take none.
+// Records of a vertex: each thread has lane, lane + lanes, ... One record is prefetched in registers; in the reverse
+// with few threads, one or three in the warp's shared memory, which saves registers.
 template <class T, int lanes_, bool reverse>
 class Records {
  public:
   static constexpr int lanes = threads_of(lanes_);
   static constexpr bool staged = has_stages(lanes_, reverse);
-  using P = Place<lanes_>;
+  using P = LaneLayout<lanes_>;
 
   const StepView<T>& s;
   const P& at;
-  bool repeats = false;  // whether the star is visited once more
+  bool repeats = false;  // whether the star is visited again
 
   // slots: of the vertex's block; stages: shared memory of the warp
   __device__ __forceinline__ Records(const StepView<T>& s, const P& at, const Span& slots, T* stages)
@@ -38,19 +37,18 @@ class Records {
     begin();
   }
 
-  // what the stages take
+  // Scalars of the stages.
   __device__ __forceinline__ int shared_scalars() const { return staged ? s.stages * stage_scalars<T>() : 0; }
   __device__ __forceinline__ int count() const { return count_; }
   __device__ __forceinline__ int size() const { return (count_ + lanes - 1) / lanes; }
   __device__ __forceinline__ bool real(int e) const { return e * lanes + at.lane < count_; }
-  // a thread without a pair left takes the slot of padding
+  // A thread without a pair takes the slot of padding.
   __device__ __forceinline__ int64_t slot(int e) const {
     const int own = e * lanes + at.lane;
     return static_cast<int64_t>(own < count_ ? first_ + own : s.plan.slots - 1) * kSlice;
   }
 
-  // Those of a visit, from the first. A copy of this has the same stages: it must make whole visits with the same
-  // `repeats`, which leave in them what was there.
+  // Starts a visit. A copy has the same stages: it must make whole visits with the same `repeats`, which restore them.
   __device__ __forceinline__ void begin() const {
     if (!s.has_tets) return;
     if constexpr (staged) {
@@ -123,7 +121,7 @@ class Records {
     for (int i = 0; i < kTetScalars; ++i) next_.material[i] = __ldg(m + i);
   }
 
-  // A stage: the rest row in packs, the material, and where; of all threads side by side.
+  // Stage: rest row in packs, material, and where, of all threads.
   __device__ __forceinline__ T* stage(int number) const {
     return stages_ + (number & (s.stages - 1)) * stage_scalars<T>();
   }
@@ -182,7 +180,7 @@ class Records {
   T* stages_;
   int first_, count_;
   mutable int asked_ = 0, taken_ = 0;  // stages
-  mutable PairRecord<T> next_;         // one pair ahead; of a scene with one material, that
+  mutable PairRecord<T> next_;         // the next pair; its material in a scene with one material
 };
 
 }  // namespace diffvbd::cuda

@@ -1,4 +1,4 @@
-// The transposed sweeps, one instantiation for each set of energies, wish and number of threads per vertex.
+// Transposed sweeps: an instance for each set of energies, wanted adjoints and number of threads per vertex.
 #pragma once
 
 #include <utility>
@@ -9,32 +9,32 @@
 namespace diffvbd::cuda {
 namespace {
 
-// Two warps of each scheduler fit, about as many as their stars leave shared memory for, and usual blocks do not spill:
-// local memory costs more than a third warp brings. In float32, without floors or contact, four fit.
+// Two warps of each scheduler fit, about as many as shared memory allows, and well-conditioned blocks do not spill:
+// spills cost more than a third warp gains. In float32 without floors or contact four fit.
 template <class T, class Set>
 constexpr int reverse_registers() {
   return sizeof(T) == sizeof(float) && !Set::keeps_positions ? 128 : 240;
 }
-constexpr int kAmongRegisters = 255;  // where a block has a vertex: of its warps there are never many
+constexpr int kCooperativeRegisters = 255;  // a block for each vertex: such warps are few
 
-// What the threads of a warp do at one turn, counted from the last sweep.
+// Vertices of a warp at one turn, counted from the last sweep.
 struct Turn {
   int64_t scene;
   int number, block, part;
 };
 
-// Reverses the updates of a warp's vertices; false, and nothing is done, where a usual set finds a block that it does
-// not suit.
+// Reverses the updates of a warp's vertices. Returns false and does nothing where a well-conditioned set meets a block
+// that it does not suit.
 template <class Set, int wanted, class T, int lanes>
 __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T>& pairs) {
-  const Place<lanes> at(turn.scene, turn.block, turn.part);
+  const LaneLayout<lanes> at(turn.scene, turn.block, turn.part);
   const int64_t scene = at.scene, position = static_cast<int64_t>(at.block) * kSlice + at.v,
                 row = scene * s.positions + position;
-  // What the tape and the accumulators hold is asked for first: it comes from farthest away.
+  // Tape and accumulators are requested first: they have the longest latency.
   const Span ranks = span_of(s.plan.block_rank, at.block), incoming = span_of(s.plan.block_incoming, at.block);
   const StarSpans spans = spans_of(s.plan, at.block);
   const int rank = ranks.begin + at.v, end_rank = ranks.end;
-  if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
+  if (rank - at.group >= end_rank) return true;  // a warp of phantoms
   const bool real = rank < end_rank, full = s.tape_policy == kFullTape;
   const T* from =
       s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn.number)) * s.tape_rows * s.plan.num_active + (real ? rank : 0);
@@ -46,7 +46,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   Recalled<T> r = recall<Set, T>(full, get);
   const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, at.block, at.v);
   const bool writes = at.lane == 0 && real;
-  T material_bar[kTetScalars];  // of all updates until now
+  T material_bar[kTetScalars];  // of all updates so far
   if constexpr ((wanted & kMaterial) != 0) {
     if (s.one_material && writes) {
 #pragma unroll
@@ -75,7 +75,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     }
   }
   if (s.has_tets) star.clear_sums(shared);
-  if constexpr (Set::contact) end_bar += pairs.sent();
+  if constexpr (Set::contact) end_bar += pairs.scattered();
   Vec3<T> x_bar = end_bar;
   if constexpr (Set::contact) x_bar = contact::limit_of<T>(exponent) * end_bar;
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
@@ -98,9 +98,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
         }
       }
     }
-    star.send_rows();
+    star.scatter_rows();
   }
-  if constexpr (Set::contact) out.x += end_bar - x_bar;  // what a limit holds back stays where it was
+  if constexpr (Set::contact) out.x += end_bar - x_bar;  // the truncated part stays at the start
   if (writes) {
     store_row(s.w.x, row, b.state.x);
     store_row(s.w.x_bar, row, out.x);
@@ -111,7 +111,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       store3(to, at.block, at.v, load_own3(to, at.block, at.v) + out.x_prev);
     }
     if constexpr (Set::contact) {
-      T* turned = s.w.turn + 6 * row;
+      T* turned = s.w.reversed + 6 * row;
       turned[0] = out.p.x, turned[1] = out.p.y, turned[2] = out.p.z;
       turned[3] = u.d_raw.x, turned[4] = u.d_raw.y, turned[5] = u.d_raw.z;
     }
@@ -119,48 +119,48 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   return true;
 }
 
-// Out of line, so that what few vertices need takes no registers from the others.
+// Out of line, so that the few vertices that need it cost the others no registers.
 template <class Set, int wanted, class T, int lanes>
-__device__ __noinline__ void reverse_rare_update(const StepView<T>& s, T* shared, Turn turn, PairTerm<T> pairs) {
+__device__ __noinline__ void reverse_ill_conditioned(const StepView<T>& s, T* shared, Turn turn, PairTerm<T> pairs) {
   reverse_update<Set, wanted, T, lanes>(s, shared, turn, pairs);
 }
 
 template <class Set, int wanted, class T, int lanes>
 __device__ __forceinline__ void reverse_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
   if (!reverse_update<Usual<Set>, wanted, T, lanes>(s, shared, turn, pairs)) {
-    reverse_rare_update<Set, wanted, T, lanes>(s, shared, turn, pairs);
+    reverse_ill_conditioned<Set, wanted, T, lanes>(s, shared, turn, pairs);
   }
 }
 
-// Of a set with contact, a block for a vertex: the first warp reverses its update, the others take what pairs have sent
-// to it and, where no tape has the block, work out their part of that.
+// With contact, a block for a vertex: the first warp reverses its update, the others gather what pairs scattered to it
+// and, where no tape has the block, its pair terms.
 template <class Set, int wanted, class T>
-__device__ __forceinline__ void reverse_update_among(const StepView<T>& s, const ContactView<T>& c, T* shared,
-                                                     const Turn& turn, int begin, int end) {
-  const Place<kManyLanes> at(turn.scene, turn.block, turn.part);
+__device__ __forceinline__ void reverse_update_cooperative(const StepView<T>& s, const ContactView<T>& c, T* shared,
+                                                           const Turn& turn, int begin, int end) {
+  const LaneLayout<kManyLanes> at(turn.scene, turn.block, turn.part);
   const int vertex = __ldg(s.plan.order + static_cast<int64_t>(at.block) * kSlice + at.v);
   const int role = static_cast<int>(threadIdx.x / kSlice) - 1;
   if (vertex < 0) return;
-  Among<T>& told = among_memory<T>();
+  Messages<T>& message = message_memory<T>();
   const bool full = s.tape_policy == kFullTape;
   if (role >= 0) {
     const TapeRows<T> rows = tape_rows_of(s, at.scene, s.sweeps - 1 - turn.number, begin, end);
     PairsOf<T, kManyLanes, TapeRows<T>> pairs(s, c.in, at, rows, role);
-    if (role == kLagged) take_sent(c, pairs, told.bar);
-    if (!full) pairs.gather(told.term[role]);
-    meet_among();  // both are there
+    if (role == kLagged) take_scattered(c, pairs, message.bar);
+    if (!full) pairs.gather(message.term[role]);
+    sync_cooperative();  // both are ready
   } else {
-    reverse_any<Set, wanted, T, kManyLanes>(s, shared, turn, {told.term[0], full ? 0 : kRoles, told.bar, true});
+    reverse_any<Set, wanted, T, kManyLanes>(s, shared, turn, {message.term[0], full ? 0 : kRoles, message.bar, true});
   }
-  meet_among();  // and have been read
+  sync_cooperative();  // and have been read
 }
 
-// Out of line: it is the same for all sets.
+// Out of line: the same for all sets.
 template <class T>
-__device__ __noinline__ void send_among(const StepView<T>& s, const ContactView<T>& c, int64_t scene, int block,
-                                        int part, int begin, int end) {
+__device__ __noinline__ void scatter_cooperative(const StepView<T>& s, const ContactView<T>& c, int64_t scene,
+                                                 int block, int part, int begin, int end) {
   const int role = static_cast<int>(threadIdx.x / kSlice) - 1;
-  if (role >= 0) send_pairs(s, c, Place<kManyLanes>(scene, block, part), role, begin, end);
+  if (role >= 0) scatter_pairs(s, c, LaneLayout<kManyLanes>(scene, block, part), role, begin, end);
 }
 
 template <class T, int mask, int wanted, int lanes>
@@ -170,7 +170,7 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
   T* const shared = memory_of_warp<T, lanes>(s, true);
   wait_for_previous();
   each_color<T, lanes>(s, range, true, [&](int64_t scene, int number, int block, int part, int, int) {
-    const Place<lanes> at(scene, block, part);
+    const LaneLayout<lanes> at(scene, block, part);
     const int64_t row = scene * s.positions + static_cast<int64_t>(block) * kSlice + at.v;
     PairTerm<T> pairs;
     if (Set::contact) pairs.at = s.w.contact + row * kContactScalars, pairs.count = s.tape_policy != kFullTape;
@@ -178,28 +178,28 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
     __syncwarp();
   });
 }
-// Of a set with contact, a block for each vertex, in one launch for all sweeps; or for each color, but for what it
-// sends to its pairs.
+// With contact, a block for each vertex, in one launch for all sweeps; or for each color, without the scatter to its
+// pairs.
 template <class T, int mask, int wanted>
-__global__ void __maxnreg__(kAmongRegisters)
-    reverse_among(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
-                  const __grid_constant__ ContactView<T> c) {
+__global__ void __maxnreg__(kCooperativeRegisters)
+    reverse_cooperative(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
+                        const __grid_constant__ ContactView<T> c) {
   T* const shared = memory_of_warp<T, kManyLanes>(s, true);  // of the first warp
   wait_for_previous();
   const auto visit = [&](int64_t scene, int number, int block, int part, int begin, int end) {
-    reverse_update_among<EnergySet<mask>, wanted>(s, c, shared, Turn{scene, number, block, part}, begin, end);
+    reverse_update_cooperative<EnergySet<mask>, wanted>(s, c, shared, Turn{scene, number, block, part}, begin, end);
   };
-  const auto send = [&](int64_t scene, int, int block, int part, int begin, int end) {
-    send_among(s, c, scene, block, part, begin, end);
+  const auto scatter = [&](int64_t scene, int, int block, int part, int begin, int end) {
+    scatter_cooperative(s, c, scene, block, part, begin, end);
   };
-  // Without pairs and friction on planes nobody has anything to send.
+  // Without pairs and friction on planes there is nothing to scatter.
   const auto any_of = [&](const contact::PairList& list) {
     const int64_t first = s.base * c.in.corners, end = (s.base + s.scenes) * c.in.corners;
     return __ldg(list.ptr + first) < __ldg(list.ptr + end);
   };
-  const bool sends =
+  const bool scatters =
       range.regime == kGrid && (c.in.planes > 0 || any_of(c.in.listed) || (c.in.lag && any_of(c.in.lagged)));
-  each_color_by_blocks(s, range, true, visit, send, sends);
+  each_color_by_blocks(s, range, true, visit, scatter, scatters);
 }
 
 template <class T, int mask, int wanted, int lanes>
@@ -207,7 +207,7 @@ SweepKernel reverse_variant() {
   if constexpr (!is_built(mask, lanes)) {
     return nullptr;
   } else if constexpr (EnergySet<mask>::contact && lanes == kManyLanes) {
-    return reinterpret_cast<SweepKernel>(&reverse_among<T, mask, wanted>);
+    return reinterpret_cast<SweepKernel>(&reverse_cooperative<T, mask, wanted>);
   } else {
     return reinterpret_cast<SweepKernel>(&sweep_reverse<T, mask, wanted, lanes>);
   }
@@ -227,7 +227,3 @@ SweepKernel reverse_kernel(int energies) {
 }
 
 }  // namespace diffvbd::cuda
-
-// Few threads a vertex and many are compiled apart: these are the files that take longest.
-#define DIFFVBD_INSTANTIATE_REVERSE(T, wanted, lanes) \
-  template diffvbd::cuda::SweepKernel diffvbd::cuda::reverse_kernel<T, (wanted), diffvbd::cuda::lanes>(int);

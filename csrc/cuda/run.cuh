@@ -1,17 +1,96 @@
-// Host side of a step: what is launched. Included once for each scalar.
+// Host side of a step: workspace and launches.
 #pragma once
 
 #include <algorithm>
 
 #include "coarse.h"
-#include "contact.h"
-#include "follow.cuh"
 #include "frame.cuh"
-#include "scene_kernels.h"
-#include "workspace.cuh"
+#include "schedule.cuh"
+#include "step.h"
 
 namespace diffvbd::cuda {
 namespace {
+
+constexpr size_t kBarrierBytes = 256;
+// Hands out the arrays of a workspace; without memory it counts their scalars.
+template <class T>
+struct Carver {
+  T* base;
+  int64_t used = 0;
+  T* operator()(bool wanted, int64_t scalars) {
+    if (!wanted) return nullptr;
+    T* here = base + used;
+    used += (scalars + 3) / 4 * 4;  // rows stay aligned
+    return here;
+  }
+};
+
+// scenes: worked on at once.
+template <class T>
+CoarseWork<T> carve_coarse(const coarse::Inputs<T>& in, int64_t positions, int64_t scenes, bool reverse,
+                           Carver<T>& take) {
+  const coarse::Plan& p = in.plan;
+  const auto bytes = [](int64_t count, size_t size) { return static_cast<int64_t>(count * size / sizeof(T) + 1); };
+  CoarseWork<T> w{};
+  w.gradient = take(true, scenes * kRow * positions);
+  w.displacement = take(true, scenes * kRow * positions);
+  w.restricted = take(true, scenes * 3 * p.functions);
+  w.solved = take(reverse, scenes * in.corrections * 3 * p.functions);
+  w.wanted = take(reverse && in.pressed, scenes * kRow * positions);
+  w.inverse = take(in.pressed, scenes * 9 * p.cells);
+  const auto doubles = [&](int64_t count) {
+    return reinterpret_cast<double*>(take(in.pressed, bytes(scenes * count, sizeof(double))));
+  };
+  w.vertex_blocks = doubles(6 * positions);
+  w.matrix = {nullptr, doubles(int64_t{9} * p.cells), doubles(int64_t{6} * p.functions * kEdge),
+              doubles(int64_t{kEdge} * kEdge * p.bodies)};
+  w.sums = reinterpret_cast<double*>(take(!reverse, bytes(scenes * p.parts * coarse::kDegree, sizeof(double))));
+  w.failures = reinterpret_cast<int32_t*>(take(!reverse, bytes(scenes * p.bodies, sizeof(int32_t))));
+  return w;
+}
+
+// Arrays that start from zero come first; `zeroed` receives their scalars.
+template <class T>
+Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
+                   Carver<T>& take, int64_t* zeroed, T** spill, CoarseWork<T>& coarse) {
+  const GroupPlan& plan = host.plan;
+  const int64_t n = choice.chunk, positions = int64_t{plan.blocks} * kSlice, pairs = int64_t{plan.slots} * kSlice;
+  const bool elastic = (in.energies & kElastic) != 0, reverse = adjoints != nullptr;
+  const bool lagged = any_x_prev(in.energies, VertexEnergies{});
+  const bool one = one_for_items(in.material);
+  int scalars = 0;
+  for (int k = 0; k < kVertexEnergies; ++k) scalars += in.data_count[k];
+  Workspace<T> w{};
+  w.rows = take(reverse, n * (int64_t{plan.edge_slots} * kSlice + 1) * kRow);
+  w.y_bar = take(reverse, n * 3 * positions);
+  w.x_prev_bar = take(reverse && lagged, n * 3 * positions);
+  w.mass_bar = take(reverse && adjoints->mass, n * positions);
+  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * kTetScalars * (one ? positions : pairs));
+  w.rest_bar = take(elastic && (choice.wanted & kRest), n * kPairRest * pairs);
+  w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
+  *zeroed = take.used;
+  w.x = take(true, n * kRow * positions);
+  w.x_bar = take(reverse, n * kRow * positions);
+  w.y = take(true, n * 3 * positions);
+  w.x_prev = take(lagged, n * 3 * positions);
+  w.origin = take(in.origin.data != nullptr, n * 3 * positions);
+  w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
+  w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kTetScalars * pairs);
+  const bool cooperative =
+      possible_lanes<T>(host, choice, choice.lanes, reverse) == kManyLanes;  // blocks keep pair terms to themselves
+  w.contact = take(in.contact && !cooperative, n * kContactScalars * positions);
+  w.moved = take(!reverse && in.contact, n * kRow * positions);
+  w.reversed = take(reverse && in.contact, n * 6 * positions);
+  w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
+  *spill = nullptr;
+  if (possible_lanes<T>(host, choice, choice.lanes, reverse) == kSpillLanes) {
+    const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
+    *spill = take(true, warps * shared_scalars<T>(host.degree, host.valence, 0, kSpillLanes, reverse));
+  }
+  coarse = {};
+  if (in.coarse) coarse = carve_coarse(*in.coarse, positions, n, reverse, take);
+  return w;
+}
 
 template <class T>
 struct Runner {
@@ -65,7 +144,7 @@ struct Runner {
     }
   }
 
-  // the scenes [base, base + count) of the batch
+  // Selects the scenes [base, base + count) of the batch.
   void choose(int64_t base, int64_t count, T* tape) {
     const auto at = [&](const Batched<const T>& t) {
       return Batched<const T>{t.data + base * t.scene, t.scene, t.item};
@@ -82,7 +161,7 @@ struct Runner {
   cudaError_t per_item(void (*kernel)(P...), int64_t items, A... arguments) {
     if (items == 0) return cudaSuccess;
     void* pointers[] = {&arguments...};
-    const unsigned blocks = static_cast<unsigned>((items + kFrameThreads - 1) / kFrameThreads);
+    const unsigned blocks = blocks_for(items, kFrameThreads);
     return cudaLaunchKernel(reinterpret_cast<const void*>(kernel), dim3(blocks), dim3(kFrameThreads), pointers, 0,
                             stream);
   }
@@ -108,8 +187,9 @@ struct Runner {
     if (colors == 0) return cudaSuccess;
     int64_t most = 1;
     for (int c = 0; c < colors; ++c) most = std::max(most, blocks_of(c) * threads_of(lanes));
-    const bool among = in.contact && lanes == kManyLanes;  // a block for each vertex, of whose warps one has a star
-    const int regime = in.contact && !among ? kColor : choice.regime;
+    const bool cooperative =
+        in.contact && lanes == kManyLanes;  // a block for each vertex, whose first warp has its star
+    const int regime = in.contact && !cooperative ? kColor : choice.regime;
     const bool own = regime == kBlock, spills = lanes == kSpillLanes;
     const auto shared_of_warp = [&](int stages) -> size_t {
       return spills ? 0 : shared_scalars<T>(host.degree, host.valence, stages, lanes, backward) * sizeof(T);
@@ -118,18 +198,18 @@ struct Runner {
     int64_t warps = own && !spills ? std::min<int64_t>(kMaxThreads / kSlice, most) : kWarpsPerBlock;
     const size_t room = choice.shared - choice.by_pairs;
     if (const size_t one = shared_of_warp(s.stages)) warps = std::min<int64_t>(warps, room / one);
-    if (among) warps = 1;
+    if (cooperative) warps = 1;
     size_t shared = shared_of_warp(s.stages) * warps;
     const size_t with_many_stages = s.stages > 0 ? shared_of_warp(kManyStages) * warps : 0;
     if (std::max(shared, with_many_stages) + choice.by_pairs > 48 * 1024) {
       const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
-      // the same limit always: another thread may be about to launch the same kernel
+      // always the same limit: other threads may launch the same kernel
       if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(room))) return error;
     }
-    const dim3 threads(static_cast<unsigned>((among ? kAmongWarps : warps) * kSlice));
+    const dim3 threads(static_cast<unsigned>((cooperative ? kCooperativeWarps : warps) * kSlice));
     Range range{regime, 0, 0, 0, colors, barrier};
     void* arguments[] = {&s, &range, &contact};
-    // with spilled stars no more blocks than have memory of their own
+    // spilled stars: no more blocks than have memory
     const auto blocks_for = [&](int64_t parts) {
       const int64_t needed = own ? s.scenes : (parts * s.scenes + warps - 1) / warps;
       return spills ? std::min<int64_t>(needed, choice.multiprocessors) : needed;
@@ -139,7 +219,7 @@ struct Runner {
       const int size = static_cast<int>(threads.x);
       return cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, bytes);
     };
-    if (s.stages > 0 && s.one_material && with_many_stages <= room) {  // materials of tets want the L1 cache
+    if (s.stages > 0 && s.one_material && with_many_stages <= room) {  // materials of tets need the L1 cache
       const int64_t each = (blocks_for(most) + choice.multiprocessors - 1) / choice.multiprocessors;
       if (auto error = occupancy(shared)) return error;
       const int64_t with_few = std::min<int64_t>(resident, each);
@@ -148,16 +228,16 @@ struct Runner {
       const bool leaves_cache = with_many * with_many_stages <= choice.shared / 8 * 7;
       if (with_many == with_few && leaves_cache) s.stages = kManyStages, shared = with_many_stages;
     }
-    const bool may_follow = regime == kColor && can_follow(function);
-    const auto start = [&](int64_t blocks, bool follows = false) {
-      return launch(function, static_cast<unsigned>(blocks), threads, arguments, shared, stream, follows);
+    const bool may_depend = regime == kColor && can_depend(function);
+    const auto start = [&](int64_t blocks, bool dependent = false) {
+      return launch(function, static_cast<unsigned>(blocks), threads, arguments, shared, stream, dependent);
     };
-    const auto run = [&](int begin, int end) {  // counted from the last in the reverse
+    const auto run = [&](int begin, int end) {  // in the reverse counted from the last
       range.first_sweep = begin, range.end_sweep = end;
       range.first_color = 0, range.end_color = colors;
       if (begin == end) return cudaSuccess;
       if (own) return start(blocks_for(most));
-      if (regime == kColor) return color_by_color(range, backward, lanes, may_follow, blocks_for, start);
+      if (regime == kColor) return color_by_color(range, backward, lanes, may_depend, blocks_for, start);
       if (auto error = occupancy(shared)) return error;
       const int64_t blocks = std::min<int64_t>(int64_t{resident} * choice.multiprocessors, blocks_for(most));
       const auto error = cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments,
@@ -168,7 +248,7 @@ struct Runner {
     return in.coarse ? corrected(run, backward) : run(0, in.sweeps);
   }
 
-  // Runs the sweeps with the corrections between them.
+  // Sweeps with the corrections between them.
   template <class Run>
   cudaError_t corrected(const Run& run, bool backward) {
     const coarse::Inputs<T>& c = *in.coarse;
@@ -186,13 +266,13 @@ struct Runner {
     return backward ? corrections.matrix_bars() : cudaSuccess;
   }
 
-  // All but the first launch follow the one before.
+  // Every launch but the first depends on the one before.
   template <class Blocks, class Start>
-  cudaError_t color_by_color(Range& range, bool backward, int lanes, bool may_follow, const Blocks& blocks_for,
+  cudaError_t color_by_color(Range& range, bool backward, int lanes, bool may_depend, const Blocks& blocks_for,
                              const Start& start) {
-    bool follows = false;
+    bool dependent = false;
     cudaError_t error = cudaSuccess;
-    const bool apart = in.contact && lanes != kManyLanes;  // passes of their own before and after the updates
+    const bool apart = in.contact && lanes != kManyLanes;  // with passes before and after the updates
     const bool full = backward && in.tape_policy == kFullTape;
     const int colors = host.plan.colors, first = range.first_sweep, last = range.end_sweep;
     for (int k = first; k < last; ++k) {
@@ -205,14 +285,14 @@ struct Runner {
         const auto pass = [&](bool wanted, const auto& launched) {
           if (!wanted || error != cudaSuccess) return;
           error = launched();
-          follows = may_follow;
+          dependent = may_depend;
         };
         const int sweep = backward ? in.sweeps - 1 - k : -1;
-        pass(apart && backward, [&] { return passes().prepare(begin, end, follows); });
-        pass(apart && !full, [&] { return passes().assemble(sweep, begin, end, follows); });
-        pass(true, [&] { return start(blocks_for(blocks_of(color) * threads_of(lanes)), follows); });
-        pass(apart && !backward, [&] { return passes().limit(k, begin, end, follows); });
-        pass(in.contact && backward, [&] { return passes().reverse(!apart, begin, end, follows); });
+        pass(apart && backward, [&] { return passes().prepare(begin, end, dependent); });
+        pass(apart && !full, [&] { return passes().assemble(sweep, begin, end, dependent); });
+        pass(true, [&] { return start(blocks_for(blocks_of(color) * threads_of(lanes)), dependent); });
+        pass(apart && !backward, [&] { return passes().limit(k, begin, end, dependent); });
+        pass(in.contact && backward, [&] { return passes().reverse(!apart, begin, end, dependent); });
         if (error != cudaSuccess) return error;
       }
       if (in.contact && !backward) std::swap(s.w.x, s.w.moved);
@@ -295,7 +375,7 @@ cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const Ste
   if (choice.regime == kThread)
     return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
-  run.contact.cut = out.cut;
+  run.contact.truncations = out.truncations;
   const int lanes = possible_lanes<T>(host, choice, choice.lanes, false);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), out.tape);
@@ -328,11 +408,3 @@ cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* 
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_RUN(T)                                                                                 \
-  template size_t diffvbd::cuda::workspace_bytes<T>(const HostPlan&, const StepInputs<T>&, const StepAdjoints<T>*, \
-                                                    const Choice&);                                                \
-  template cudaError_t diffvbd::cuda::run_forward<T>(const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&, \
-                                                     const Choice&, void*, cudaStream_t);                          \
-  template cudaError_t diffvbd::cuda::run_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*,    \
-                                                     const StepAdjoints<T>&, const Choice&, void*, cudaStream_t);

@@ -1,41 +1,41 @@
-// A scene per thread: the scenes of a batch share their mesh, so that the threads of a warp visit the same vertex of 32
-// scenes at once. Positions lie in shared memory, a column for each thread; what all share is read once for all.
+// A scene per thread: the scenes of a batch share their mesh, so the threads of a warp visit the same vertex of 32
+// scenes at once. Positions are in shared memory, a column for each thread; what scenes share is read once.
 #pragma once
 
 #include <algorithm>
 #include <utility>
 
 #include "group.cuh"
-#include "scene_kernels.h"
+#include "step.h"
 
 namespace diffvbd::cuda {
 namespace {
 
 constexpr int kMaxSceneThreads = 128;
-constexpr int kColumn = kSlice + 1;  // distance of a column's entries: one more than a warp, against bank conflicts
+constexpr int kColumn = kSlice + 1;  // stride of a column: one more than a warp, against bank conflicts
 
-// Two kernels do a step: one of usual sets for all scenes, and one for those that it has marked.
+// A step takes two kernels: one of well-conditioned sets for all scenes, and one for the scenes that it has marked.
 template <int mask>
-struct UsualVariant {
+struct WellConditionedVariant {
   using Set = Usual<EnergySet<mask>>;
 };
 template <int mask>
-struct RareVariant {
+struct IllConditionedVariant {
   using Set = EnergySet<mask>;
 };
 template <class Set>
 constexpr bool marks() {
   return Set::usual;
 }
-// A bit for each thread of the warp: whether it has its scene to do.
+// Bit set of the threads of the warp that have a scene to do.
 template <class Set>
-__device__ __forceinline__ unsigned scenes_to_do(const uint8_t* rare, int64_t scene, int64_t scenes) {
+__device__ __forceinline__ unsigned scenes_to_do(const uint8_t* ill_conditioned, int64_t scene, int64_t scenes) {
   bool mine = scene < scenes;
-  if constexpr (!Set::usual) mine = mine && rare[scene] != 0;
+  if constexpr (!Set::usual) mine = mine && ill_conditioned[scene] != 0;
   return __ballot_sync(kWholeWarp, mine);
 }
 
-// What the threads of a block share: the list of visits, and the rest scalars unless scenes have their own.
+// Shared by the threads of a block: the list of visits, and the rest scalars unless scenes have their own.
 template <class T>
 struct Visits {
   const int2* visit;  // vertex + (its pairs << kLocalBits), its first pair
@@ -43,7 +43,7 @@ struct Visits {
   const T* rest;      // [pairs, kRestRow]
   uint64_t active;    // mask of the vertices that sweeps move
 
-  // int32 of the visits, rounded so that the pairs' rows are aligned
+  // Integers of the visits, rounded so that the pairs' rows are aligned.
   DIFFVBD_FN static int visit_ints(const GroupPlan& plan) { return (2 * plan.num_active + 3) / 4 * 4; }
   DIFFVBD_FN static size_t bytes(const GroupPlan& plan) {
     return 4 * (static_cast<size_t>(visit_ints(plan)) + 16 * static_cast<size_t>(plan.num_tets)) +
@@ -68,7 +68,7 @@ struct Visits {
     active = 0;
     for (int r = 0; r < plan.num_active; ++r) active |= uint64_t{1} << (visit[r].x & kMaxDegree);
   }
-  // Pairs of inactive corners stand in no list: their entries are zero and are never read.
+  // Pairs of inactive corners are in no list: their entries are zero and never read.
   __device__ __forceinline__ static void load_rest(const T* packed, int pair, T* to) {
     constexpr int width = Pack<T>::size;
     const T* from = packed + (static_cast<int64_t>(pair / kSlice) * kRestRow * kSlice + pair % kSlice * width);
@@ -91,8 +91,8 @@ __device__ __forceinline__ void set_column3(T* column, int vertex, const Vec3<T>
   a[2 * kColumn] = v.z;
 }
 
-// For what a warp's scenes own of an array [scenes, 3 V], side by side in memory: load(element) for several elements at
-// once, then keep(element, place in a tile, value) for each.
+// Elements of a warp's scenes in an array [scenes, 3 V]: load(element) for several at once, then keep(element, index in
+// a tile, value) for each.
 template <class Load, class Keep>
 __device__ __forceinline__ void each_element(int64_t base, int64_t scenes, int size, Load&& load, Keep&& keep) {
   constexpr int batch = 8;
@@ -121,8 +121,8 @@ struct Pair {
   T first, second;
 };
 
-// The incident tets of one vertex in 32 scenes. `common`: all scenes share their rest shape, and all tets of a scene
-// their material. x_bar is null in the forward.
+// Incident tets of one vertex in 32 scenes. common: scenes share their rest shape, and tets of a scene their material.
+// x_bar is null in the forward.
 template <class T, bool common>
 struct SceneStar {
   const StepInputs<T>& in;
@@ -133,7 +133,7 @@ struct SceneStar {
   T* x_bar;
   int64_t scene;
   int vertex, first, count;
-  T material[kTetScalars];  // of all tets, where they share it
+  T material[kTetScalars];  // of all tets, if they share it
 
   __device__ __forceinline__ SceneStar(const StepInputs<T>& in, const StepAdjoints<T>* out, const GroupPlan& plan,
                                        const Visits<T>& list, const T* x, T* x_bar, int64_t scene)
@@ -160,7 +160,7 @@ struct SceneStar {
 #pragma unroll
     for (int m = 0; m < kTetScalars; ++m) material_bar[m] = a.material_bar[m];
   }
-  // A block may come without its y (scene_reverse.cuh), which the few uneven ones fetch.
+  // A block may lack its y (scene_reverse.cuh); the few ill-conditioned ones load it.
   __device__ __forceinline__ Vec3<T> predictor(const Block<T>& b) const {
     const auto load = [&](const Batched<const T>& t, int c) { return __ldg(t.data + scene * t.scene + c); };
     Vec3<T> y;
@@ -179,7 +179,7 @@ struct SceneStar {
     const T* a = x + offset;
     return {a[0], a[kColumn], a[2 * kColumn]};
   }
-  // which corner of its tet the vertex is, where what the law reads depends on it
+  // Corner of its tet that the vertex is, where the law depends on it.
   __device__ __forceinline__ int corner(int e) const {
     return kPrevScalars > 0 ? __ldg(plan.visit_pair + 4 * (first + e) + 3) : 0;
   }
@@ -211,13 +211,13 @@ struct SceneStar {
     for (int a = 0; a < kPairRest; ++a) p.rest[a] = rest[a];
     return p;
   }
-  __device__ __forceinline__ void send(int offset, const Vec3<T>& v) const {
+  __device__ __forceinline__ void scatter(int offset, const Vec3<T>& v) const {
     T* to = x_bar + offset;
     to[0] += v.x;
     to[kColumn] += v.y;
     to[2 * kColumn] += v.z;
   }
-  __device__ __forceinline__ const SceneStar& local() const { return *this; }  // it has sums
+  __device__ __forceinline__ const SceneStar& local() const { return *this; }  // it has the sums
   template <class Law, int wanted>
   __device__ __forceinline__ Vec3<T> reverse_tets(const Reversed<T>& update) const {
     return diffvbd::reverse_tets<Law, wanted>(*this, update);
@@ -228,9 +228,9 @@ struct SceneStar {
   }
   __device__ __forceinline__ void add(int e, const TetAdjoint<T>& a) const {
     const int4 row = list.pair[first + e];
-    send(row.x, a.xj);
-    send(row.y, a.xk);
-    send(row.z, a.xl);
+    scatter(row.x, a.xj);
+    scatter(row.y, a.xk);
+    scatter(row.z, a.xl);
   }
   __device__ __forceinline__ void add_material(int e, const T* bar) const {
 #pragma unroll
@@ -251,7 +251,7 @@ struct SceneStar {
   mutable T material_bar[kTetScalars] = {};
 };
 
-// y is null where nothing depends on it.
+// y: null where nothing depends on it.
 template <class Set, class T>
 __device__ __forceinline__ Block<T> load_scene_block(const StepInputs<T>& in, const GroupPlan& plan,
                                                      const int64_t* data_start, int64_t scene, int vertex, const T* x,
@@ -280,7 +280,7 @@ __device__ __forceinline__ Block<T> load_scene_block(const StepInputs<T>& in, co
   return b;
 }
 
-// Where the data of each energy starts among those of a scene.
+// Start of the data of each energy among those of a scene.
 template <class T>
 __device__ __forceinline__ void data_starts(const StepInputs<T>& in, const GroupPlan& plan, int64_t* start) {
   int64_t at = 0;
@@ -291,14 +291,14 @@ __device__ __forceinline__ void data_starts(const StepInputs<T>& in, const Group
   }
 }
 
-// A warp's tiles, one for each array of positions that it works on.
+// Tiles of a warp, one for each array of positions.
 template <class T>
 __device__ __forceinline__ T* tiles_of_warp(const GroupPlan& plan, unsigned char* memory, int tiles) {
   T* all = reinterpret_cast<T*>(memory + Visits<T>::bytes(plan));
   return all + threadIdx.x / kSlice * tiles * 3 * plan.num_vertices * kColumn;
 }
 
-// Fills the tiles of y and of where the sweeps start; either may be null.
+// Fills the tiles of y and of the start of the sweeps; either may be null.
 template <class T>
 __device__ __forceinline__ void load_start(const StepInputs<T>& in, const GroupPlan& plan, const Visits<T>& list,
                                            int64_t base, T* x, T* y) {
@@ -337,7 +337,7 @@ bool is_common(const StepInputs<T>& in) {
   return in.rest.scene == 0 && one_for_items(in.material);
 }
 
-// One launch: as many blocks as the device holds, each going on until all scenes are done.
+// One launch of as many blocks as the device holds, which loop over the scenes.
 template <class T, class K>
 cudaError_t launch_scenes(K kernel, void** arguments, const StepInputs<T>& in, const GroupPlan& plan, int tiles,
                           const Choice& choice, cudaStream_t stream) {
@@ -345,7 +345,7 @@ cudaError_t launch_scenes(K kernel, void** arguments, const StepInputs<T>& in, c
   const size_t common = Visits<T>::bytes(plan);
   const size_t of_warp = sizeof(T) * tiles * 3 * plan.num_vertices * kColumn;
   if (common + of_warp > choice.shared) return cudaErrorInvalidConfiguration;
-  // the block size that keeps most warps on a multiprocessor
+  // block size with most warps on a multiprocessor
   int threads = 0, resident = 0;
   size_t shared = 0;
   for (int warps = 1; warps <= kMaxSceneThreads / kSlice; ++warps) {

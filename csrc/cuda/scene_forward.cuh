@@ -1,4 +1,4 @@
-// The sweeps of a step, a scene per thread.
+// Sweeps of a step, a scene per thread.
 #pragma once
 
 #include "scene.cuh"
@@ -6,8 +6,8 @@
 namespace diffvbd::cuda {
 namespace {
 
-// Updates the r-th vertex in sweep k; false, and nothing is done, where a usual set finds a block that it does not
-// suit.
+// Updates the r-th vertex in sweep k. Returns false and does nothing where a well-conditioned set meets a block that it
+// does not suit.
 template <class Set, bool common, class T>
 __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs<T>& out, const GroupPlan& plan,
                                       SceneStar<T, common>& star, T* x, const T* y, int64_t scene, int k, int r) {
@@ -36,11 +36,11 @@ __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs
   return true;
 }
 
-// With a usual set: marks the scenes that it does not suit. With the others: does those again.
+// A well-conditioned set marks the scenes that it does not suit; the other sets repeat those.
 template <class T, class Set, bool common>
 __global__ void __launch_bounds__(kMaxSceneThreads, 4)
     scene_forward(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepOutputs<T> out,
-                  const __grid_constant__ GroupPlan plan, uint8_t* rare) {
+                  const __grid_constant__ GroupPlan plan, uint8_t* ill_conditioned) {
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
   const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice;
@@ -50,7 +50,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
   for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
        base += stride) {
     const int64_t scene = base + lane;
-    const unsigned mine = scenes_to_do<Set>(rare, scene, in.scenes);
+    const unsigned mine = scenes_to_do<Set>(ill_conditioned, scene, in.scenes);
     if (mine == 0) continue;
     load_start(in, plan, list, base, x_tile, y_tile);
     __syncwarp();
@@ -62,7 +62,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
           suits = visit<Set, common>(in, out, plan, star, x, y, scene, k, r);
         }
       }
-      if (marks<Set>()) rare[scene] = !suits;
+      if (marks<Set>()) ill_conditioned[scene] = !suits;
     }
     __syncwarp();
     const T rate = T(1) / in.parameters.time_step;
@@ -91,25 +91,21 @@ SceneForward<T> pick_scene_forward(int index, std::integer_sequence<int, n...>) 
 
 template <class T>
 cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
-                              const Choice& choice, uint8_t* rare, cudaStream_t stream) {
+                              const Choice& choice, uint8_t* ill_conditioned, cudaStream_t stream) {
   if (host.plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = free_index(in.energies);
   StepInputs<T> inputs = in;
   StepOutputs<T> outputs = out;
   GroupPlan plan = host.plan;
-  void* arguments[] = {&inputs, &outputs, &plan, &rare};
-  const auto usual = is_common(in) ? pick_scene_forward<T, true, UsualVariant>(index, sets)
-                                   : pick_scene_forward<T, false, UsualVariant>(index, sets);
+  void* arguments[] = {&inputs, &outputs, &plan, &ill_conditioned};
+  const auto usual = is_common(in) ? pick_scene_forward<T, true, WellConditionedVariant>(index, sets)
+                                   : pick_scene_forward<T, false, WellConditionedVariant>(index, sets);
   const auto error = launch_scenes(usual, arguments, in, plan, 2, choice, stream);
   if (error != cudaSuccess) return error;
-  const auto again = is_common(in) ? pick_scene_forward<T, true, RareVariant>(index, sets)
-                                   : pick_scene_forward<T, false, RareVariant>(index, sets);
+  const auto again = is_common(in) ? pick_scene_forward<T, true, IllConditionedVariant>(index, sets)
+                                   : pick_scene_forward<T, false, IllConditionedVariant>(index, sets);
   return launch_scenes(again, arguments, in, plan, 2, choice, stream);
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_SCENE_FORWARD(T)                \
-  template cudaError_t diffvbd::cuda::run_scene_forward<T>( \
-      const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&, const Choice&, uint8_t*, cudaStream_t);

@@ -1,4 +1,4 @@
-// The transposed sweeps of a step, a scene per thread.
+// Transposed sweeps of a step, a scene per thread.
 #pragma once
 
 #include "scene.cuh"
@@ -6,13 +6,13 @@
 namespace diffvbd::cuda {
 namespace {
 
-// The predictor matters to what a tape does not hold, and to the masses: only then has it a tile.
+// Whether the predictor needs a tile: only for values that the tape lacks, and for masses.
 template <class T>
 DIFFVBD_FN bool reads_y(const StepAdjoints<T>& out, int policy, bool filters) {
   return out.mass != nullptr || (filters && policy != kFullTape);
 }
 
-// Those of a thread's scene.
+// Columns of a thread's scene.
 template <class T>
 struct Columns {
   T* x;
@@ -20,7 +20,7 @@ struct Columns {
   T *x_bar, *y_bar;
 };
 
-// The reversed visits of a scene, counted down: the n-th is of rank (n - 1) % active in sweep (n - 1) / active.
+// Reversed visits of a scene, counted down: visit n has rank (n - 1) % active in sweep (n - 1) / active.
 template <class Set, int wanted, bool common, class T>
 struct ReverseVisits {
   const StepInputs<T>& in;
@@ -53,13 +53,13 @@ struct ReverseVisits {
     return recall<Set, T>(in.tape_policy == kFullTape, get);
   }
 
-  // Returns how many are left: a usual set stops before a block that it does not suit.
+  // Returns how many are left: a well-conditioned set stops before a block that it does not suit.
   __device__ __forceinline__ int run(int left) {
     if (left > 0) {
       int64_t start[kVertexEnergies];
       data_starts(in, plan, start);
       int k = (left - 1) / plan.num_active, r = (left - 1) % plan.num_active;
-      // what a visit reads of the tape is on its way during the visit before it
+      // the tape of a visit is prefetched during the visit before it
       Recalled<T> next = read(k, r);
       for (; left > 0; --left) {
         const int rank = r;
@@ -110,7 +110,7 @@ struct ReverseVisits {
   }
 };
 
-// What a first attempt may have added to the adjoints of a scene.
+// Clears what a first attempt may have added to the adjoints of a scene.
 template <class T>
 __device__ void clear_scene(const StepInputs<T>& in, const StepAdjoints<T>& out, const GroupPlan& plan, int64_t scene) {
   const auto clear = [&](T* p, int64_t count) {
@@ -123,18 +123,19 @@ __device__ void clear_scene(const StepInputs<T>& in, const StepAdjoints<T>& out,
   clear(out.data, in.data_size);
 }
 
-// Blocks of a multiprocessor that registers are shared out to. In float64 three would spill: a million cubes took a
-// twelfth longer.
+// Blocks of a multiprocessor that share its registers. In float64 three would spill: a million cubes took a twelfth
+// longer.
 template <class T>
 constexpr int scene_reverse_blocks() {
   return sizeof(T) == sizeof(double) ? 2 : 3;
 }
 
-// With a usual set: marks the scenes that it does not suit. With the others: does those again.
+// A well-conditioned set marks the scenes that it does not suit; the other sets repeat those.
 template <class T, class Set, int wanted, bool common>
 __global__ void __launch_bounds__(kMaxSceneThreads, scene_reverse_blocks<T>())
     scene_reverse(const __grid_constant__ StepInputs<T> in, const T* ends, const T* tape,
-                  const __grid_constant__ StepAdjoints<T> out, const __grid_constant__ GroupPlan plan, uint8_t* rare) {
+                  const __grid_constant__ StepAdjoints<T> out, const __grid_constant__ GroupPlan plan,
+                  uint8_t* ill_conditioned) {
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
   const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice;
@@ -149,7 +150,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, scene_reverse_blocks<T>())
   for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
        base += stride) {
     const int64_t scene = base + lane;
-    const unsigned mine = scenes_to_do<Set>(rare, scene, in.scenes);
+    const unsigned mine = scenes_to_do<Set>(ill_conditioned, scene, in.scenes);
     if (mine == 0) continue;
     if (needs_y) load_start(in, plan, list, base, static_cast<T*>(nullptr), y_tile);
     each_element(
@@ -170,7 +171,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, scene_reverse_blocks<T>())
       const Columns<T> columns{x, y, x_bar, y_bar};
       ReverseVisits<Set, wanted, common, T> visits(in, tape, out, plan, list, columns, scene);
       const int left = visits.run(in.sweeps * plan.num_active);
-      if (marks<Set>()) rare[scene] = left > 0;
+      if (marks<Set>()) ill_conditioned[scene] = left > 0;
     }
     __syncwarp();
     each_element(
@@ -183,12 +184,12 @@ __global__ void __launch_bounds__(kMaxSceneThreads, scene_reverse_blocks<T>())
             out.y[to] = moved_y;
             return;
           }
-          const bool pinned = !list.moves(from / kColumn / 3), follows = pinned && in.prescribed.data != nullptr;
+          const bool pinned = !list.moves(from / kColumn / 3), prescribed = pinned && in.prescribed.data != nullptr;
           const T all = begin + moved_y;
-          if (out.x) out.x[to] = (follows ? T(0) : all) - of_velocity;
+          if (out.x) out.x[to] = (prescribed ? T(0) : all) - of_velocity;
           if (out.v) out.v[to] = pinned ? T(0) : h * all;
           if (out.acceleration) out.acceleration[to] = pinned ? T(0) : h * h * all;
-          if (out.prescribed) out.prescribed[to] = follows ? all : T(0);
+          if (out.prescribed) out.prescribed[to] = prescribed ? all : T(0);
         });
     __syncwarp();
   }
@@ -207,7 +208,7 @@ template <class T, template <int> class Variant, bool common>
 SceneReverse<T> pick_scene_reverse(int energies, int wanted) {
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = free_index(energies);
-  // rest shapes that are differentiated are no common ones, or cost too much memory traffic for it to matter
+  // differentiated rest shapes are not common, or their memory traffic dominates
   if (wanted & kRest) return pick_scene_reverse<T, Variant, kMaterial | kRest, false>(index, sets);
   if (wanted & kMaterial) return pick_scene_reverse<T, Variant, kMaterial, common>(index, sets);
   return pick_scene_reverse<T, Variant, kState, common>(index, sets);
@@ -217,7 +218,8 @@ SceneReverse<T> pick_scene_reverse(int energies, int wanted) {
 
 template <class T>
 cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
-                              const StepAdjoints<T>& out, const Choice& choice, uint8_t* rare, cudaStream_t stream) {
+                              const StepAdjoints<T>& out, const Choice& choice, uint8_t* ill_conditioned,
+                              cudaStream_t stream) {
   const GroupPlan& plan = host.plan;
   if (plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
   const auto clear = [&](T* p, int64_t per_scene) {
@@ -235,19 +237,14 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
   StepInputs<T> inputs = in;
   StepAdjoints<T> adjoints = out;
   GroupPlan list = plan;
-  void* arguments[] = {&inputs, &ends, &tape, &adjoints, &list, &rare};
-  const auto usual = is_common(in) ? pick_scene_reverse<T, UsualVariant, true>(in.energies, choice.wanted)
-                                   : pick_scene_reverse<T, UsualVariant, false>(in.energies, choice.wanted);
+  void* arguments[] = {&inputs, &ends, &tape, &adjoints, &list, &ill_conditioned};
+  const auto usual = is_common(in) ? pick_scene_reverse<T, WellConditionedVariant, true>(in.energies, choice.wanted)
+                                   : pick_scene_reverse<T, WellConditionedVariant, false>(in.energies, choice.wanted);
   const auto error = launch_scenes(usual, arguments, in, plan, tiles, choice, stream);
   if (error != cudaSuccess) return error;
-  const auto again = is_common(in) ? pick_scene_reverse<T, RareVariant, true>(in.energies, choice.wanted)
-                                   : pick_scene_reverse<T, RareVariant, false>(in.energies, choice.wanted);
+  const auto again = is_common(in) ? pick_scene_reverse<T, IllConditionedVariant, true>(in.energies, choice.wanted)
+                                   : pick_scene_reverse<T, IllConditionedVariant, false>(in.energies, choice.wanted);
   return launch_scenes(again, arguments, in, plan, tiles, choice, stream);
 }
 
 }  // namespace diffvbd::cuda
-
-#define DIFFVBD_INSTANTIATE_SCENE_REVERSE(T)                                                                          \
-  template cudaError_t diffvbd::cuda::run_scene_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*, \
-                                                           const StepAdjoints<T>&, const Choice&, uint8_t*,           \
-                                                           cudaStream_t);

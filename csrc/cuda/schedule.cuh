@@ -1,17 +1,48 @@
-// Who visits which vertices when: the loops over sweeps and colors inside a launch, and the barriers between colors.
+// Schedule of the sweeps: launches that depend on one another, loops over sweeps and colors inside a launch, barriers.
 #pragma once
+
+#include <cuda_runtime.h>
 
 #include <cstddef>
 #include <type_traits>
 
-#include "follow.cuh"
 #include "group.cuh"
 
 namespace diffvbd::cuda {
 
-// All threads of a cooperative launch wait for each other; `turn` counts the meetings. The arrival releases what the
-// block wrote; no acquire follows, which would empty the L1 cache of the mesh's data too: what other blocks write is
-// read from the L2 cache alone (load_state).
+// Waits for the previous kernel. All threads must call it before they read what an earlier kernel may write and before
+// any of them ends. At most two kernels are then on the device, so the writes of earlier ones are visible.
+__device__ __forceinline__ void wait_for_previous() {
+#if __CUDA_ARCH__ >= 900
+  asm volatile("griddepcontrol.wait;" ::: "memory");
+  asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+#endif
+}
+
+// Whether a kernel that calls it may be a dependent launch: it waits where it was compiled for such a device, and so do
+// all kernels compiled with it. Older drivers cannot capture such launches.
+inline bool can_depend(const void* kernel) {
+  constexpr int kCaptured = 12030;  // CUDA 12.3
+  cudaFuncAttributes of{};
+  int driver = 0;
+  return cudaFuncGetAttributes(&of, kernel) == cudaSuccess && of.ptxVersion >= 90 &&
+         cudaDriverGetVersion(&driver) == cudaSuccess && driver >= kCaptured;
+}
+
+inline cudaError_t launch(const void* kernel, unsigned blocks, dim3 threads, void** arguments, size_t shared,
+                          cudaStream_t stream, bool dependent) {
+  cudaLaunchAttribute attribute{};
+  attribute.id = cudaLaunchAttributeProgrammaticStreamSerialization;
+  attribute.val.programmaticStreamSerializationAllowed = 1;
+  cudaLaunchConfig_t config{};
+  config.gridDim = dim3(blocks), config.blockDim = threads;
+  config.dynamicSmemBytes = shared, config.stream = stream;
+  config.attrs = &attribute, config.numAttrs = dependent ? 1 : 0;
+  return cudaLaunchKernelExC(&config, kernel, arguments);
+}
+
+// Barrier of a cooperative launch; `turn` counts arrivals. The arrival releases the block's writes. No acquire follows,
+// which would flush mesh data from the L1 cache: values of other blocks are read from the L2 cache only (load_state).
 __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) {
   __syncthreads();
   turn += gridDim.x;
@@ -25,7 +56,7 @@ __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) 
   __syncthreads();
 }
 
-// Calls visit(scene, sweep, block, part, begin, end) for the warps' share of each color, whose blocks are [begin, end),
+// Calls visit(scene, sweep, block, part, begin, end) for the warps' part of each color, whose blocks are [begin, end),
 // with barriers between colors.
 template <class T, int lanes_, class Visit>
 __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& range, bool backward, Visit&& visit) {
@@ -57,9 +88,8 @@ __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& ra
   }
 }
 
-// The same where a block has a vertex at a time: visit(scene, sweep, block, part, begin, end) of all of a color, and
-// then(...) of all, unless `twice` is false. All threads of a block call them together. Where launches have a color
-// each, then() has one to itself.
+// The same for a block per vertex: visit(...) of all of a color, then then(...) of all unless `twice` is false. All
+// threads of a block call them together. Launches of one color leave then() to a launch of its own.
 template <class T, class Visit, class Then>
 __device__ __forceinline__ void each_color_by_blocks(const StepView<T>& s, const Range& range, bool backward,
                                                      const Visit& visit, const Then& then, bool twice = true) {

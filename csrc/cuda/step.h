@@ -1,5 +1,4 @@
-// What passes between ops_cuda.cpp and the kernels: plain structs, launchers. No torch here, and no CUDA either but the
-// stream.
+// Interface between the bindings and the kernels of a step: plain structs and launchers, without torch.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -11,10 +10,10 @@
 
 namespace diffvbd::cuda {
 
-// Scalars of a pair's rest shape in memory: a whole number of the widest loads.
+// Scalars of a pair's rest shape in memory: a multiple of the widest load.
 constexpr int kRestRow = (kPairRest + 3) / 4 * 4;
 
-// How the sweeps of a step are spread over the device (docs/performance.md).
+// Distribution of a step's sweeps over the device (docs/performance.md).
 enum Regime {
   kThread = 1,  // a scene per thread, a step per launch
   kBlock = 2,   // a scene per thread block, a step per launch
@@ -22,7 +21,7 @@ enum Regime {
   kColor = 4,   // all scenes, a launch per color
 };
 
-// A step in the user's numbering.
+// Inputs of a step in the user's numbering.
 template <class T>
 struct StepInputs {
   using Scalar = T;
@@ -38,7 +37,7 @@ struct StepInputs {
   StepParameters<T> parameters;
   int sweeps, tape_policy;
   // A fused step has these in place of x_start and y, which are then the predictor (pinned vertices: `prescribed`, or
-  // where x_prev has them), and returns velocities.
+  // x_prev), and returns velocities.
   bool fused;
   Batched<const T> v, acceleration,
       prescribed;                            // [B, V, 3]; acceleration also [B, 1, 3] (item 0); prescribed may be null
@@ -48,9 +47,9 @@ struct StepInputs {
 
 template <class T>
 struct StepOutputs {
-  T *x, *v;      // [B, V, 3]; v only of a fused step
-  T* tape;       // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
-  uint8_t* cut;  // [B, sweeps, V], zero: exponents of limits; with contact
+  T *x, *v;              // [B, V, 3]; v only of a fused step
+  T* tape;               // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
+  uint8_t* truncations;  // [B, sweeps, V], zero: exponents of limits; with contact
 };
 
 template <class T>
@@ -62,11 +61,11 @@ struct StepAdjoints {
   T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
   T *x, *v, *acceleration, *prescribed;        // of a fused step, null where not wanted
   const contact::ContactAdjoints<T>* contact;  // on the host; with contact, as are the next
-  const uint8_t* limits;                       // what the forward has left in `cut`
+  const uint8_t* limits;                       // `truncations` of the forward
   T *collider, *collider_prev, *kappa;         // [B, Vc, 3], [B, Vc, 3], [B]
 };
 
-// Where the kernels work, for one chunk of scenes in sweep order. Sizes are per scene.
+// Workspace of the kernels for a chunk of scenes, in sweep order; sizes per scene.
 template <class T>
 struct Workspace {
   T *x, *x_bar, *rows;                          // [positions, 4], [positions, 4], [edge_slots kSlice + 1, 4]
@@ -77,19 +76,19 @@ struct Workspace {
   T* rest_bar;        // [slots, kSlice, kPairRest]
   T* data_bar;        // [scalars, positions]
   // with contact:
-  T* contact;         // [positions, kContactScalars]: the pairs' part of the block
-  T* moved;           // [positions, 4]: where vertices are that have moved in a sweep; after it, x of the next one
-  T* turn;            // [positions, 6]: p and d_raw of the latest reversed update
-  int32_t* position;  // [V]: where a vertex stands in sweep order
+  T* contact;         // [positions, kContactScalars]: pair terms of the block
+  T* moved;           // [positions, 4]: vertices that have moved in a sweep; x of the next one
+  T* reversed;        // [positions, 6]: p and d_raw of the latest reversed update
+  int32_t* position;  // [V]: position of a vertex in sweep order
 };
 
-// Rows of vertices that have yet to move in a sweep, and of those that have.
+// Rows of vertices before and after their motion in a sweep.
 template <class T>
 struct MovingRows {
   T *x, *moved;
 };
 
-// Everything a sweep's kernels read and write; a chunk of scenes.
+// Arguments of the sweep kernels for a chunk of scenes.
 template <class T>
 struct StepView {
   GroupPlan plan;
@@ -100,7 +99,7 @@ struct StepView {
   StepParameters<T> parameters;
   int sweeps, tape_policy, tape_rows;  // tape_rows: scalars of a vertex and sweep
   bool one_material;                   // `material` below; else w.material
-  bool has_tets;                       // whether they have an energy
+  bool has_tets;                       // whether tets have an energy
   bool own;                            // whether a block has its scene to itself
   Batched<const T> mass, rest, data, material[kTetScalars];
   int64_t material_scene;
@@ -115,41 +114,67 @@ struct StepView {
 
 constexpr int kMaxThreads = 256;  // of a block of the sweep kernels
 
-// The part of a step that one launch executes: sweeps [first_sweep, end_sweep) in the order of execution (the reverse
-// counts down), and of each the colors [first_color, end_color).
+// Part of a step in one launch: sweeps [first_sweep, end_sweep) in the order of execution (reversed in the reverse),
+// and of each the colors [first_color, end_color).
 struct Range {
   int regime;
   int first_sweep, end_sweep, first_color, end_color;
   unsigned* barrier;  // kGrid: zero before the launch
 };
 
-// What the kernels of sets with contact get beside these.
+// Further arguments of the kernels with contact.
 template <class T>
 struct ContactView {
   contact::ContactInputs<T> in;
   contact::ContactAdjoints<T> slots;  // in the reverse
-  uint8_t* cut;                       // in the forward
+  uint8_t* truncations;               // in the forward
 };
 
-// A kernel that takes a StepView and a Range, and a ContactView where the set has contact.
+// Passes of contact for the blocks [begin, end) of a color. Kernels may be dependent launches (schedule.cuh). Where
+// warps share a vertex, all but reverse() are part of the sweep kernel; reverse() too where one launch has all sweeps.
+template <class T>
+struct ContactPasses {
+  const StepView<T>& s;
+  const ContactView<T>& c;
+  cudaStream_t stream;
+
+  // Before the updates: pair terms of the blocks. sweep: in the reverse, otherwise negative.
+  cudaError_t assemble(int sweep, int64_t begin, int64_t end, bool dependent) const;
+  // After the updates: limits them.
+  cudaError_t limit(int sweep, int64_t begin, int64_t end, bool dependent) const;
+  // In the reverse, before the updates: gathers what pairs scattered.
+  cudaError_t prepare(int64_t begin, int64_t end, bool dependent) const;
+  // In the reverse, after the updates: adjoint of assemble(). few: a warp for each kind of pair of a vertex.
+  cudaError_t reverse(bool few, int64_t begin, int64_t end, bool dependent) const;
+  // After the last update, before the adjoints are stored: the rest for vertices and colliders.
+  cudaError_t collect(const StepAdjoints<T>& out) const;
+  // After the adjoints are stored: adjoints of the start of the step and of kappa.
+  cudaError_t store(const StepAdjoints<T>& out) const;
+
+ private:
+  template <class... P, class... A>
+  cudaError_t over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool dependent, A... arguments) const;
+};
+
+// Kernel with a StepView and a Range, and a ContactView where the set has contact.
 using SweepKernel = const void*;
 
-// Threads that share a vertex: few where there are vertices enough to fill the device, many to finish a small color
-// soon. The last is for stars too large for shared memory: a whole warp, working in device memory.
+// Threads per vertex: few where vertices fill the device, many to finish a small color soon. The last is for stars too
+// large for shared memory: a whole warp that works in device memory.
 constexpr int kFewLanes = 2, kSomeLanes = 8, kSomeReverseLanes = 4, kManyLanes = 32, kSpillLanes = 64;
 DIFFVBD_FN constexpr int threads_of(int lanes) { return lanes == kSpillLanes ? kSlice : lanes; }
-// Few threads each add up their own share of what a reversed update sends to a neighbour; many leave single
-// contributions, which are then gathered edge by edge.
+// Whether the reverse gathers single contributions edge by edge (many threads); few threads sum their own contributions
+// to each neighbour.
 DIFFVBD_FN constexpr bool gathers(int lanes) { return lanes >= kManyLanes; }
 
-// The kernels of a scene's energies for `lanes` threads per vertex.
+// Kernels of a set of energies for `lanes` threads per vertex.
 template <class T>
 SweepKernel forward_kernel(int energies, int lanes);
 template <class T, int wanted, int lanes>
 SweepKernel reverse_kernel(int energies);
 
-// In the reverse, where a thread has several pairs, their records wait in shared memory (records.cuh): one that is read
-// and some that are on their way.
+// Stages of records in shared memory (records.cuh), in the reverse with several pairs per thread: one is read while
+// others are loaded.
 constexpr int kFewStages = 2, kManyStages = 4;  // powers of two
 DIFFVBD_FN constexpr bool has_stages(int lanes, bool reverse) { return reverse && lanes < kManyLanes; }
 template <class T>
@@ -157,7 +182,7 @@ DIFFVBD_FN constexpr int stage_scalars() {
   return kSlice * (kRestRow + kTetScalars) + kSlice * static_cast<int>(sizeof(int32_t)) / static_cast<int>(sizeof(T));
 }
 
-// scalars of shared memory that a warp needs, for stars of up to `degree` neighbours and `valence` pairs
+// Scalars of shared memory of a warp, for stars of up to `degree` neighbours and `valence` pairs.
 template <class T>
 DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int stages, int lanes, bool reverse) {
   const int groups = kSlice / threads_of(lanes);
@@ -165,28 +190,28 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int stages, int
   return stages * stage_scalars<T>() + groups * (3 * degree + (reverse ? contributions : 0));
 }
 
-// With contact a vertex has many threads or some: one variant less to build.
+// With contact a vertex has many threads or some; the variant with few is not built.
 constexpr bool is_built(int mask, int lanes) { return (mask & kContact) == 0 || lanes != kFewLanes; }
 
-// A plan with what the host must know of it.
+// Plan with the numbers that the host needs.
 struct HostPlan {
   GroupPlan plan;              // arrays on the device
   const int64_t* color_block;  // [colors + 1] on the host
   int degree, valence;         // largest number of neighbours and of pairs of an active vertex
 };
 
-// How a step is to run.
+// Choices for the run of a step.
 struct Choice {
   int regime, lanes, wanted;
   int64_t chunk;  // scenes that are worked on at once
   int multiprocessors;
-  size_t shared;        // bytes of shared memory that a block can have
-  size_t by_pairs = 0;  // and of them what pairs need in a sweep
+  size_t shared;        // bytes of shared memory of a block
+  size_t by_pairs = 0;  // and of these for pairs in a sweep
 };
 
 constexpr int kWarpsPerBlock = 4;         // of the grid and color regimes
-constexpr size_t kPairBytes = 14 * 1024;  // of a block's shared memory that pairs need, beside stars
-// Threads per vertex: so many, or so many more that shared memory holds the stars of several warps.
+constexpr size_t kPairBytes = 14 * 1024;  // of a block's shared memory for pairs
+// Threads per vertex: `least`, or as many more as it takes for stars to fit into shared memory.
 template <class T>
 int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool reverse) {
   const size_t room = choice.shared - choice.by_pairs;
@@ -196,7 +221,7 @@ int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool r
   };
   const int some = reverse ? kSomeReverseLanes : kSomeLanes;
   if (least <= kFewLanes && 6 * needed(kFewLanes) <= room) return kFewLanes;  // fewer warps would wait for memory
-  if (least <= some && 4 * needed(some) <= room) return some;                 // those of a block
+  if (least <= some && 4 * needed(some) <= room) return some;                 // warps of a block
   return needed(kManyLanes) <= room ? kManyLanes : kSpillLanes;
 }
 
@@ -206,9 +231,18 @@ size_t workspace_bytes(const HostPlan& host, const StepInputs<T>& in, const Step
 template <class T>
 cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out, const Choice& choice,
                         void* workspace, cudaStream_t stream);
-// `ends` is the x that run_forward returned.
+// ends: x of run_forward().
 template <class T>
 cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
                         const StepAdjoints<T>& out, const Choice& choice, void* workspace, cudaStream_t stream);
+
+// A scene per thread, for many small meshes (scene.cuh). ill_conditioned [scenes]: workspace.
+template <class T>
+cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
+                              const Choice& choice, uint8_t* ill_conditioned, cudaStream_t stream);
+template <class T>
+cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
+                              const StepAdjoints<T>& out, const Choice& choice, uint8_t* ill_conditioned,
+                              cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

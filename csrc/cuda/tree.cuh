@@ -1,42 +1,39 @@
-// Bounding-volume trees of all scenes on the device (contact/tree.h): triangles, edges and points of every scene sorted
-// along its Morton curve by one radix sort, then boxes from the leaves up. Of small scenes the leaves alone.
+// Bounding-volume trees of all scenes (contact/tree.h): triangles, edges and points of every scene are sorted along its
+// Morton curve by one radix sort, and boxes are built from the leaves up. Small scenes have leaves only.
 #pragma once
 
 #include <cub/device/device_radix_sort.cuh>
 
 #include "../contact/candidates.h"
-#include "exchange.cuh"
-#include "ordered.cuh"
+#include "atomics.cuh"
+#include "common.cuh"
+#include "warp_reduce.cuh"
 
 namespace diffvbd::cuda {
 
 constexpr int kThreads = 256;
 
-inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
-
-__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
-
-// Bits of numbers up to `most`; at least one.
+// Bits of numbers up to `most`, at least one.
 inline int bits_of(uint64_t most) {
   int bits = 1;
   while (bits < 64 && most >> bits != 0) ++bits;
   return bits;
 }
 
-// The order of primitives in the sort, if there is one: triangles of all scenes, their edges, their points.
+// Trees, and the order of primitives if they are sorted: triangles of all scenes, then edges, then points.
 struct Forest {
   int64_t scenes;
   int32_t count[3], leaves[2];  // primitives of a scene; leaves of its trees of triangles and of edges
   int axis_bits;
   uint64_t *keys, *sorted_keys;
   int32_t *items, *sorted_items;  // index of a primitive in its scene
-  bool sorted = true;             // false: leaves are in the order of their primitives, without a tree over them
+  bool sorted = true;             // false: leaves in the order of primitives, without a tree
   contact::Box* nodes[2];         // [scenes, 2 leaves]
   unsigned (*bounds)[6];          // of each scene, as ordered bits
 
-  // Sizes, and memory by take(pointer, items).
+  // Sizes and memory.
   template <class T, class Take>
-  void lay_out(const contact::Surfaces<T>& in, const Take& take) {
+  void lay_out(const contact::Surfaces<T>& in, Take& take) {
     scenes = in.scenes;
     count[0] = in.num_triangles, count[1] = in.num_edges, count[2] = in.num_points;
     const int room = (64 - bits_of(static_cast<uint64_t>(3 * in.scenes))) / 3;
@@ -49,7 +46,7 @@ struct Forest {
       take(nodes[kind], in.scenes * 2 * leaves[kind]);
     }
   }
-  // Bytes that the sort of the primitives works in.
+  // Bytes of workspace of the sort.
   size_t sort_bytes() const {
     size_t bytes = 0;
     cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, sorted_keys, items, sorted_items, size());
@@ -60,7 +57,7 @@ struct Forest {
     return scenes * ((kind > 0 ? int64_t{count[0]} : 0) + (kind > 1 ? int64_t{count[1]} : 0));
   }
   DIFFVBD_FN int64_t size() const { return first(2) + scenes * count[2]; }
-  // The k-th primitive of a kind in a scene.
+  // k-th primitive of a kind in a scene.
   DIFFVBD_FN int32_t item(int kind, int64_t scene, int32_t k) const {
     return sorted ? sorted_items[first(kind) + scene * count[kind] + k] : k;
   }
@@ -68,7 +65,7 @@ struct Forest {
   int key_bits() const { return 3 * axis_bits + bits_of(static_cast<uint64_t>(3 * scenes)); }
 };
 
-// Before any box is known.
+// Empty bounds.
 __device__ __forceinline__ void clear_bounds(const Forest& forest, int64_t scene) {
   const float far = std::numeric_limits<float>::infinity();
   for (int k = 0; k < 6; ++k) forest.bounds[scene][k] = ordered(k < 3 ? far : -far);
@@ -140,8 +137,8 @@ __global__ void leaves_kernel(const contact::Surfaces<T> in, Forest forest, int 
   forest.tree(kind, scene)[leaves + leaf] = box;
 }
 
-// The nodes over a level of `width` nodes in each tree, `steps` levels up: a block works on what 2 kThreads nodes of
-// the level, maybe of several trees, come to.
+// Parents of a level of `width` nodes in each tree, `steps` levels up; a block starts from 2 kThreads nodes, maybe of
+// several trees.
 static __global__ void fold_kernel(Forest forest, int kind, int32_t width, int steps) {
   __shared__ contact::Box part[kThreads];
   const int t = static_cast<int>(threadIdx.x);
@@ -165,21 +162,21 @@ template <class T>
 cudaError_t build_forest(const contact::Surfaces<T>& in, const Forest& forest, void* sort, size_t sort_bytes,
                          cudaStream_t stream) {
   if (forest.sorted && in.scenes * in.num_points > 0) {
-    bounds_kernel<<<blocks_for(in.scenes * in.num_points), kThreads, 0, stream>>>(in, forest);
+    bounds_kernel<<<blocks_for(in.scenes * in.num_points, kThreads), kThreads, 0, stream>>>(in, forest);
   }
   const int64_t n = forest.size();
   if (forest.sorted && n > 0) {
-    codes_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, forest);
+    codes_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, forest);
     if (auto error = cub::DeviceRadixSort::SortPairs(sort, sort_bytes, forest.keys, forest.sorted_keys, forest.items,
                                                      forest.sorted_items, n, 0, forest.key_bits(), stream))
       return error;
   }
   for (int kind = 0; kind < 2 && in.scenes > 0; ++kind) {
-    leaves_kernel<<<blocks_for(in.scenes * forest.leaves[kind]), kThreads, 0, stream>>>(in, forest, kind);
+    leaves_kernel<<<blocks_for(in.scenes * forest.leaves[kind], kThreads), kThreads, 0, stream>>>(in, forest, kind);
     for (int32_t width = forest.leaves[kind]; forest.sorted && width > 1;) {
       int steps = 0;
       while (steps < 9 && width >> steps > 1) ++steps;
-      fold_kernel<<<blocks_for(in.scenes * width / 2), kThreads, 0, stream>>>(forest, kind, width, steps);
+      fold_kernel<<<blocks_for(in.scenes * width / 2, kThreads), kThreads, 0, stream>>>(forest, kind, width, steps);
       width >>= steps;
     }
   }

@@ -177,7 +177,8 @@ def _reverse_fused(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tu
     settings, tape_policy = rest
     wants = _wants(ops.STEP_ADJOINTS, fields._fields, needs)
     with backward_memory(fields.x, settings, tape_policy):
-        out = ops.fused_step_backward(*bars, x_end, tape, fields, packed_rest, plan, settings, tape_policy, wants)
+        out = ops.fused_step_backward(bars[0], bars[1], x_end, tape, fields, packed_rest, plan, settings, tape_policy,
+                                      wants)  # fmt: skip
     return [out[name] for name in fields._fields]
 
 

@@ -39,7 +39,7 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
 
 def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: ContactSurface, self_contact: bool,
                   between_bodies: bool, capacity: int = 0) -> ops_contact.Intersections:  # fmt: skip
-    """Edges that pass through triangles and points behind planes, see :func:`diffvbd.ops.contact.contact_intersections`.
+    """Edges that pass through triangles and points behind planes: :func:`diffvbd.ops.contact.contact_intersections`.
 
     Args:
         x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  colliders: Their points [B, Vc, 3] [m].

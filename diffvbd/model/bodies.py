@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..ops.fields import CORRECTED
+
 # vertices of a body that a thread (where there are many), a part of a warp and a block of a CUDA device work on
 LARGEST = (12, 64, 2048)
 Groups = tuple[int, int, int, int]  # how many bodies are tiny, small, medium and large, by LARGEST
-CORRECTED = -2  # twin of kCorrected in csrc/rigid/body.h
 
 
 class Bodies(NamedTuple):

@@ -20,6 +20,7 @@ from .. import ops
 from ..checks import check_count, fail, is_word
 from ..ops.coarse import PACK as LANES
 from ..ops.coarse import ROW, lengths
+from ..ops.fields import TILE
 from ..tuples import replaced
 from .bodies import connected
 
@@ -71,7 +72,7 @@ class CoarseSpace:
         object.__setattr__(self, "every", check_count("every", self.every, 1, maximum=MOST_OF_ANY))
 
     def corrections(self, sweeps: int) -> int:
-        """How many corrections a step of so many sweeps has."""
+        """Number of corrections of a step of so many sweeps."""
         return ops.corrections_of(sweeps, self.every)
 
 
@@ -328,7 +329,6 @@ def _pairs(one: np.ndarray, two: np.ndarray, count: int) -> tuple[np.ndarray, np
 
 # --- the coarse space of a model as tensors ---------------------------------------------------------------------------
 
-TILE = 32  # unknowns of a body beyond which it counts as large; twin of kTile in csrc/coarse/views.h
 MOST_COUPLED = 512  # functions of all bodies beside contact: one dense system of three times as many unknowns
 PART = 32  # most blocks of a part of a body
 

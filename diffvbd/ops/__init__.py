@@ -48,7 +48,7 @@ from .fields import (
     tape_rows,
     tape_shape,
 )
-from .load import has_cuda, raw, require_cuda
+from .load import direct, has_cuda, raw, require_cuda
 from .sums import broadcast, star_sum, tet_gather
 from .sweep import build_plan, fused_step, fused_step_backward, pack_rest, plan_order, sweep, sweep_backward
 
@@ -80,6 +80,7 @@ __all__ = [
     "broadcast",
     "build_plan",
     "corrections_of",
+    "direct",
     "distinct",
     "fold_scenes",
     "folded",

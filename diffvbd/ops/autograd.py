@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.autograd import Function, forward_ad
 
-from ..scopes import transformed
 from .load import raw
 
 Bars = Sequence[Tensor | None]  # adjoints; None where there is none
@@ -26,13 +25,14 @@ Reverse = Callable[[Bars, Sequence[Any], tuple, Sequence[bool]], Bars]
 Vmap = Callable[..., tuple[Any, Any]]  # as torch.autograd.Function.vmap
 
 
-def no_second_derivative(*_: Any) -> NoReturn:
+def no_second_derivative() -> NoReturn:
     raise NotImplementedError(
         "diffvbd: second derivatives of a step are not supported (create_graph, hessian), nor is "
         "torch.autograd.functional.jvp, which differentiates a backward: take torch.autograd.grad or backward() once"
     )
 
 
+_peek = torch._C._functorch.peek_interpreter_stack  # pyright: ignore[reportAttributeAccessIssue]
 CONTACT = "torch.func transforms and batched gradients (is_grads_batched) of a step with contact are not supported"
 
 
@@ -122,7 +122,10 @@ class Differentiable:
 
         class _Reverse(Function):
             forward = staticmethod(reversed_)
-            backward = staticmethod(no_second_derivative)
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Any) -> NoReturn:
+                no_second_derivative()
 
             @staticmethod
             def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
@@ -169,16 +172,15 @@ class Differentiable:
         self.function = _Forward
 
     def __call__(self, *args: Any) -> Any:
-        if torch.compiler.is_compiling() or transformed():
+        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
             return self.function.apply(*args)
         if torch.is_grad_enabled():
             for t in args[: self.count]:
                 if t is not None and t.requires_grad:
                     # what apply() does where no transforms are active, but for looking at each argument
                     return super(Function, self.function).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
-        if forward_ad._current_level >= 0:
-            return self.function.apply(*args)  # which raises where there are tangents
-        return self.run(*args)
+        with torch._C._AutoDispatchBelowAutograd():  # half of what a call of an operator costs beside its work
+            return self.run(*args)
 
 
 def _like(bar: Tensor | None, t: Tensor) -> Tensor:
@@ -195,11 +197,12 @@ class Linear:
         run: Of a tensor and constants.
         transpose: Of its adjoint, the shape of the tensor, and the constants: the tensor's adjoint.
         arguments: How many there are, with the tensor.
-        vmap: As of torch.autograd.Function, but of ``run``; None: there is none.
+        vmap: Of the info of torch.autograd.Function.vmap, the tensor with the batch first, and the constants; None:
+            there is none.
     """
 
     def __init__(self, run: Callable[..., Tensor], transpose: Callable[..., Tensor], arguments: int,
-                 vmap: Vmap | None = None) -> None:  # fmt: skip
+                 vmap: Callable[..., Tensor] | None = None) -> None:  # fmt: skip
         class _Function(Function):
             forward = _of_arity(arguments, run)
 
@@ -215,7 +218,7 @@ class Linear:
             def vmap(info: Any, in_dims: tuple, values: Tensor, *constants: Any) -> tuple[Tensor, int]:
                 if vmap is None:
                     no_transforms()
-                return vmap(info, values.movedim(in_dims[0], 0), *constants), 0  # type: ignore[return-value]
+                return vmap(info, values.movedim(in_dims[0], 0), *constants), 0
 
         self.function = _Function
 
@@ -243,8 +246,10 @@ def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def distinct(*tensors: Tensor | None) -> list[Tensor | None]:
-    """Contiguous, and none of them twice, which torch.compile refuses."""
+    """Contiguous, and for torch.compile, which refuses that, none of them twice."""
     out: list[Tensor | None] = []
+    if not torch.compiler.is_compiling():
+        return [t if t is None else t.contiguous() for t in tensors]
     for t in tensors:
         t = t if t is None else t.contiguous()
         out.append(t.view_as(t) if t is not None and any(t is other for other in out) else t)

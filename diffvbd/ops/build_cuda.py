@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from glob import glob
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +19,57 @@ CXX_FLAGS = ["-O3", "-g0", "-fvisibility=hidden", "-Wno-psabi", "-Wno-ignored-at
 # Compressed, because there is a kernel for each set of energies: a quarter of the bytes.
 NVCC_FLAGS = ["-O3", "-std=c++17", "--expt-relaxed-constexpr", "-Xcompiler", "-fvisibility=hidden"]
 NVCC_FLAGS += ["-Xfatbin", "-compress-all"]
+
+# Sources that instantiate templates, one for each variant, so that they compile side by side.
+INSTANCES = "build/instances"
+TEMPLATES = {  # by header of csrc/cuda, each for both scalars T
+    "coarse_gradient": [
+        *(f"gradient_kernel_of<T, {wanted}>" for wanted in ("kForward", "kState", "kMaterial", "kMaterial | kRest"))
+    ],
+    "contact": [
+        "struct ContactPasses<T>",
+        *(f"{name}<T>" for name in ("sum_lag", "pair_lag", "pair_lag_backward")),
+        *(f"lagged_friction{backward}<T>" for backward in ("", "_backward")),
+    ],
+    "forward": ["forward_kernel<T>"],
+    "run": ["workspace_bytes<T>", "run_forward<T>", "run_reverse<T>"],
+    "scene_forward": ["run_scene_forward<T>"],
+    "scene_reverse": ["run_scene_reverse<T>"],
+}
+WANTED = {"state": "kState", "material": "kMaterial", "rest": "kMaterial | kRest"}
+# The transposed sweeps take longest: few threads a vertex and many are compiled apart.
+LANES = {"few": ("kFewLanes", "kSomeReverseLanes"), "many": ("kManyLanes", "kSpillLanes")}
+
+
+def cuda_instances() -> dict[str, str]:
+    """Sources of template instances for the CUDA object: text by name."""
+
+    def text(header: str, templates: list[str], scalar: str) -> str:
+        names = [template.replace("<T", f"<{scalar}") for template in templates]
+        lines = [f"template {n};" if n.startswith("struct ") else f"template decltype({n}) {n};" for n in names]
+        include = f'#include "../../csrc/cuda/{header}.cuh"'
+        return "\n".join([include, "", "namespace diffvbd::cuda {", *lines, "}  // namespace diffvbd::cuda", ""])
+
+    out = {}
+    for scalar in ("double", "float"):
+        out |= {f"{header}_{scalar}.cu": text(header, names, scalar) for header, names in TEMPLATES.items()}
+        for wanted, value in WANTED.items():
+            for share, lanes in LANES.items():
+                names = [f"reverse_kernel<T, ({value}), {count}>" for count in lanes]
+                out[f"reverse_{wanted}_{scalar}_{share}.cu"] = text("reverse", names, scalar)
+    return out
+
+
+def write_instances(sources: dict[str, str]) -> list[str]:
+    """Paths of these sources in the current folder. One that has its text already is left alone: no new compilation."""
+    paths = []
+    for name, text in sources.items():
+        path = Path(INSTANCES, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+        paths.append(path.as_posix())
+    return paths
 
 
 def has_compiler() -> bool:
@@ -42,7 +94,11 @@ def extension() -> Any:
     os.environ["TORCH_CUDA_ARCH_LIST"] = architectures()  # without a device torch itself would not know any
     return CUDAExtension(
         "diffvbd._C_cuda",
-        [*sorted(glob("csrc/bind/*.cpp")), *sorted(glob("csrc/cuda/*.cu"))],
+        [
+            *sorted(glob("csrc/bind/*.cpp")),
+            *write_instances(cuda_instances()),  # first of the kernels: they take longest
+            *sorted(glob("csrc/cuda/*.cu")),
+        ],
         define_macros=[("TORCH_TARGET_VERSION", "0x020b000000000000"), ("USE_CUDA", None)],
         extra_compile_args={"cxx": CXX_FLAGS, "nvcc": NVCC_FLAGS},
         extra_link_args=["-s"],

@@ -237,50 +237,7 @@ def sweep_rooms(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, fall: Ten
                                    held, body_order, body_ptr, more, least)  # fmt: skip
 
 
-def unsupported(x: Tensor, origin: Tensor, lift: Tensor, force: Tensor, mass: Tensor, planes: Tensor,
-                held_bodies: Tensor, body_order: Tensor, body_ptr: Tensor, time_step: float) -> Tensor:  # fmt: skip
-    """What is left of ``lift`` [B, V, 3] [m] once forces have borne their part of each body's acceleration.
-
-    Sums over a body make its own acceleration a and that of the forces f. Contact takes the share s of f, between 0 and
-    1, that leaves least of a + s f; it takes none of a body that is held. Results repeat to the bit.
-
-    Args:
-        x, origin: [B, V, 3] [m], the latter may be empty.
-        lift: [1 | B, V, 3], h^2 times the acceleration of each vertex [m].
-        force: [B, N, 3] of pairs at corner points [N], the vertices first; what follows them is not read.
-        mass: [1 | B, V] [kg].
-        planes: Data of a FloorBarrier [1 | B, 7 planes], whose forces count as well; or empty.
-        held_bodies: [bodies] bool.  body_order, body_ptr: Vertices by body [V], and the first of each [bodies + 1].
-        time_step: [s].
-    """
-    return raw.contact_unsupported(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step)
-
-
-def unsupported_backward(bar: Tensor, x: Tensor, origin: Tensor, lift: Tensor, force: Tensor, mass: Tensor,
-                         planes: Tensor, held_bodies: Tensor, body_order: Tensor, body_ptr: Tensor, time_step: float,
-                         wants_planes: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Adjoints of x [B, V, 3], or none without a floor, lift [B, V, 3], force [B, N, 3], mass [B, V], and of planes by
-    body [B, bodies, 7 planes], or none."""
-    return raw.contact_unsupported_backward(bar, x, origin, lift, force, mass, planes, held_bodies, body_order,
-                                            body_ptr, time_step, wants_planes)  # fmt: skip
-
-
 # --- the start of a part ----------------------------------------------------------------------------------------------
-
-
-def translation(move: Tensor, mass: Tensor, x: Tensor, origin: Tensor, planes: Tensor, held: Tensor, body: Tensor,
-                body_order: Tensor, body_ptr: Tensor, island: Tensor, lowest: Tensor) -> Tensor:  # fmt: skip
-    """Translation of each body's island [B, bodies, 3]; arguments in the order of csrc/bind/schema.cpp."""
-    return raw.contact_translation(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest)
-
-
-def translation_backward(u_bar: Tensor, move: Tensor, mass: Tensor, x: Tensor, origin: Tensor, planes: Tensor,
-                         held: Tensor, body: Tensor, body_order: Tensor, body_ptr: Tensor, island: Tensor,
-                         lowest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Adjoints of move [B, V, 3], mass [B, V], x [B, V, 3], planes [B, 7 planes]."""
-    return raw.contact_translation_backward(
-        u_bar, move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest
-    )
 
 
 def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
@@ -350,7 +307,8 @@ class Whole(NamedTuple):
 
 def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
                 ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """What a floor leaves of ways of bodies as wholes, less u [B, V, 3] [m], and which bodies it stops [B, bodies].
+    """Displacements of whole bodies as a floor limits them, less u [B, V, 3] [m], and which bodies it stops [B,
+    bodies].
 
     Args:
         x, way: [B, V, 3] [m].  u: [B, bodies, 3] [m], part of the way, which the floor lets pass; or empty.
@@ -358,12 +316,6 @@ def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tenso
         order, ptr: Vertices by body [V], and the first of each [bodies + 1], int32.
     """
     return raw.contact_above_floor(x, u, way, planes, origin, held, order, ptr)
-
-
-def above_floor_backward(bar: Tensor, x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor,
-                         order: Tensor, ptr: Tensor, wants_planes: bool) -> tuple[Tensor, ...]:  # fmt: skip
-    """Adjoints of x [B, V, 3], u [B, bodies, 3], way [B, V, 3] and planes [B, bodies, 7 planes or 0]."""
-    return raw.contact_above_floor_backward(bar, x, u, way, planes, origin, held, order, ptr, wants_planes)
 
 
 def frames(x: Tensor, move: Tensor, u: Tensor, way: Tensor, left: Tensor, stretch: Tensor, room: Tensor,
@@ -415,42 +367,7 @@ def start(at: Whole, fall: Tensor, share: Tensor, last_share: Tensor, stopped: T
     return raw.contact_start(*at[:2], fall, *at[2:5], share, last_share, stopped, *at[5:7], *at.bodies, FILTER_ETA)
 
 
-def start_backward(bar: Tensor, at: Whole, fall: Tensor, share: Tensor, last_share: Tensor, wants_planes: bool
-                   ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Adjoints of x, move, fall, u (for each vertex) and left [B, V, 3], planes [B, V, 7 planes or 0]."""
-    return raw.contact_start_backward(bar, *at[:2], fall, *at[2:5], share, last_share, *at[5:7], *at.bodies, FILTER_ETA,
-                                      wants_planes)  # fmt: skip
-
-
 # --- what sweeps keep of the start of a step --------------------------------------------------------------------------
-
-
-def lag(x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor,
-        entry: Tensor) -> Tensor:  # fmt: skip
-    """Normal force, activity, normal and weights of each pair, [pairs, 9]."""
-    return raw.contact_lag(x, origin, collider, kappa, pairs, constants, ptr, entry)
-
-
-def lag_backward(bar: Tensor, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, pairs: Tensor,
-                 constants: Tensor, ptr: Tensor, entry: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Adjoints of where corner points are [B, N, 3], the vertices first, and of kappa [B]."""
-    return raw.contact_lag_backward(bar, x, origin, collider, kappa, pairs, constants, ptr, entry)
-
-
-def rubbing(x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor,
-            pairs: Tensor, constants: Tensor, ptr: Tensor, entry: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Friction coefficient times normal force [N], damping [N s/m], normal and weights of each pair, [pairs, 9]; and
-    the forces of pairs on corner points [B, N, 3] [N]. friction, damping: [1 | B], or empty without."""
-    return raw.contact_rubbing(x, origin, collider, kappa, friction, damping, pairs, constants, ptr, entry)
-
-
-def rubbing_backward(lag_bar: Tensor, push_bar: Tensor, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor,
-                     friction: Tensor, damping: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor, entry: Tensor
-                     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Adjoints of where corner points are [B, N, 3], of kappa [B], and of friction and damping [B], or empty. Either
-    of the first two arguments may be empty."""
-    return raw.contact_rubbing_backward(lag_bar, push_bar, x, origin, collider, kappa, friction, damping, pairs,
-                                        constants, ptr, entry)  # fmt: skip
 
 
 def lowest(x: Tensor, origin: Tensor, planes: Tensor, body_order: Tensor, body_ptr: Tensor, island: Tensor
@@ -629,7 +546,8 @@ def _translation_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: S
     return raw.contact_translation_backward(bars[0], move, mass, x, origin, planes, *rest)
 
 
-# move, mass, x, planes, origin; held, body, body_order, body_ptr, island, lowest
+# Translation of each body's island [B, bodies, 3] [m], of move, mass, x, planes, origin; held, body, body_order,
+# body_ptr, island, lowest. Without a floor planes and lowest are empty.
 island_translation = Differentiable(
     lambda move, mass, x, planes, origin, *index: raw.contact_translation(move, mass, x, origin, planes, *index),
     _translation_reverse, arguments=11, inputs=4, tensors=5,
@@ -642,7 +560,7 @@ def _above_floor_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: S
     return x, u, way, _of_planes(own, planes)
 
 
-# As above_floor().
+# above_floor(), differentiable in x, u, way and planes.
 ways_above_floor = Differentiable(above_floor, _above_floor_reverse, arguments=8, inputs=4, tensors=8)
 
 
@@ -664,15 +582,15 @@ def _start(x: Tensor, move: Tensor, fall: Tensor, u: Tensor, left: Tensor, plane
 
 def _start_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
     (x, move, fall, u, left, planes), (decided,) = saved, rest
-    at = Whole(x, move, u, left, decided.frames, planes, decided.origin, decided.bodies)
-    bar = bars[0]
-    assert bar is not None
-    x, move, fall, u, left, own = start_backward(bar, at, fall, *decided.shares, needs[5] and planes.numel() > 0)
+    x, move, fall, u, left, own = raw.contact_start_backward(
+        bars[0], x, move, fall, u, left, decided.frames, *decided.shares, planes, decided.origin, *decided.bodies,
+        FILTER_ETA, needs[5] and planes.numel() > 0,
+    )  # fmt: skip
     u = segment_sum(u, decided.bodies.order, decided.bodies.ptr)
     return x, move, fall, u, left, _of_planes(own, planes)
 
 
-# x, move, fall, u, left, planes; Decided
+# start(), of x, move, fall, u, left, planes; Decided.
 part_start = Differentiable(_start, _start_reverse, arguments=7, inputs=6)
 
 
@@ -687,7 +605,7 @@ rigid_motion = Differentiable(
     _motion_reverse, arguments=9, inputs=3, tensors=4, rest=lambda inputs: inputs[4:-1],
 )  # fmt: skip
 
-# x, mass, move; held, held_bodies, body_order, body_ptr, chord
+# contact_coast(), of x, mass, move; held, held_bodies, body_order, body_ptr, chord.
 coasting = Differentiable(
     raw.contact_coast, lambda bars, saved, rest, needs: raw.contact_coast_backward(bars[0], *saved, *rest),
     arguments=8, inputs=3,
@@ -700,7 +618,11 @@ def _unsupported_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: S
     return (*out, _of_planes(own, planes) if needs[4] else None)
 
 
-# x, lift, force, mass, planes, origin; held_bodies, body_order, body_ptr, time_step
+# What is left of lift [B, V, 3] [m] once forces have borne their part of each body's acceleration, of x, lift, force,
+# mass, planes, origin; held_bodies, body_order, body_ptr, time_step. Sums over a body make its own acceleration a and
+# that of the forces f. Contact takes the share s of f, between 0 and 1, that leaves least of a + s f, and none of a
+# body that is held. lift [1 | B, V, 3]: h^2 times the acceleration [m]; force [B, N, 3]: of pairs at corner points; planes
+# may be empty.
 lift_left = Differentiable(
     lambda x, lift, force, mass, planes, origin, *rest: raw.contact_unsupported(x, origin, lift, force, mass, planes,
                                                                                 *rest),
@@ -714,7 +636,8 @@ def _lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[
     return *_split(points, x), by_kappa
 
 
-# x, collider, kappa, origin; pairs, constants, ptr, entry
+# Normal force, activity, normal and weights of each pair [pairs, 9], of x, collider, kappa, origin; pairs, constants,
+# ptr, entry.
 pair_lag = Differentiable(
     lambda x, collider, kappa, origin, *listed: raw.contact_lag(x, origin, collider, kappa, *listed), _lag_reverse,
     arguments=8, inputs=3, tensors=4,
@@ -728,7 +651,9 @@ def _rubbing_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Seque
     return *_split(points, x), *others
 
 
-# x, collider, kappa, friction, damping, origin; pairs, constants, ptr, entry
+# Friction coefficient times normal force [N], damping [N s/m], normal and weights of each pair [pairs, 9], and the
+# forces of pairs on corner points [B, N, 3] [N], of x, collider, kappa, friction, damping, origin; pairs, constants,
+# ptr, entry. friction, damping: [1 | B], or empty without.
 pair_rubbing = Differentiable(
     lambda x, collider, kappa, friction, damping, origin, *listed: raw.contact_rubbing(x, origin, collider, kappa,
                                                                                        friction, damping, *listed),

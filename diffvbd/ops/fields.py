@@ -56,7 +56,7 @@ class SweepFields(NamedTuple):
     rest: Tensor | None
     energy_data: Tensor  # [1 | B, n], see VertexEnergy.pack
     origin: Tensor | None = None  # [B, V, 3], what positions are relative to
-    # contact; the shapes of the index data are those of ops.detect
+    # contact; the shapes of the index data are those of ops.contact
     collider: Tensor | None = None  # during the sweeps [m], [B, Vc, 3]
     collider_prev: Tensor | None = None  # at the start of the step [m], [B, Vc, 3]
     kappa: Tensor | None = None  # [1 | B] [N/m]

@@ -37,6 +37,8 @@ def load() -> None:
             "folder, whose sources hide the installed package"
         )
     torch.ops.load_library(str(path))
+    if not hasattr(torch.ops.diffvbd, "constants"):
+        raise ImportError(f"diffvbd was built from older sources: run `{_COMMAND}` in this folder")
     path = _built("_C_cuda")
     if torch.version.cuda and path is not None:
         try:

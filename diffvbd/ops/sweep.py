@@ -18,7 +18,7 @@ from .fields import (
     SweepSettings,
     as_list,
 )
-from .load import raw
+from .load import direct as raw
 
 
 def build_plan(

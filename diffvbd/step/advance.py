@@ -19,9 +19,9 @@ from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep, check_adjoint
 from ..adjoint.sweep import fused_step, is_out_of_memory, sweep
 from ..mask import VERTEX_ENERGIES
-from ..model.coarse import TILE
 from ..model.system import System
 from ..ops import regimes
+from ..ops.fields import TILE, WORKSPACE_BUDGET
 from ..scopes import checking, recorders
 from ..tuples import replaced
 from .arguments import (
@@ -146,7 +146,11 @@ def _fused(
 
 
 def _is_differentiated(tensors: Sequence[Tensor | None]) -> bool:
-    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    if torch.is_grad_enabled():
+        for t in tensors:  # not any(), whose generator is called for each
+            if t is not None and t.requires_grad:
+                return True
+    return False
 
 
 def _tape_policy(model: System, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
@@ -207,7 +211,6 @@ def out_of_memory_named(model: System, x: Tensor, settings: ops.SweepSettings, p
 
 
 _POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}
-WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/bind/cuda/sweep.h
 
 
 def cuda_scratch(model: System, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:

@@ -25,7 +25,7 @@ _FIELDS = len(ops.CoarseFields._fields)
 
 
 class CoarseParts(NamedTuple):
-    """What the matrices of all steps are made of."""
+    """Parts of the matrices of all steps."""
 
     stiffness: Tensor  # [1 | B, groups, 3, 3, width, width], at rest [N/m]
     mass: Tensor  # [1 | B, cells] [kg]
@@ -65,17 +65,17 @@ def _shapes_of(model: System) -> tuple[Tensor, Tensor]:
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Sequence[Tensor]:
     sizes, time_step, _ = rest
-    return ops.raw.coarse_matrix_backward(*saved, bars[0], sizes, time_step)
+    return ops.direct.coarse_matrix_backward(*saved, bars[0], sizes, time_step)
 
 
 # The matrices, or their Cholesky factors. What comes back for these is the adjoint of the matrices themselves: no other
 # operator reads a factor, and the matrices need not be kept. Fields; sizes, time_step, factored.
-_matrix = ops.Differentiable(ops.raw.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS, tensors=_FIELDS,
-                             vmap=NO_VMAP, batched=True)  # fmt: skip
+_matrix = ops.Differentiable(ops.direct.coarse_matrix, _reverse, arguments=_FIELDS + 3, inputs=_TENSORS,
+                             tensors=_FIELDS, vmap=NO_VMAP, batched=True)  # fmt: skip
 
 
 def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
-    """What the sweeps read, with the corrections between them."""
+    """Fields of the sweeps, with the corrections between them."""
     plan = model._coarse_plan
     matrix = matrix_of(model, parts, fields.x_prev, time_step, factored=not model.energy_mask & VERTEX_ENERGIES)
     return replaced(fields, coarse_factor=matrix, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,

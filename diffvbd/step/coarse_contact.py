@@ -164,7 +164,7 @@ class Corrections:
 
 
 class _Press(NamedTuple):
-    """What presses back against motions sum_k w_k x_k of some vertices."""
+    """Stiffness against motions sum_k w_k x_k of some vertices."""
 
     rows: Tensor  # int64 [n, k], among the vertices of all scenes
     weights: Tensor  # [n, k]

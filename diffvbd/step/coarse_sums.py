@@ -1,4 +1,4 @@
-"""What the matrices of coarse corrections are made of: stiffness and mass in the functions of the bodies
+"""Parts of the matrices of coarse corrections: stiffness and mass in the functions of the bodies
 (docs/method.md, section 15).
 
 On the CPU by compiled loops (csrc/coarse/sums.h), on CUDA by products of torch (ops/coarse.py). Either sums in an
@@ -36,20 +36,22 @@ def coarse_mass(plan: CoarsePlan, mass: Tensor) -> Tensor:
 def _stiffness_reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
                        ) -> Sequence[Tensor]:  # fmt: skip
     (plan,) = rest
-    return ops.raw.coarse_stiffness_backward(*saved, plan.plan, plan.weights, bars[0], plan.sizes, needs[2] or needs[3])
+    return ops.direct.coarse_stiffness_backward(
+        *saved, plan.plan, plan.weights, bars[0], plan.sizes, needs[2] or needs[3]
+    )
 
 
 def _mass_reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Sequence[Tensor]:
     (plan,) = rest
-    return (ops.raw.coarse_mass_backward(bars[0], plan.plan, plan.weights, plan.sizes),)
+    return (ops.direct.coarse_mass_backward(bars[0], plan.plan, plan.weights, plan.sizes),)
 
 
 NO_VMAP = "torch.func.vmap of coarse corrections is not supported"
 _stiffness = ops.Differentiable(
-    lambda mu, lam, gradients, volume, plan: ops.raw.coarse_stiffness(mu, lam, gradients, volume, plan.plan,
+    lambda mu, lam, gradients, volume, plan: ops.direct.coarse_stiffness(mu, lam, gradients, volume, plan.plan,
                                                                       plan.weights, plan.sizes),
     _stiffness_reverse, arguments=5, inputs=4, vmap=NO_VMAP, batched=True,
 )  # fmt: skip
-_mass = ops.Differentiable(lambda mass, plan: ops.raw.coarse_mass(mass, plan.plan, plan.weights, plan.sizes),
+_mass = ops.Differentiable(lambda mass, plan: ops.direct.coarse_mass(mass, plan.plan, plan.weights, plan.sizes),
                            _mass_reverse, arguments=2, inputs=1,
                            vmap=NO_VMAP, batched=True)  # fmt: skip

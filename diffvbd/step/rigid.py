@@ -25,14 +25,16 @@ _FIELDS = len(ops.RigidFields._fields)
 
 
 def _run(*args: Any) -> tuple[Tensor, Tensor]:
-    return ops.raw.rigid(*ops.as_list(ops.RigidFields(*args[:_FIELDS]), args[0]), *args[_FIELDS:])
+    return ops.direct.rigid(*ops.as_list(ops.RigidFields(*args[:_FIELDS]), args[0]), *args[_FIELDS:])
 
 
 def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     x, data_count = saved[0], rest[1]
     x_bar = torch.zeros_like(x) if bars[0] is None else bars[0]
     v_bar = x.new_empty((0,)) if bars[1] is None else bars[1]
-    *out, shared, own = ops.raw.rigid_backward(*ops.as_list(ops.RigidFields(*saved), x), x_bar, v_bar, *rest, needs[4])
+    *out, shared, own = ops.direct.rigid_backward(
+        *ops.as_list(ops.RigidFields(*saved), x), x_bar, v_bar, *rest, needs[4]
+    )
     return [*out, join_data(shared, own, data_count) if needs[4] else None]
 
 

@@ -1,4 +1,4 @@
-"""What coarse corrections of bodies that touch are made of, differentiable: gradient and blocks of inertia, energies of
+"""Parts of coarse corrections of bodies that touch, differentiable: gradient and blocks of inertia, energies of
 single vertices, friction on a floor, and barriers, friction and damping of pairs. Twin of csrc/contact/rigid.h."""
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from .. import ops
 from ..adjoint.contact_lag import Pairs, at_corners, of_scene, pair_lag, some_of
 from ..adjoint.potential import of_vertices
 from ..ops import broadcast
-
-RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
+from ..ops.fields import RESTING_MOTION
 
 
 class Scenes(NamedTuple):
-    """What the correction reads."""
+    """Fields of the correction."""
 
     model: Any
     fields: ops.TouchingFields
@@ -36,8 +35,8 @@ class Scenes(NamedTuple):
 
 
 class PairTerms(NamedTuple):
-    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and weights
-    [n, 4]."""
+    """Contribution of pairs: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and
+    weights [n, 4]."""
 
     listed: Pairs
     force: Tensor
@@ -53,7 +52,7 @@ def outer(n: Tensor) -> Tensor:
 def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
     """f1(|u|) / |u| of friction, and that quotient's derivative over |u|, of slips u [..., 3]."""
     square = (u * u).sum(-1)
-    moves = square > (RESTING * eps) ** 2
+    moves = square > (RESTING_MOTION * eps) ** 2
     length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
     sticks = length < eps
     rate = torch.where(sticks, (2 - length / eps) / eps, 1 / torch.where(sticks, torch.ones_like(length), length))

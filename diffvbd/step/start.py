@@ -1,4 +1,4 @@
-"""Where a step begins: the predictor y = x + h v + h^2 a, and where its sweeps start.
+"""Start of a step: the predictor y = x + h v + h^2 a, and where its sweeps start.
 
 A body that is corrected coasts: all of its vertices go one share of h v less what in h v is a turn (on straight lines
 it would stretch the body), as far as planes let it, and the body is corrected there (rigid.py). Where planes hold it
@@ -30,14 +30,14 @@ _FIELDS = len(ops.BeginFields._fields)
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
     groups, other_groups, options = args[_FIELDS:]
-    return ops.raw.begin(*ops.as_list(ops.BeginFields(*args[:_FIELDS]), args[0]), groups, other_groups, *options)
+    return ops.direct.begin(*ops.as_list(ops.BeginFields(*args[:_FIELDS]), args[0]), groups, other_groups, *options)
 
 
 def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     fields, (falls, alone), (groups, options) = ops.BeginFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
     x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
     wants = (needs[2], needs[3], needs[5])
-    *out, shared, own, planes = ops.raw.begin_backward(
+    *out, shared, own, planes = ops.direct.begin_backward(
         *ops.as_list(fields, fields.x), x_start_bar, y_bar, falls, alone, groups, *options[:-1], wants
     )
     data_out = None
@@ -76,7 +76,7 @@ def begin(
     others: OtherBodies, data_count: tuple[int, ...], time_step: float, chord: float, *, start: str, filters: bool,
     parts: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Where the sweeps start and the predictor [m], both [B, V, 3]; differentiable in the first six tensors.
+    """Start of the sweeps and predictor [m], both [B, V, 3]; differentiable in the first six tensors.
 
     Args:
         x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].
@@ -89,7 +89,7 @@ def begin(
         parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
     """
     # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
-    looked_at = (t if t is None else t.detach() for t in (mu, lam, rest))
+    looked_at = mu.detach(), lam.detach(), rest if rest is None else rest.detach()
     tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
     *listed, groups = bodies
     *listed_others, other_groups = others

@@ -18,12 +18,12 @@ from ..energies import FloorBarrier, StableNeoHookean
 from ..inspect.record import record
 from ..model.model import Model
 from ..model.solver import VBD
+from ..ops.fields import NO_MOVE
 from ..reference import contact as reference
 from ..step.step import step
 from .scenes import generator
 
 GRAVITY = (0.3, -9.81, 0.2)
-NO_MOVE = 8  # the exponent of a limit of 0; twin of kNoMove in csrc/contact/limit.h
 
 
 @dataclass

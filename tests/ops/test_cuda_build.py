@@ -20,6 +20,7 @@ from diffvbd.ops import build_cuda
 from diffvbd.ops import load as native
 
 KERNELS = sorted(CSRC.glob("cuda/*.cu"))
+INSTANCES = build_cuda.cuda_instances()
 BINDINGS = sorted(CSRC.glob("bind/*.cpp"))
 ARCHITECTURES = ("80", "90", "100", "120")
 LIMIT = 120  # [s] for what takes one on an idle machine: a hang, not slowness
@@ -59,7 +60,10 @@ def failures(jobs: list[tuple[Path, list[str]]], folder: Path) -> dict[str, str]
 
 
 def compile_for(kernels: list[Path], architectures: list[str], folder: Path, *flags: str) -> None:
-    """As the package is built, and with `flags`."""
+    """As the package is built, and with `flags`. Instances are written into the folder."""
+    for name, text in INSTANCES.items():
+        (folder / name).write_text(text.replace("../../csrc", str(CSRC)), encoding="utf-8")
+    kernels = [folder / k if k.name in INSTANCES else k for k in kernels]
     known = subprocess.run([str(nvcc()), "--list-gpu-code"], capture_output=True, text=True).stdout.split()
     missing = {f"sm_{a}" for a in architectures} - set(known)
     if missing:
@@ -89,8 +93,9 @@ def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
     assert build_cuda.architectures() == "8.0 9.0+PTX"
 
 
-TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(KERNELS)]
-STEMS = [k.stem for k in KERNELS]
+UNITS = [*KERNELS, *map(Path, INSTANCES)]
+TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(UNITS)]
+STEMS = [k.stem for k in UNITS]
 QUICK = ("scene_reverse_float", "contact_float")  # the sweep, all energies with their adjoints, pairs
 
 
@@ -107,7 +112,7 @@ def test_kernels_compile(tmp_path: Path, kernel: Path, architecture: str) -> Non
 @needs_csrc
 @needs_nvcc
 def test_every_variant_compiles_as_it_is_built(tmp_path: Path) -> None:
-    compile_for([k for k in KERNELS for _ in ARCHITECTURES], [*ARCHITECTURES] * len(KERNELS), tmp_path)
+    compile_for([k for k in UNITS for _ in ARCHITECTURES], [*ARCHITECTURES] * len(UNITS), tmp_path)
 
 
 @pytest.mark.slow

@@ -188,7 +188,6 @@ PLANE = dv.colliders.Plane((0.0, -0.003, 0.0))
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {},
     "floor, friction": {"energies": (FLOOR, FRICTION)},
-    "Anderson": {"acceleration": dv.Anderson(2)},
     "coarse": {"coarse": "auto"},
     "pairs": {"energies": (PAIRS,)},
     "pairs, coarse": {"energies": (PAIRS,), "coarse": "auto"},

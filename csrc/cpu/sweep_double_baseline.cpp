@@ -1,3 +1,0 @@
-#include "sweep_kernels.h"
-
-template diffvbd::Kernels<double> diffvbd::baseline::sweep_kernels<double>();

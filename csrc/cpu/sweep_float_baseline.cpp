@@ -1,3 +1,0 @@
-#include "sweep_kernels.h"
-
-template diffvbd::Kernels<float> diffvbd::baseline::sweep_kernels<float>();

@@ -1,3 +1,0 @@
-#include "forward.cuh"
-
-DIFFVBD_INSTANTIATE_FORWARD(float)

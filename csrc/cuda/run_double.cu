@@ -1,3 +1,0 @@
-#include "run.cuh"
-
-DIFFVBD_INSTANTIATE_RUN(double)

@@ -1,3 +1,0 @@
-#include "scene_forward.cuh"
-
-DIFFVBD_INSTANTIATE_SCENE_FORWARD(double)

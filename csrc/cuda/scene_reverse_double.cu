@@ -1,3 +1,0 @@
-#include "scene_reverse.cuh"
-
-DIFFVBD_INSTANTIATE_SCENE_REVERSE(double)
