@@ -17,7 +17,7 @@ PYTHON = (
 CPP = ("core", "energies", "sweep", "rigid", "start", "coarse", "contact", "cpu", "cuda", "bind")
 # Imports that point upward or close a circle today. The list may only shrink.
 KNOWN = {
-    ("model.model", "rollout.memory"), ("contact", "inspect.contact"), 
+    ("model.model", "rollout.memory"), ("contact", "inspect.contact"),
     ("model.warnings", "model.model"), ("model.moduli", "model.model"), ("model.tet_shapes", "model.model"),
     ("step.contact_cycles", "step.contact"), ("step.corrections", "step.contact"),
 }  # fmt: skip
