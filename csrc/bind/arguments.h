@@ -10,7 +10,7 @@
 #include <string>
 #include <vector>
 
-#include "../core/plan_views.h"
+#include "../core/views.h"
 #include "../energies/energies.h"
 #include "fields.h"
 

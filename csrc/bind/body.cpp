@@ -1,8 +1,8 @@
 // Operators on whole bodies: the rigid correction, the beginning of a step, and the rise of potentials.
 #include "body.h"
 
-#include "../coarse/rise.h"
-#include "../start/part.h"
+#include "../subspace/begin.h"
+#include "../subspace/coarse.h"
 
 namespace diffvbd {
 namespace {
@@ -65,7 +65,7 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   in.pinned = read.flags("pinned", t.pinned, v);
   require(q.from >= start::kInertia && q.from <= start::kLower, "diffvbd::begin: expected start 0, 1 or 2");
   in.others = static_cast<int32_t>(other_bodies(t));
-  in.falls = q.from == start::kLower ? read.bytes("falls", falls, b * in.others) : data<const uint8_t>(falls);
+  in.from_predictor = q.from == start::kLower ? read.bytes("falls", falls, b * in.others) : data<const uint8_t>(falls);
   require(alone.numel() == 0 || q.filters, "diffvbd::begin: expected filters with alone");
   in.alone = alone.numel() > 0 ? read.bytes("alone", alone, b * corrected_bodies(t)) : nullptr;
   require(!q.filters || (in.bodies.data_count[0] > 0 &&
@@ -75,7 +75,7 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   in.some_alone = t.order.numel() < v;
   in.filters = q.filters;
   require(q.chord != 0, "diffvbd::begin: expected chord other than 0");
-  in.chord = q.chord;
+  in.lookback = q.chord;
   in.parameters.time_step = T(q.time_step);
   in.parameters.filter_eta = T(q.filter_eta);
   return in;
@@ -191,7 +191,7 @@ DIFFVBD_OPERATOR(Tensor, potential_rise, In x, In to, In x_prev, In y, In mass, 
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    coarse::RiseInputs<T> in{};
+    coarse::IncreaseInputs<T> in{};
     in.bodies = rigid_inputs<T>({x, x_prev, y, mass, energy_data, origin, order, ptr, order, other}, data_count,
                                 time_step, false);
     const int64_t blocks = corner.size(0), bodies = in.bodies.bodies;

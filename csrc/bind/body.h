@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "../rigid/reverse.h"
+#include "../subspace/rigid.h"
 #include "backend.h"
 
 namespace diffvbd {

@@ -1,8 +1,8 @@
 // The plan of a coarse space, as its entries and those of sweeps take it.
 #pragma once
 
-#include "../coarse/matrix.h"
-#include "../coarse/sums.h"
+#include "../subspace/coarse.h"
+#include "../subspace/coarse_matrix.h"
 #include "backend.h"
 
 namespace diffvbd {

@@ -1,17 +1,16 @@
 // Constants that Python needs as well: defaults of the parameters of an operator that nobody calls, which Python reads.
 #include <string>
 
-#include "../coarse/length.h"
-#include "../coarse/views.h"
-#include "../contact/candidates.h"
-#include "../contact/groups.h"
+#include "../contact/detection.h"
 #include "../contact/intersect.h"
+#include "../contact/islands.h"
 #include "../contact/limit.h"
-#include "../contact/lowest.h"
 #include "../contact/motion.h"
 #include "../contact/pairs.h"
-#include "../contact/part.h"
-#include "../start/begin.h"
+#include "../contact/start.h"
+#include "../subspace/begin.h"
+#include "../subspace/coarse.h"
+#include "../subspace/contact_rigid.h"
 #include "arguments.h"
 
 #ifndef USE_CUDA
@@ -43,7 +42,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"few", contact::kFew},                   // bodies of scenes that are one group
       {"most_coupled", contact::kMostCoupled},  // bodies of a group,
       {"group_memory", contact::kGroupMemory},  // of which there are at most so many over the bodies of the scene
-      {"asks", contact::kAsks},  // state of a vertex that rests unless the potential of its body lets it go
+      {"asks", contact::kPending},  // state of a vertex that rests unless the potential of its body lets it go
       {"start_inertia", start::kInertia},
       {"start_predictor", start::kPredictor},
       {"start_lower", start::kLower},

@@ -1,8 +1,8 @@
 // Lists of pairs, bodies and planes, as the entries of contact take them.
 #pragma once
 
-#include "../contact/lag.h"
-#include "../contact/lowest.h"
+#include "../contact/friction.h"
+#include "../contact/islands.h"
 #include "../contact/passes.h"
 #include "backend.h"
 
@@ -51,10 +51,10 @@ contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, cons
 }
 
 template <class T>
-contact::LowestInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes, const Tensor& order,
-                                       const Tensor& ptr, const Tensor& island) {
+contact::SupportVertexInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
+                                              const Tensor& order, const Tensor& ptr, const Tensor& island) {
   const Reader<T> read(x);
-  contact::LowestInputs<T> in{};
+  contact::SupportVertexInputs<T> in{};
   in.x = read.positions();
   in.origin = read.vectors_or_null("origin", origin);
   const Batched<const T> floor = floor_of(read, planes);

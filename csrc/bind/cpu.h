@@ -8,8 +8,6 @@
 #include "../cpu/advance.h"
 #include "../cpu/contact_rigid.h"
 #include "../cpu/detect.h"
-#include "../cpu/intersect.h"
-#include "../cpu/islands.h"
 #include "../cpu/loops.h"
 #include "../cpu/motion.h"
 #include "../cpu/neighbors.h"

@@ -29,7 +29,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.edges = primitives("edges", edges, 2, out.num_edges);
   out.points = primitives("points", points, 1, out.num_points);
   out.planes = primitives("planes", planes, 3, out.num_planes);
-  out.body = read.index("body", body, n), out.held = read.flags("held", held, n);
+  out.body = read.index("body", body, n), out.pinned = read.flags("held", held, n);
   require(b * n + 1 <= std::numeric_limits<int32_t>::max(),
           "contact: too large, expected at most 2^31 corner points in all scenes");
   out.scenes = b;
@@ -60,8 +60,8 @@ DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collid
                              held, mesh_bodies, self_contact, between_bodies);
     require(std::isfinite(dhat), "contact: expected a finite dhat");
     const Reader<T> read(x);
-    in.room = read.like("room", room, read.b * (in.mesh_bodies + int64_t{1}));
-    in.own_room = read.like("own_room", own_room, read.b * (in.mesh_bodies + int64_t{1}));
+    in.trust_radius = read.like("room", room, read.b * (in.mesh_bodies + int64_t{1}));
+    in.deformation_radius = read.like("own_room", own_room, read.b * (in.mesh_bodies + int64_t{1}));
     in.dhat = static_cast<T>(dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor near_corners = device.empty({b, n, contact::kNearRow}, ScalarType::Int);

@@ -3,7 +3,7 @@
 
 #include <cmath>
 
-#include "../contact/candidates.h"
+#include "../contact/detection.h"
 #include "../contact/islands.h"
 #include "backend.h"
 
@@ -30,10 +30,10 @@ contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, co
   out.planes = read.index("planes", planes, 3 * planes.size(0)), out.body = read.index("body", body, n);
   out.body_order = read.index("body_order", body_order, v);
   out.body_ptr = read.index("body_ptr", body_ptr, mesh_bodies + 1);
-  out.held = read.flags("held", held, n), out.radius = read.like("radius", radius, n);
+  out.pinned = read.flags("held", held, n), out.radius = read.like("radius", radius, n);
   out.scenes = b, out.vertices = static_cast<int32_t>(v), out.corners = static_cast<int32_t>(n);
   out.num_planes = static_cast<int32_t>(planes.size(0)), out.mesh_bodies = static_cast<int32_t>(mesh_bodies);
-  out.room = read.like("room", room, b * (mesh_bodies + 1)), out.half = static_cast<T>(dhat / 2);
+  out.trust_radius = read.like("room", room, b * (mesh_bodies + 1)), out.half = static_cast<T>(dhat / 2);
   out.any_direction = any_direction;
   return out;
 }

@@ -1,8 +1,8 @@
 // Operators on how bodies want to move, and how far they may: rigid motions, rooms, what contact bears.
-#include "../contact/coast.h"
-#include "../contact/rooms.h"
-#include "../contact/sweep_rooms.h"
-#include "../contact/unsupported.h"
+#include "../contact/motion.h"
+
+#include "../contact/residual_acceleration.h"
+#include "../contact/trust_region.h"
 #include "contact.h"
 #include "detect.h"
 
@@ -20,7 +20,7 @@ contact::MotionInputs<T> motion_inputs(const Tensor& x, const Tensor& origin, co
   in.x = read.positions(), in.move = read.vectors("move", move);
   in.origin = read.batch_or_null("origin", origin, 3 * read.v);
   in.mass = read.batch("mass", mass, read.v);
-  in.held = read.flags("held", held, read.v, true);
+  in.pinned = read.flags("held", held, read.v, true);
   return in;
 }
 
@@ -31,9 +31,9 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In f
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     auto in = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
-    in.held_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
-    in.fall = Reader<T>(x).vectors_or_null("fall", fall);
-    Tensor rigid = device.like_x(), ways = device.empty({contact::kWays, in.scenes, in.bodies});
+    in.pinned_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
+    in.gravity_move = Reader<T>(x).vectors_or_null("fall", fall);
+    Tensor rigid = device.like_x(), ways = device.empty({contact::kDisplacements, in.scenes, in.bodies});
     Tensor sums = device.empty({in.scenes, in.bodies, 4});
     DIFFVBD_RUN(device, find_motion<T>, in, data<T>(rigid), data<T>(ways), data<T>(sums));
     return Out<3>(rigid, ways, sums);
@@ -45,7 +45,7 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In ma
   return dispatch_float(x, [&]<class T>(T) {
     auto in = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
     const Reader<T> read(x);
-    in.held_bodies = read.flags("held_bodies", held_bodies, in.bodies);
+    in.pinned_bodies = read.flags("held_bodies", held_bodies, in.bodies);
     Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
     const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
                                          data<T>(mass_bar)};
@@ -62,9 +62,9 @@ DIFFVBD_OPERATOR(Tensor, contact_coast, In x, In mass, In move, In held, In held
   require(chord != 0, "diffvbd::contact_coast: expected chord other than 0");
   return dispatch_float(x, [&]<class T>(T) {
     auto in = motion_inputs<T>(x, device.empty({0}), mass, move, held, order, ptr);
-    in.held_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
+    in.pinned_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
     Tensor coasted = device.like_x();
-    DIFFVBD_RUN(device, coast<T>, in, chord, data<T>(coasted));
+    DIFFVBD_RUN(device, extrapolate<T>, in, chord, data<T>(coasted));
     return coasted;
   });
 }
@@ -75,11 +75,11 @@ DIFFVBD_OPERATOR(Out<3>, contact_coast_backward, In bar, In x, In mass, In move,
   return dispatch_float(x, [&]<class T>(T) {
     auto in = motion_inputs<T>(x, device.empty({0}), mass, move, held, order, ptr);
     const Reader<T> read(x);
-    in.held_bodies = read.flags("held_bodies", held_bodies, in.bodies);
+    in.pinned_bodies = read.flags("held_bodies", held_bodies, in.bodies);
     Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
     const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
                                          data<T>(mass_bar)};
-    DIFFVBD_RUN(device, reverse_coast<T>, in, chord, out);
+    DIFFVBD_RUN(device, reverse_extrapolate<T>, in, chord, out);
     return Out<3>(x_bar, mass_bar, move_bar);
   });
 }
@@ -93,7 +93,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_rooms, In x, In origin, In mass, In move, In he
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    contact::RoomInputs<T> in{};
+    contact::RadiusInputs<T> in{};
     in.motion = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
     const int64_t b = read.b, bodies = in.motion.bodies, rows = b * bodies;
     const int64_t count = planes.size(0) + planes_of(floor);
@@ -103,19 +103,20 @@ DIFFVBD_OPERATOR(Out<4>, contact_rooms, In x, In origin, In mass, In move, In he
     in.islands = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, order, ptr, held,
                                   radius, room, bodies, dhat, any_direction);
     in.rigid = read.vectors("rigid", rigid);
-    in.ways = read.like("ways", ways, contact::kWays * rows), in.sums = read.like("sums", sums, 4 * rows);
+    in.displacements = read.like("ways", ways, contact::kDisplacements * rows),
+    in.sums = read.like("sums", sums, 4 * rows);
     in.most = read.like("most", most, bodies), in.most_alone = read.like("most_alone", most_alone, bodies);
     in.most_own = read.like("most_own", most_own, bodies), in.least_own = read.like("least_own", least_own, bodies);
     in.floor_planes = planes_of(floor), in.floor = floor_of(read, floor);
-    in.share = static_cast<T>(share), in.least = static_cast<T>(least);
+    in.fraction = static_cast<T>(share), in.least = static_cast<T>(least);
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
-    contact::RoomWork<T> work{};
+    contact::RadiusWork<T> work{};
     T* at = data<T>(memory);
     const auto take = [&](T*& pointer, int64_t size) { pointer = at, at += size; };
     take(work.planes, b * in.planes() * contact::kPlaneScalars), take(work.pushed, b);
     take(work.stopped, rows), take(work.bent, rows), take(work.most, rows);
     work.island = data<int32_t>(island);
-    work.room = data<T>(room), work.own_room = data<T>(own_room), work.over = data<T>(over);
+    work.trust_radius = data<T>(room), work.deformation_radius = data<T>(own_room), work.over = data<T>(over);
     DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(in.islands));)
     DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
     return Out<4>(island, room, own_room, over);
@@ -130,17 +131,18 @@ DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move,
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    contact::SweepRoomInputs<T> in{};
+    contact::SweepRadiusInputs<T> in{};
     read.by_body(in, body_order, body_ptr);
     in.x = read.positions(), in.start = read.vectors("start", start), in.begin = read.vectors("begin", begin);
-    in.move = read.vectors("move", move), in.fall = read.vectors("fall", fall);
+    in.move = read.vectors("move", move), in.gravity_move = read.vectors("fall", fall);
     in.apart = read.like("apart", apart, in.scenes * in.bodies);
     in.stretched = read.like("stretched", stretched, in.scenes * in.bodies);
-    in.center = read.vectors("center", center), in.room = read.of_vertices("room", room);
+    in.center = read.vectors("center", center), in.trust_radius = read.of_vertices("room", room);
     if (own_room.numel() > 0) {
-      in.own_center = read.vectors("own_center", own_center), in.own_room = read.of_vertices("own_room", own_room);
+      in.deformation_center = read.vectors("own_center", own_center),
+      in.deformation_radius = read.of_vertices("own_room", own_room);
     }
-    in.held = read.flags("held", held, read.v, true);
+    in.pinned = read.flags("held", held, read.v, true);
     in.more = static_cast<T>(more), in.least = static_cast<T>(least);
     Tensor out = device.empty({in.scenes, in.vertices});
     const Tensor wishes = device.empty({in.scenes, in.bodies}), most = device.empty({in.scenes});
@@ -150,20 +152,20 @@ DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move,
 }
 
 template <class T>
-contact::UnsupportedInputs<T> unsupported_inputs(const Tensor& x, const Tensor& origin, const Tensor& lift,
-                                                 const Tensor& force, const Tensor& mass, const Tensor& planes,
-                                                 const Tensor& held_bodies, const Tensor& order, const Tensor& ptr,
-                                                 double time_step) {
+contact::ResidualInputs<T> unsupported_inputs(const Tensor& x, const Tensor& origin, const Tensor& lift,
+                                              const Tensor& force, const Tensor& mass, const Tensor& planes,
+                                              const Tensor& held_bodies, const Tensor& order, const Tensor& ptr,
+                                              double time_step) {
   const Reader<T> read(x);
-  contact::UnsupportedInputs<T> in{};
+  contact::ResidualInputs<T> in{};
   read.by_body(in.scene, order, ptr);
   in.scene.x = read.positions();
   in.scene.x_prev = {in.scene.x, 3 * read.v};  // a floor's damping, which reads it, is not asked for
   in.scene.mass = read.batch("mass", mass, read.v);
   in.scene.origin = read.batch_or_null("origin", origin, 3 * read.v);
   in.scene.time_step = time_step;
-  in.held_bodies = read.flags("held_bodies", held_bodies, in.scene.bodies);
-  in.lift = read.batch("lift", lift, 3 * read.v);
+  in.pinned_bodies = read.flags("held_bodies", held_bodies, in.scene.bodies);
+  in.h2_a = read.batch("lift", lift, 3 * read.v);
   require(force.dim() == 3 && force.size(1) >= read.v, "diffvbd::contact_unsupported: expected force of corner points");
   in.corners = force.size(1);
   in.force = read.like("force", force, 3 * read.b * in.corners);
@@ -196,8 +198,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_unsupported_backward, In bar, In x, In origin, 
                  force_bar = device.zeros({b, in.corners, 3}), mass_bar = device.empty({b, v});
     const Tensor planes_bar =
         device.zeros({wants_planes ? b : 0, in.scene.bodies, int64_t{in.planes} * contact::kPlaneScalars});
-    const contact::UnsupportedAdjoints<T> out{data_or_null<T>(x_bar), data<T>(lift_bar), data<T>(force_bar),
-                                              data<T>(mass_bar), data_or_null<T>(planes_bar)};
+    const contact::ResidualAdjoints<T> out{data_or_null<T>(x_bar), data<T>(lift_bar), data<T>(force_bar),
+                                           data<T>(mass_bar), data_or_null<T>(planes_bar)};
     DIFFVBD_RUN(device, residual_acceleration_backward<T>, in, Reader<T>(x).vectors("bar", bar), out);
     return Out<5>(x_bar, lift_bar, force_bar, mass_bar, planes_bar);
   });

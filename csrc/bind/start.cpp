@@ -1,11 +1,11 @@
 // Operators of the start of a part of a step with contact: translations of islands, ways above a floor, shares of ways;
 // what sweeps with contact keep of the start of a step; and lists of pairs.
-#include "../contact/above_floor_reverse.h"
+#include "../contact/start.h"
+
+#include "../contact/above_floor.h"
 #include "../contact/advance.h"
-#include "../contact/keep.h"
-#include "../contact/narrow.h"
-#include "../contact/part.h"
-#include "../contact/translation.h"
+#include "../contact/islands.h"
+#include "../contact/pair_list.h"
 #include "contact.h"
 
 namespace diffvbd {
@@ -38,14 +38,14 @@ contact::TranslationInputs<T> translation_inputs(const Tensor& move, const Tenso
   in.scenes = read.b;
   in.vertices = static_cast<int32_t>(read.v), in.bodies = static_cast<int32_t>(ptr.numel() - 1);
   in.island = read.index("island", island, in.scenes * in.bodies);
-  in.held = read.flags("held", held, read.v, true), in.body = read.index("body", body, read.v, true);
+  in.pinned = read.flags("held", held, read.v, true), in.body = read.index("body", body, read.v, true);
   in.move = read.vectors("move", move);
   const auto masses = read.batch("mass", mass, read.v);
   in.mass = masses.data, in.mass_scene = masses.scene;
   if (planes.numel() > 0) {
     in.floor = lowest_inputs<T>(x, origin, planes, order, ptr, island);
     require(in.floor.num_planes <= contact::kMostPlanes, "diffvbd::contact_translation: expected at most 8 planes");
-    in.lowest = read.index("lowest", lowest, in.scenes * in.bodies * in.floor.num_planes);
+    in.support_vertex = read.index("lowest", lowest, in.scenes * in.bodies * in.floor.num_planes);
   }
   return in;
 }
@@ -97,10 +97,11 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
     in.center = read.vectors("center", center), in.origin = read.vectors_or_null("origin", origin);
     in.collider = read.like("collider", collider, 3 * b * (corners - v));
     in.collider_next = read.like("collider_next", collider_next, 3 * b * (corners - v));
-    in.held = read.flags("held", held, corners), in.body = read.index("body", body, corners);
-    in.room = read.of_vertices("room", room);
+    in.pinned = read.flags("held", held, corners), in.body = read.index("body", body, corners);
+    in.trust_radius = read.of_vertices("room", room);
     if (own_room.numel() > 0) {
-      in.own_center = read.vectors("own_center", own_center), in.own_room = read.of_vertices("own_room", own_room);
+      in.deformation_center = read.vectors("own_center", own_center),
+      in.deformation_radius = read.of_vertices("own_room", own_room);
     }
     in.listed = pair_list(pairs, ptr, entry, x, b * corners);
     in.constants = pair_constants<T>(constants, pairs, x);
@@ -129,9 +130,10 @@ DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, 
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     const int64_t colliders = read.colliders(collider);
-    contact::NarrowInputs<T> in{};
+    contact::GapInputs<T> in{};
     in.x = read.positions(), in.origin = read.vectors_or_null("origin", origin);
-    in.collider = read.like("collider", collider, 3 * read.b * colliders), in.room = read.of_vertices("room", room);
+    in.collider = read.like("collider", collider, 3 * read.b * colliders),
+    in.trust_radius = read.of_vertices("room", room);
     in.pairs = read.index("pairs", pairs, pairs.size(0) * contact::kPairRow);
     read.index("ptr", ptr, read.b * (read.v + colliders) + 1);
     in.constants = pair_constants<T>(constants, pairs, x);
@@ -148,13 +150,13 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
   const Device device(constants);
   return dispatch_float(constants, [&]<class T>(T) {
     const contact::PairList all = pair_list(pairs, ptr, entry, constants, ptr.numel() - 1);
-    const contact::KeepInputs<T> in{array<bool>("keep", keep, constants, ScalarType::Bool, pairs.size(0)),
-                                    all.pairs,
-                                    all.ptr,
-                                    all.entry,
-                                    pair_constants<T>(constants, pairs, constants),
-                                    pairs.size(0),
-                                    ptr.numel() - 1};
+    const contact::CompactInputs<T> in{array<bool>("keep", keep, constants, ScalarType::Bool, pairs.size(0)),
+                                       all.pairs,
+                                       all.ptr,
+                                       all.entry,
+                                       pair_constants<T>(constants, pairs, constants),
+                                       pairs.size(0),
+                                       ptr.numel() - 1};
     require(in.corners >= 0, "diffvbd::contact_keep: expected pairs made by contact_detect");
     int64_t capacity = in.count;
 #ifndef USE_CUDA
@@ -169,8 +171,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
                  pairs_out = device.empty({capacity, contact::kPairRow}, ScalarType::Int),
                  ptr_out = device.empty({ptr.numel()}, ScalarType::Int),
                  entry_out = device.empty({4 * capacity}, ScalarType::Int);
-    const contact::Kept<T> out{data<int64_t>(rows),      data<int32_t>(pairs_out), data<int32_t>(ptr_out),
-                               data<int32_t>(entry_out), data<T>(constants_out),   capacity};
+    const contact::CompactList<T> out{data<int64_t>(rows),      data<int32_t>(pairs_out), data<int32_t>(ptr_out),
+                                      data<int32_t>(entry_out), data<T>(constants_out),   capacity};
 #ifdef USE_CUDA
     const Tensor work = device.bytes(cuda::compact_list_bytes(in));
     DIFFVBD_RUN(device, compact_list<T>, in, out, work.data_ptr());
@@ -249,7 +251,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x
     const Reader<T> read(x);
     const auto by = lag_coefficients(friction, damping, read);
     const int64_t b = x.size(0), rows = pairs.size(0) * contact::kLagScalars;
-    const contact::RubbingBars<T> given{
+    const contact::LaggedFrictionBars<T> given{
         lag_bar.numel() ? read.like("lag_bar", lag_bar, rows) : nullptr,
         push_bar.numel() ? read.like("push_bar", push_bar, 3 * b * in.corners) : nullptr, in.corners};
     Tensor points = device.empty({b, in.corners, 3}), kappa_bar = device.empty({b});
@@ -275,10 +277,10 @@ contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u
   read.by_body(in.scene, order, ptr);
   in.scene.x = read.positions();
   in.scene.origin = read.batch_or_null("origin", origin, 3 * read.v);
-  in.way = read.vectors("way", way);
+  in.displacement = read.vectors("way", way);
   if (u.numel() > 0) in.u = read.like("u", u, 3 * in.scene.scenes * in.scene.bodies);
   in.floor = floor_of(read, planes), in.planes = planes_of(planes);
-  in.held = read.flags("held", held, read.v, true);
+  in.pinned = read.flags("held", held, read.v, true);
   return in;
 }
 
@@ -290,7 +292,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_above_floor, In x, In u, In way, In planes, In 
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = above_floor_inputs<T>(x, u, way, planes, origin, held, body_order, body_ptr);
     Tensor left = device.like_x(), stopped = device.empty({in.scene.scenes, in.scene.bodies}, ScalarType::Bool);
-    device.bodies(contact::AboveFloorWays<T>{in, data<T>(left), data<bool>(stopped)});
+    device.bodies(contact::AboveFloorDisplacements<T>{in, data<T>(left), data<bool>(stopped)});
     return Out<2>(left, stopped);
   });
 }
@@ -320,8 +322,8 @@ contact::StartInputs<T> start_inputs(const Tensor& x, const IndexTensors& index)
   contact::StartInputs<T> in{};
   read.by_body(in.scene, index.order, index.ptr);
   in.scene.x = read.positions();
-  in.held = read.flags("held", index.held, read.v, true), in.body = read.index("body", index.body, read.v, true);
-  in.held_bodies = read.flags("held_bodies", index.held_bodies, in.scene.bodies);
+  in.pinned = read.flags("held", index.held, read.v, true), in.body = read.index("body", index.body, read.v, true);
+  in.pinned_bodies = read.flags("held_bodies", index.held_bodies, in.scene.bodies);
   return in;
 }
 
@@ -397,8 +399,8 @@ DIFFVBD_OPERATOR(Out<2>, contact_hold, In way, In state, In rises) {
     contact::StartInputs<T> in{};
     in.scene.scenes = read.b, in.scene.vertices = static_cast<int32_t>(read.v);
     Tensor way_out = device.like_x(), state_out = device.empty({read.b, read.v}, ScalarType::Byte);
-    device.vertices(contact::Holds<T>{in, read.positions(), read.bytes("state", state, rows),
-                                      read.flags("rises", rises, rows), data<T>(way_out), data<uint8_t>(state_out)});
+    device.vertices(contact::Freeze<T>{in, read.positions(), read.bytes("state", state, rows),
+                                       read.flags("rises", rises, rows), data<T>(way_out), data<uint8_t>(state_out)});
     return Out<2>(way_out, state_out);
   });
 }
@@ -408,11 +410,11 @@ DIFFVBD_OPERATOR(Out<2>, contact_held_up, In base, In way, In share, In state, D
   return dispatch_float(base, [&]<class T>(T) {
     auto in = start_inputs<T>(base, {held, held_bodies, body, body_order, body_ptr});
     const Reader<T> read(base);
-    in.share = read.of_vertices("share", share);
+    in.fraction = read.of_vertices("share", share);
     Tensor to = device.like_x(), state_out = device.empty({read.b, read.v}, ScalarType::Byte);
-    device.bodies(contact::HeldUp<T>{in, read.positions(), read.vectors("way", way),
-                                     read.bytes("state", state, read.b * read.v), data<T>(to),
-                                     data<uint8_t>(state_out)});
+    device.bodies(contact::BlockedBodies<T>{in, read.positions(), read.vectors("way", way),
+                                            read.bytes("state", state, read.b * read.v), data<T>(to),
+                                            data<uint8_t>(state_out)});
     return Out<2>(to, state_out);
   });
 }
@@ -424,10 +426,10 @@ DIFFVBD_OPERATOR(Out<3>, contact_falls, In x, In move, In fall, In u, In left, I
     auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
                               {held, held_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
-    in.fall = read.vectors("fall", fall), in.share = read.of_vertices("share", share);
+    in.gravity_move = read.vectors("fall", fall), in.fraction = read.of_vertices("share", share);
     Tensor went = device.empty({read.b, read.v}), at = device.like_x(), way = device.like_x();
-    device.vertices(
-        contact::Falls<T>{in, read.bytes("state", state, read.b * read.v), data<T>(went), data<T>(at), data<T>(way)});
+    device.vertices(contact::GravityMoves<T>{in, read.bytes("state", state, read.b * read.v), data<T>(went),
+                                             data<T>(at), data<T>(way)});
     return Out<3>(went, at, way);
   });
 }
@@ -441,8 +443,8 @@ DIFFVBD_OPERATOR(Out<2>, contact_start, In x, In move, In fall, In u, In left, I
     auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
                               {held, held_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
-    in.fall = read.vectors("fall", fall);
-    in.share = read.of_vertices("share", share), in.last_share = read.of_vertices("last_share", last_share);
+    in.gravity_move = read.vectors("fall", fall);
+    in.fraction = read.of_vertices("share", share), in.last_fraction = read.of_vertices("last_share", last_share);
     Tensor end = device.like_x(), is_short = device.empty({read.b, read.v}, ScalarType::Bool);
     device.vertices(contact::Starts<T>{in, read.flags("stopped", stopped, in.scene.scenes * in.scene.bodies),
                                        data<T>(end), data<bool>(is_short)});
@@ -456,8 +458,8 @@ DIFFVBD_OPERATOR(Out<6>, contact_start_backward, In bar, In x, In move, In fall,
     auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
                               {held, held_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
-    in.fall = read.vectors("fall", fall);
-    in.share = read.of_vertices("share", share), in.last_share = read.of_vertices("last_share", last_share);
+    in.gravity_move = read.vectors("fall", fall);
+    in.fraction = read.of_vertices("share", share), in.last_fraction = read.of_vertices("last_share", last_share);
     const Tensor x_bar = device.like_x(), move_bar = device.like_x(), fall_bar = device.like_x(),
                  u_bar = device.like_x(), left_bar = device.like_x(),
                  planes_bar = device.empty({read.b, read.v, wants_planes ? in.floor_scalars : 0});

@@ -56,7 +56,7 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
     in.planes = static_cast<int>(t.floor_lag.numel() / t.floor_lag.size(0) / (read.v * contact::kFloorLag));
     in.floor_lag = read.batch("floor_lag", t.floor_lag, read.v * in.planes * contact::kFloorLag);
   }
-  in.center = read.vectors("center", t.center), in.room = read.of_vertices("room", t.room);
+  in.center = read.vectors("center", t.center), in.trust_radius = read.of_vertices("room", t.room);
   in.x_prev = step.x_prev;
   in.friction_eps = static_cast<T>(friction_eps);
   return in;
@@ -79,7 +79,7 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const Swe
   in.factor = {read.like("coarse_factor", f.coarse_factor, 9 * int64_t{p.cells} * read.b), 9 * int64_t{p.cells}, 1};
   in.mass = read.batch("coarse_mass", f.coarse_mass, p.cells);
   in.keeps_positions = keeps_positions(step.energies);
-  in.pressed = has_vertex_energy(step.energies);
+  in.has_vertex_blocks = has_vertex_energy(step.energies);
   in.corrections = coarse::corrections_of(step.sweeps, p.every, p.begun);
   return in;
 }
@@ -344,7 +344,7 @@ struct ContactSlots {
       const int64_t scene = at / corners, corner = at % corners;
       T* to = corner < v ? data<T>(bars.x_prev) + 3 * (scene * v + corner)
                          : data<T>(bars.collider_prev) + 3 * (scene * (corners - v) + corner - v);
-      contact::add_at(to, contact::vector_at(data<T>(prev) + 3 * at));
+      diffvbd::add_to(to, diffvbd::vector_at(data<T>(prev) + 3 * at));
     }
   }
 #endif

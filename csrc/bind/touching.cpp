@@ -1,6 +1,6 @@
 // Operators of the rigid correction of bodies that touch.
-#include "../contact/rigid_reverse.h"
-#include "../contact/rigid_tries.h"
+#include "../subspace/contact_rigid.h"
+#include "../subspace/contact_rigid_reverse.h"
 #include "body.h"
 #include "contact.h"
 
@@ -27,10 +27,10 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
   contact::AdvanceInputs<T>& gate = in.gate;
   gate.x = read.positions(), gate.move = move;
   gate.origin = in.scene.origin.data;
-  gate.center = read.vectors("center", t.center), gate.room = read.of_vertices("room", t.room);
+  gate.center = read.vectors("center", t.center), gate.trust_radius = read.of_vertices("room", t.room);
   gate.collider = gate.collider_next = read.like("collider", t.collider, 3 * b * colliders);
   in.collider_prev = read.like("collider_prev", t.collider_prev, 3 * b * colliders);
-  gate.held = read.flags("held", t.held, corners), gate.body = read.index("body", t.body, corners);
+  gate.pinned = read.flags("held", t.held, corners), gate.body = read.index("body", t.body, corners);
   gate.listed = pair_list(t.pairs, t.pair_ptr, t.pair_entry, t.x, b * corners);
   gate.constants = pair_constants<T>(t.constants, t.pairs, t.x);
   gate.scenes = b;
@@ -47,7 +47,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
     in.floor_lag = read.batch("floor_lag", t.floor_lag, v * in.planes * contact::kFloorLag);
   }
   if (groups.numel() > 0) in.groups = read.index("groups", groups, contact::kGroupRows * b * bodies);
-  in.room = contact::most_grouped(bodies);
+  in.capacity = contact::most_grouped(bodies);
   in.has_friction = 0 < q.friction_eps;
   in.friction_eps = in.has_friction ? q.friction_eps : 1;
   return in;
@@ -57,14 +57,14 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
 // memory of a factor has room for no others.
 template <class T>
 void set_moving(contact::RigidInputs<T>& in, const Tensor& moving, bool alone, const Tensor& x) {
-  if (!in.together() && alone) in.room = std::min<int64_t>(in.bodies(), 1);
+  if (!in.together() && alone) in.capacity = std::min<int64_t>(in.bodies(), 1);
   const bool all = moving.dim() == 1 && moving.size(0) == 0;
   const bool* mask =
       array<bool>("moving", moving, x, ScalarType::Bool, all ? 0 : in.scene.scenes * int64_t{in.bodies()});
   if (!all && moving.numel() > 0) in.moving = mask;
 }
 
-DIFFVBD_ON_CUDA(cuda::PairCapacity room_of(const TouchingFields& f) {
+DIFFVBD_ON_CUDA(cuda::PairCapacity trust_radius_of(const TouchingFields& f) {
   return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
 })
 
@@ -88,11 +88,12 @@ DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints
     Tensor centers = device.empty({b, n, 3}, ScalarType::Double),
            motion = device.empty({b, n, six}, ScalarType::Double);
     Tensor factor = device.empty(
-        few ? std::vector<int64_t>{b, six * n, six * n} : std::vector<int64_t>{b, n, six, six * int64_t{in.room}},
+        few ? std::vector<int64_t>{b, six * n, six * n} : std::vector<int64_t>{b, n, six, six * int64_t{in.capacity}},
         ScalarType::Double);
-    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_system_bytes(in, room_of(f)));)
-    DIFFVBD_RUN(device, rigid_system<T>, in, DIFFVBD_ON_CUDA(room_of(f), ) data<double>(centers), data<double>(motion),
-                data<double>(factor), in.groups ? data<int32_t>(groups) : nullptr DIFFVBD_ON_CUDA(, work.data_ptr()));
+    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_system_bytes(in, trust_radius_of(f)));)
+    DIFFVBD_RUN(device, rigid_system<T>, in, DIFFVBD_ON_CUDA(trust_radius_of(f), ) data<double>(centers),
+                data<double>(motion), data<double>(factor),
+                in.groups ? data<int32_t>(groups) : nullptr DIFFVBD_ON_CUDA(, work.data_ptr()));
     return Out<4>(centers, motion, factor, groups);
   });
 }
@@ -116,8 +117,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_rigid_move, DIFFVBD_PARAMETERS(TOUCHING) In cen
                  moved = device.empty({b, n}, ScalarType::Bool), held_up = device.empty({b, n}, ScalarType::Bool),
                  left = device.empty({b, n});
     const contact::RigidOutcome<T> out{data<double>(share), data<bool>(moved), data<bool>(held_up), data<T>(left)};
-    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_move_bytes(in, room_of(f)));)
-    DIFFVBD_RUN(device, rigid_move<T>, in, DIFFVBD_ON_CUDA(room_of(f), ) center, motions, data<T>(way), out,
+    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_move_bytes(in, trust_radius_of(f)));)
+    DIFFVBD_RUN(device, rigid_move<T>, in, DIFFVBD_ON_CUDA(trust_radius_of(f), ) center, motions, data<T>(way), out,
                 data<T>(end) DIFFVBD_ON_CUDA(, work.data_ptr()));
     return Out<5>(end, share, moved, held_up, left);
   });
@@ -188,7 +189,7 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
       auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, nullptr, groups[k]);
       const int64_t rows = read.b * in.bodies();
       in.scene.x = in.gate.x = read.vectors("at", at[k]);
-      if (!in.together() && factor[k].dim() == 4) in.room = factor[k].size(3) / contact::kUnknowns;
+      if (!in.together() && factor[k].dim() == 4) in.capacity = factor[k].size(3) / contact::kUnknowns;
       read.doubles("factor", factor[k], read.b * in.matrix_size());
       require(read.b == 0 || in.together() == (in.groups == nullptr),
               "diffvbd::contact_rigid: expected groups as contact_rigid_system returns them");

@@ -1,19 +1,126 @@
-// How much of its way each vertex, or each body as a whole, may go at the start of the sweeps, where all move at once:
-// all of it wherever the pairs that it is in stay apart, else a half, a quarter, ... of what is left, and so on from
-// there. The shares are decided, not differentiated (docs/method.md, section 12).
+// Step fractions at the start of the sweeps, where all vertices, or all bodies as wholes, move at once: 1 where every
+// pair stays apart, else 1/2, 1/4, ... of what is left, and on from there. The fractions are decided, not
+// differentiated (docs/method.md, section 12).
 #pragma once
 
-#include "advance_state.h"
+#include "passes.h"
 
 namespace diffvbd::contact {
 
-constexpr int kMoves = 3;     // one after another, each of what the ones before have left
-constexpr int kRounds = 16;   // of halving in each
-constexpr int kPatience = 8;  // rounds from which on what fails does not move
-constexpr double kLeastTry = 1.0 / 64;
+template <class T>
+struct AdvanceInputs {
+  const T *x, *move;                  // [B, V, 3]  positions at the detection; wanted displacement
+  const T* u;                         // [B, bodies, 3]  translation of each body's island; or null
+  const T* center;                    // [B, V, 3]  center of the trust region, less u
+  const T* origin;                    // [B, V, 3] or null
+  const T *collider, *collider_next;  // [B, Vc, 3]
+  const bool* pinned;                 // [N]
+  const int32_t* body;                // [N]
+  PairList listed;
+  const T* constants;
+  const T* trust_radius;                             // [B, V]
+  const T *deformation_center, *deformation_radius;  // the same relative to the rigid motion of the body; or null
+  int64_t scenes;
+  int32_t vertices, corners, bodies;
+  bool careful;  // the motion does not minimise the barrier
+  bool whole;    // all vertices of a body have one fraction
+
+  // Units have a fraction each: vertices, or bodies.
+  DIFFVBD_FN int64_t units() const { return scenes * (whole ? bodies : vertices); }
+  DIFFVBD_FN int64_t unit(int64_t scene, int32_t v) const {
+    return whole ? scene * bodies + body[v] : scene * vertices + v;
+  }
+  DIFFVBD_FN int64_t scene_of_unit(int64_t unit) const { return unit / (whole ? bodies : vertices); }
+};
+
+// A vertex's displacement since gaps were taken, now and after the trial.
+template <class T>
+struct Motion {
+  Vec3<T> since, end;
+  T size;  // of its position, the scale of rounding
+};
+
+// The state of the search, for each unit.
+template <class T>
+struct AdvanceState {
+  T *fraction, *now;                  // of the whole displacement after the moves so far; trial fraction of the rest
+  uint8_t *blocked, *stamp;           // whether a pair blocks it; round in which its trial was last reduced
+  uint8_t* failed;                    // [B]  scenes without an admissible trial
+  bool first;                         // the move in which colliders and prescribed vertices go
+  const Motion<T>* motion = nullptr;  // [B, V]  in this round; set before pairs are looked at
+};
+
+// Several threads may write; all write the same.
+DIFFVBD_FN void mark(uint8_t* flag) {
+#if defined(__CUDA_ARCH__)
+  *flag = 1;
+#else
+  __atomic_store_n(flag, uint8_t{1}, __ATOMIC_RELAXED);
+#endif
+}
+
+template <class T>
+DIFFVBD_FN Vec3<T> displacement_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) {
+  const Vec3<T> displacement = vector_at(in.move + 3 * (scene * in.vertices + v));
+  return in.pinned[v] || !in.u ? displacement : displacement - vector_at(in.u + 3 * (scene * in.bodies + in.body[v]));
+}
+
+// The trial part of it.
+template <class T>
+DIFFVBD_FN Vec3<T> trial_displacement(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
+  const int64_t unit = in.unit(scene, v);
+  const T done = in.pinned[v] ? T(s.first ? 0 : 1) : s.fraction[unit];
+  return ((T(1) - done) * (in.pinned[v] ? T(1) : s.now[unit])) * displacement_of(in, scene, v);
+}
+
+// A vertex at its current position, relative to `from`, and its trial displacement.
+template <class T>
+struct Trial {
+  Vec3<T> at, from, since, displacement;
+  T size;
+};
+
+template <class T>
+DIFFVBD_FN T size_of(const Vec3<T>& p) {
+  return absolute(p.x) + absolute(p.y) + absolute(p.z);
+}
+
+template <class T>
+DIFFVBD_FN Trial<T> trial(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
+  Trial<T> out;
+  const int64_t row = scene * in.vertices + v;
+  const Vec3<T> whole = displacement_of(in, scene, v);
+  const int64_t unit = in.unit(scene, v);
+  const T done = in.pinned[v] ? T(s.first ? 0 : 1) : s.fraction[unit];
+  out.at = vector_at(in.x + 3 * row) + done * whole;
+  out.since = out.at - vector_at(in.center + 3 * row);
+  out.from = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
+  out.displacement = trial_displacement(in, s, scene, v);
+  out.size = size_of(out.at + out.from);
+  return out;
+}
+template <class T>
+DIFFVBD_FN Motion<T> motion_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
+  const Trial<T> t = trial(in, s, scene, v);
+  return {t.since, t.since + t.displacement, t.size};
+}
+template <class T>
+DIFFVBD_FN Motion<T> motion_at(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair, int k) {
+  return s.motion[int64_t{pair[5]} * in.vertices + pair[k]];
+}
+
+template <class T>
+DIFFVBD_FN T guard_of_size(T size) {
+  return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
+}
+
+constexpr int kMoves = 3;     // in sequence, each of what the moves before have left
+constexpr int kRounds = 16;   // rounds of halving in each
+constexpr int kPatience = 8;  // rounds after which what fails does not move
+constexpr double kLeastTrial = 1.0 / 64;
 constexpr double kRoundedSquare = 4e-6;  // of squares of lengths: more than rounding makes of them
 
-// Whether a collider's point is already where it ends: planes are, wherever they come from.
+// Whether a point of a collider is at its end already: planes always are.
 template <class T>
 DIFFVBD_FN bool is_still(const AdvanceState<T>& s, const int32_t* pair) {
   return pair[4] == kPointPlane || !s.first;
@@ -23,7 +130,7 @@ DIFFVBD_FN int64_t row_of_collider(const AdvanceInputs<T>& in, const int32_t* pa
   return 3 * (int64_t{pair[5]} * (in.corners - in.vertices) + pair[k] - in.vertices);
 }
 
-// The corners of a pair as they are where a move begins.
+// The corners of a pair at the begin of a move.
 template <class T>
 struct PairPlace {
   Corners<T> corners;
@@ -50,34 +157,35 @@ DIFFVBD_FN PairPlace<T> place_of(const AdvanceInputs<T>& in, const AdvanceState<
   return out;
 }
 
-// The ways that they try.
+// Their trial displacements.
 template <class T>
-struct Ways {
-  Vec3<T> way[4];
-  T shares[4];  // of a gap that each may close
+struct TrialDisplacements {
+  Vec3<T> displacement[4];
+  T fractions[4];  // of a gap that each may close
   bool free[4], moves, careful;
-  DIFFVBD_FN Ways(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair)
+  DIFFVBD_FN TrialDisplacements(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair)
       : moves(false), careful(false) {
     bool one = false, other = false;
     for (int k = 0; k < 4; ++k) {
       if (pair[k] >= in.vertices) {
         const int64_t row = row_of_collider(in, pair, k);
-        way[k] = is_still(s, pair) ? zero3<T>() : vector_at(in.collider_next + row) - vector_at(in.collider + row);
+        displacement[k] =
+            is_still(s, pair) ? zero3<T>() : vector_at(in.collider_next + row) - vector_at(in.collider + row);
         free[k] = false;
       } else {
-        way[k] = way_tried(in, s, pair[5], pair[k]);
-        free[k] = !in.held[pair[k]];
+        displacement[k] = trial_displacement(in, s, pair[5], pair[k]);
+        free[k] = !in.pinned[pair[k]];
       }
-      const bool goes = T(0) < dot(way[k], way[k]);
+      const bool goes = T(0) < dot(displacement[k], displacement[k]);
       one = one || (goes && k < sides(pair[4])), other = other || (goes && k >= sides(pair[4]));
       careful = careful || (in.careful && free[k] && goes);  // what is prescribed may come closer
     }
     moves = one || other;
-    for (T& own : shares) own = one && other ? T(kBothShare) : T(kShare);
+    for (T& own : fractions) own = one && other ? T(kBothGapFraction) : T(kGapFraction);
   }
 };
 
-// The gap of a point above a plane that has yet to move. Apart, since it is seldom asked for.
+// The gap of a point above a plane before the plane moves. Out of line: seldom needed.
 template <class T>
 DIFFVBD_APART T gap_before(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair, T offset) {
   const Trial<T> t = trial(in, s, pair[5], pair[0]);
@@ -89,7 +197,7 @@ DIFFVBD_APART T gap_before(const AdvanceInputs<T>& in, const AdvanceState<T>& s,
   return distance(kPointPlane, corners).d - offset;
 }
 
-// What keeps a pair apart along the direction of its closest points in a move: all but the ways that it tries.
+// The separating plane of a pair in a move, without the trial displacements.
 template <class T>
 struct PairPlane {
   Vec3<T> n;
@@ -102,7 +210,7 @@ struct PairPlane {
     n = distance(record[4], at.corners).n;
     separation = Separation<T>(record[4], at.corners, n, constants.offset);
     guard = at.guard, least = least_of(constants.dhat);
-    // a plane that would pass the point: this has to go as far as that comes
+    // a plane that would pass the point: the point must keep ahead of it
     if (record[4] == kPointPlane && s.first && !(guard < separation.gap) && in.collider != in.collider_next) {
       const T before = gap_before(in, s, record, constants.offset);
       if (T(0) < before) separation.slack[0] = separation.gap - before, separation.gap = before;
@@ -110,76 +218,77 @@ struct PairPlane {
   }
   DIFFVBD_FN void forget() { least = T(-1); }
   DIFFVBD_FN bool is_known() const { return T(0) <= least; }
-  DIFFVBD_FN bool holds(int kind, const Ways<T>& a) const {
-    const bool rests = !a.moves && !(separation.slack[0] < T(0));
-    return rests || holds_along(kind, n, separation, guard, least, a.way, a.shares, a.careful, a.careful);
+  DIFFVBD_FN bool holds(int kind, const TrialDisplacements<T>& a) const {
+    const bool at_rest = !a.moves && !(separation.slack[0] < T(0));
+    return at_rest || holds_along(kind, n, separation, guard, least, a.displacement, a.fractions, a.careful, a.careful);
   }
 };
 
-// Whether a pair stays out of the barrier's reach all the way, however its corners go: by its gap when that was taken.
+// Whether a pair stays out of the barrier's reach, by its gap when that was taken.
 template <class T>
 DIFFVBD_FN bool stays_far(const Motion<T> (&m)[4], const int32_t* pair, const T* constants) {
   T size = T(0), most = T(0);
   for (const Motion<T>& own : m) size = size < own.size ? own.size : size;
-  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
-  if (!(T(0) < room)) return false;
+  const T slack = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
+  if (!(T(0) < slack)) return false;
   each_across(sides(pair[4]), [&](int i, int j) {
-    const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].end - m[j].end};
-    for (const Vec3<T>& d : ways) {
+    const Vec3<T> displacements[] = {m[i].since - m[j].since, m[i].end - m[j].end};
+    for (const Vec3<T>& d : displacements) {
       const T square = dot(d, d);
       most = most < square ? square : most;
     }
   });
-  return most < room * room;
+  return most < slack * slack;
 }
 template <class T>
 DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair,
                           const T* constants) {
   Motion<T> m[4];
   for (int k = 0; k < 4; ++k) {
-    if (pair[k] >= in.vertices) return false;  // whose gap may be of another time
+    if (pair[k] >= in.vertices) return false;  // its gap may be older
     m[k] = motion_at(in, s, pair, k);
   }
   return stays_far(m, pair, constants);
 }
 
-// Whether it stays so whatever shares of their ways its corners go: then no round of a move has to look at it.
+// The same for any fractions of its corners: no round of a move has to test the pair.
 template <class T>
-DIFFVBD_FN bool stays_far_at_any_share(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
+DIFFVBD_FN bool stays_far_at_any_fraction(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
   const T* constants = in.constants + kConstants * pair;
-  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
+  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (pair_list.h)
   Motion<T> m[4];
   T size = T(0), most = T(0);
   for (int k = 0; k < 4; ++k) {
-    if (record[k] >= in.vertices) return false;  // whose gap may be of another time
+    if (record[k] >= in.vertices) return false;  // its gap may be older
     m[k] = motion_at(in, s, record, k);
     size = size < m[k].size ? m[k].size : size;
   }
-  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
-  if (!(T(0) < room)) return false;
+  const T slack = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
+  if (!(T(0) < slack)) return false;
   each_across(sides(record[4]), [&](int i, int j) {
-    const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].since - m[j].end, m[i].end - m[j].since, m[i].end - m[j].end};
-    for (const Vec3<T>& d : ways) {
+    const Vec3<T> displacements[] = {m[i].since - m[j].since, m[i].since - m[j].end, m[i].end - m[j].since,
+                                     m[i].end - m[j].end};
+    for (const Vec3<T>& d : displacements) {
       const T square = dot(d, d);
       most = most < square ? square : most;
     }
   });
-  return T(1 + kRoundedSquare) * most < room * room;
+  return T(1 + kRoundedSquare) * most < slack * slack;
 }
 
-// Whether a corner of a pair has yet to go some of its way: what earlier moves have taken all the way moves no more.
+// Whether a corner of a pair has displacement left.
 template <class T>
 DIFFVBD_FN bool is_open(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* record) {
   for (int k = 0; k < 4; ++k) {
-    if (record[k] < in.vertices && !in.held[record[k]] && s.share[in.unit(record[5], record[k])] < T(1)) {
+    if (record[k] < in.vertices && !in.pinned[record[k]] && s.fraction[in.unit(record[5], record[k])] < T(1)) {
       return true;
     }
   }
   return false;
 }
 
-// Whether one has tried less in the round before.
+// Whether the trial of a corner was reduced in the round before.
 template <class T>
 DIFFVBD_FN bool is_retried(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* record, int round) {
   for (int k = 0; k < 4; ++k) {
@@ -188,8 +297,8 @@ DIFFVBD_FN bool is_retried(const AdvanceInputs<T>& in, const AdvanceState<T>& s,
   return false;
 }
 
-// Whether a pair passes by its plane, which is found when it is first asked for, or need not be looked at in this
-// round: the quick part of try_pair(). find(): the plane.
+// The quick part of test_pair(): whether the separating plane admits the pair, or the pair needs no test in this round.
+// find(): the plane, on first use.
 template <class T, class Find>
 DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, PairPlane<T>& plane, int64_t pair,
                           int round, const Find& find) {
@@ -197,32 +306,33 @@ DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   if (round > 0 && !is_retried(in, s, record, round)) return true;
   if (stays_far(in, s, record, in.constants + kConstants * pair)) return true;
   if (!plane.is_known()) plane = find();
-  return plane.holds(record[4], Ways<T>(in, s, record));
+  return plane.holds(record[4], TrialDisplacements<T>(in, s, record));
 }
 
-// Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at
-// those of which a corner has tried less in the round before.
+// Marks the corners that block a pair; returns whether it is safe. Round 0 tests all pairs, later rounds those with a
+// reduced corner.
 template <class T>
-DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
+DIFFVBD_FN bool test_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
   if (round > 0 && !is_retried(in, s, record, round)) return true;
   if (!s.first && round == 0 && !is_open(in, s, record)) return true;
   const T* constants = in.constants + kConstants * pair;
-  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
+  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (pair_list.h)
   if (stays_far(in, s, record, constants)) return true;                                // as do most
-  const Ways<T> a(in, s, record);
+  const TrialDisplacements<T> a(in, s, record);
   const bool plane = record[4] == kPointPlane;
   if (plane && PairPlane<T>(in, s, pair).holds(record[4], a)) return true;
   if (!plane && !a.moves) return true;
   const int first = sides(record[4]);
   const PairPlace<T> at = place_of(in, s, record);
   const Gate<T> gate(record[4], at.corners, constants, at.guard);
-  if (!plane && (gate.holds(a.way, a.shares, a.careful) || stays_apart(gate, a.way, a.careful))) return true;
+  if (!plane && (gate.holds(a.displacement, a.fractions, a.careful) || stays_apart(gate, a.displacement, a.careful)))
+    return true;
   bool named = false;
   for (int pass = 0; pass < 2 && !named; ++pass) {
     for (int k = 0; k < 4; ++k) {
-      if (!a.free[k] || !(T(0) < dot(a.way[k], a.way[k]))) continue;
-      const T toward = (k < first ? -dot(gate.n, a.way[k]) : dot(gate.n, a.way[k]));
+      if (!a.free[k] || !(T(0) < dot(a.displacement[k], a.displacement[k]))) continue;
+      const T toward = (k < first ? -dot(gate.n, a.displacement[k]) : dot(gate.n, a.displacement[k]));
       if (pass == 0 && !(T(kStartLeast) * gate.gap < toward)) continue;
       mark(s.blocked + in.unit(record[5], record[k]));
       named = true;
@@ -236,64 +346,66 @@ DIFFVBD_FN T total(T done, T now) {
   return now == T(1) ? T(1) : done + now * (T(1) - done);
 }
 
-// Whether a vertex is within its rooms after a share of its way.
+// Whether a vertex is within its radii after a fraction of its displacement.
 template <class T>
-DIFFVBD_FN bool is_within_rooms(const AdvanceInputs<T>& in, int64_t scene, int32_t v, T share) {
+DIFFVBD_FN bool is_within_radii(const AdvanceInputs<T>& in, int64_t scene, int32_t v, T fraction) {
   const int64_t row = scene * in.vertices + v;
-  const Vec3<T> end = vector_at(in.x + 3 * row) + share * way_of(in, scene, v);
-  const auto within = [&](const T* center, const T* room) {
+  const Vec3<T> end = vector_at(in.x + 3 * row) + fraction * displacement_of(in, scene, v);
+  const auto within = [&](const T* center, const T* trust_radius) {
     const Vec3<T> off = end - vector_at(center + 3 * row);
-    return dot(off, off) <= room[row] * room[row];
+    return dot(off, off) <= trust_radius[row] * trust_radius[row];
   };
-  return within(in.center, in.room) && (!in.own_room || within(in.own_center, in.own_room));
+  return within(in.center, in.trust_radius) &&
+         (!in.deformation_radius || within(in.deformation_center, in.deformation_radius));
 }
 
-// Marks the body of a vertex that leaves its rooms by what it tries; returns whether it stays. Rounds as of try_pair().
-// A vertex on its own tries no more than its rooms let it: begin_move().
+// Marks the body of a vertex that leaves its radii by the trial; returns whether it stays. Rounds as in test_pair().
+// The trial of a single vertex is within its radii: begin_move().
 template <class T>
 DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v, int round) {
   const int64_t unit = in.unit(scene, v);
-  if (in.held[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
-  if (is_within_rooms(in, scene, v, total(s.share[unit], s.now[unit]))) return true;
+  if (in.pinned[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
+  if (is_within_radii(in, scene, v, total(s.fraction[unit], s.now[unit]))) return true;
   mark(s.blocked + unit);
   return false;
 }
 
-// What is tried next where `now` of what is left does not pass.
+// The next smaller trial fraction.
 template <class T>
-DIFFVBD_FN T next_try(T now) {
-  return T(kLeastTry) < now ? T(0.5) * now : T(0);
+DIFFVBD_FN T next_trial(T now) {
+  return T(kLeastTrial) < now ? T(0.5) * now : T(0);
 }
 
-// After a round: what is blocked tries less.
+// After a round: blocked units reduce their trials.
 template <class T>
 DIFFVBD_FN bool retreat(const AdvanceState<T>& s, int64_t unit, int round) {
   if (!s.blocked[unit]) return false;
   s.blocked[unit] = 0;
   s.stamp[unit] = static_cast<uint8_t>(round + 1);
-  s.now[unit] = round < kPatience ? next_try(s.now[unit]) : T(0);
+  s.now[unit] = round < kPatience ? next_trial(s.now[unit]) : T(0);
   return true;
 }
 
 template <class T>
 DIFFVBD_FN void begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
-  if (s.first) s.share[unit] = T(0);
+  if (s.first) s.fraction[unit] = T(0);
   T now = T(1);
-  if (!in.whole) {  // rooms are balls: at smaller shares it is no farther out than at this one or now
+  if (!in.whole) {  // balls: at a smaller fraction it is no farther out than at this one or now
     const int64_t scene = in.scene_of_unit(unit);
     const auto v = static_cast<int32_t>(unit - scene * in.vertices);
-    while (!in.held[v] && T(0) < now && !is_within_rooms(in, scene, v, total(s.share[unit], now))) now = next_try(now);
+    while (!in.pinned[v] && T(0) < now && !is_within_radii(in, scene, v, total(s.fraction[unit], now)))
+      now = next_trial(now);
   }
   s.now[unit] = now, s.blocked[unit] = s.stamp[unit] = 0;
 }
-// A scene that has found no way stays where it is in this move.
+// A scene without an admissible trial stays in this move.
 template <class T>
 DIFFVBD_FN void give_up(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
   if (s.failed[in.scene_of_unit(unit)]) s.now[unit] = T(0);
 }
 template <class T>
 DIFFVBD_FN void end_move(const AdvanceState<T>& s, int64_t unit) {
-  s.share[unit] = total(s.share[unit], s.now[unit]);
+  s.fraction[unit] = total(s.fraction[unit], s.now[unit]);
 }
 
 }  // namespace diffvbd::contact

@@ -9,7 +9,7 @@
 
 namespace diffvbd::contact {
 
-// What the corners are: point and triangle, edge and edge, or point and the plane of a triangle that has no end.
+// The kind of the corners: point and triangle, edge and edge, or point and the unbounded plane of a triangle.
 enum Kind { kPointTriangle = 0, kEdgeEdge = 1, kPointPlane = 2 };
 
 // Corner positions [m], relative to a point of the pair.
@@ -99,7 +99,7 @@ DIFFVBD_FN Distance<R> chosen(const M& condition, const Distance<R>& a, const Di
 // Below this squared sine two directions count as parallel.
 DIFFVBD_FN constexpr double parallel() { return 1e-16; }
 
-// Where the closest points of a point and a triangle are, if that is inside its face.
+// The closest points of a point and a triangle, if inside its face.
 template <class R>
 struct InFace {
   Vec3<R> normal;
@@ -122,7 +122,7 @@ struct InFace {
     return out;
   }
 };
-// And those of two edges, if they are inside both.
+// The closest points of two edges, if inside both.
 template <class R>
 struct InEdges {
   Vec3<R> normal;
@@ -208,7 +208,7 @@ DIFFVBD_FN Distance<R> distance(int kind, const Corners<R>& c, int* feature = nu
                                 : point_plane(c);
 }
 
-// Where the closest points are those of an end.
+// The distance at an end.
 template <class R>
 DIFFVBD_FN Distance<R> at_end(int kind, const End& end, const Corners<R>& c) {
   const auto corner = [&](int i) {  // chosen by comparison: an index would move the corners from registers to memory

@@ -1,12 +1,12 @@
-// Whether an edge of the surfaces passes through a triangle, and whether a point lies behind a plane: what no distance
-// shows, and what a start must not have. By signs of volumes in double precision, of positions plus origins.
+// Intersections: edges of surfaces through triangles, points behind planes. No distance shows them, and a start must
+// have none. By signs of volumes of positions plus origins, in double precision.
 #pragma once
 
-#include "candidates.h"
+#include "detection.h"
 
 namespace diffvbd::contact {
 
-// What a search for intersections returns. Unused rows are -1.
+// The result of a search for intersections. Unused rows are -1.
 constexpr int kCrossingRow = 3;
 struct Intersections {
   int64_t capacity;
@@ -98,7 +98,7 @@ DIFFVBD_FN bool is_crossing(const Surfaces<T>& in, int64_t scene, int32_t edge, 
   // positions first: of what is tried they rule out nearly all
   return crosses(position(in, scene, e[0]), position(in, scene, e[1]), position(in, scene, t[0]),
                  position(in, scene, t[1]), position(in, scene, t[2])) &&
-         !(in.held[e[0]] && in.held[e[1]] && in.held[t[0]] && in.held[t[1]] && in.held[t[2]]) &&
+         !(in.pinned[e[0]] && in.pinned[e[1]] && in.pinned[t[0]] && in.pinned[t[1]] && in.pinned[t[2]]) &&
          !in.ignores(in.group(e[0]), in.group(t[0])) && !is_one_place(in, e, t);
 }
 
@@ -106,7 +106,7 @@ DIFFVBD_FN bool is_crossing(const Surfaces<T>& in, int64_t scene, int32_t edge, 
 template <class T>
 DIFFVBD_FN bool is_behind(const Surfaces<T>& in, int64_t scene, int32_t point, int32_t plane) {
   const int32_t i = in.points[point], *t = in.planes + int64_t{3} * plane;
-  if (in.held[i]) return false;
+  if (in.pinned[i]) return false;
   const Vec3<double> a = position(in, scene, t[0]);
   return side(normal_of(position(in, scene, t[1]) - a, position(in, scene, t[2]) - a), position(in, scene, i) - a) < 0;
 }
@@ -120,7 +120,7 @@ template <class T>
 DIFFVBD_FN uint64_t crossing_key(const Surfaces<T>& in, int64_t scene, int32_t edge, int32_t triangle) {
   return crossing_keys(in, scene) + static_cast<uint64_t>(edge) * in.num_triangles + static_cast<uint64_t>(triangle);
 }
-// Of a point and a plane of one scene.
+// The key of a point and a plane of one scene.
 template <class T>
 DIFFVBD_FN uint64_t behind_key(const Surfaces<T>& in, int32_t point, int32_t plane) {
   return static_cast<uint64_t>(point) * in.num_planes + static_cast<uint64_t>(plane);

@@ -1,28 +1,29 @@
-// How far a vertex may go without that two surfaces cross: as long as a plane keeps the sides of a pair apart, with the
-// pair's own closest points, or with a direction that the neighbourhood suggests. A limit is a power of two, from 1
-// down to 2^-7, or 0: it is decided, not differentiated (docs/method.md, section 12).
+// The largest step fraction of a vertex for which no two surfaces cross: a plane keeps the sides of a pair apart, by
+// the pair's closest points or by a direction that the neighbourhood suggests. A limit is 1, 1/2, ... 2^-7, or 0: it is
+// decided, not differentiated (docs/method.md, section 12).
 #pragma once
 
+#include <cstdint>
 #include <limits>
 
 #include "pairs.h"
 
 namespace diffvbd::contact {
 
-constexpr int kNoMove = 8;                   // the exponent that stands for a limit of 0
-constexpr double kBothShare = 0.45;          // of a gap that an update may close where both sides move
-constexpr double kShare = 2 * kBothShare;    // and where the other one rests
-constexpr double kStartLeast = 0.05;         // of any gap that what does not minimise the barrier may close
-constexpr double kStartPart = 0.5;           // of dhat: such motion brings no pair closer
-constexpr double kTight = 0.125;             // of that: a gap below it such motion closes no further,
+constexpr int kNoMove = 8;                             // the exponent that stands for a limit of 0
+constexpr double kBothGapFraction = 0.45;              // of a gap that an update may close where both sides move
+constexpr double kGapFraction = 2 * kBothGapFraction;  // and where one side moves
+constexpr double kStartLeast = 0.05;         // of any gap that a motion may close which does not minimise the barrier
+constexpr double kStartFraction = 0.5;       // of dhat: such a motion brings no pair closer
+constexpr double kTight = 0.125;             // of that: it closes a smaller gap no further,
 constexpr double kTightest = 1e-6;           // or by so much of itself
-constexpr double kGuardUlps = 32;            // roundings of a position, which a gap is not trusted to
-constexpr double kClosedGuards = 1.0 / 128;  // of these, that a way along a gap may seem to close
-constexpr double kTrusted = 0.25;            // of these, below which nothing goes; up to them, what does not close it
+constexpr double kGuardUlps = 32;            // roundings of a position, the uncertainty of a gap
+constexpr double kClosedGuards = 1.0 / 128;  // of these, that a displacement along a gap may seem to close
+constexpr double kTrusted = 0.25;            // of these: below, nothing moves; up to them, what does not close the gap
 
 template <class T>
 DIFFVBD_FN T least_of(T dhat) {
-  return T(kStartPart) * dhat;
+  return T(kStartFraction) * dhat;
 }
 
 template <class T>
@@ -52,42 +53,41 @@ struct Separation {
   Separation() = default;
   DIFFVBD_FN Separation(int kind, const Corners<R>& c, const Vec3<R>& m, const R& offset) {
     const int first = sides(kind);
-    R h[4], lowest = R(std::numeric_limits<float>::infinity()), highest = -lowest;
+    R h[4], minimum = R(std::numeric_limits<float>::infinity()), maximum = -minimum;
     for (int k = 0; k < 4; ++k) {
       h[k] = dot(m, c.x[k]);
-      if (k < first) lowest = select(h[k] < lowest, h[k], lowest);
-      if (k >= first) highest = select(highest < h[k], h[k], highest);
+      if (k < first) minimum = select(h[k] < minimum, h[k], minimum);
+      if (k >= first) maximum = select(maximum < h[k], h[k], maximum);
     }
-    for (int k = 0; k < 4; ++k) slack[k] = k < first ? h[k] - lowest : highest - h[k];
-    gap = lowest - highest - offset;
+    for (int k = 0; k < 4; ++k) slack[k] = k < first ? h[k] - minimum : maximum - h[k];
+    gap = minimum - maximum - offset;
   }
 };
 
-// What one corner of a pair may do while the others rest: the first of the questions that a Gate asks.
+// The largest motion of one corner while the others rest: the first test of a Gate.
 template <class T>
 struct Clearance {
   Vec3<T> toward;  // in which direction the corner closes the gap
   T gap, slack;    // along that direction [m]
-  DIFFVBD_FN bool holds(const Vec3<T>& d, T share, T guard) const {
+  DIFFVBD_FN bool holds(const Vec3<T>& d, T fraction, T guard) const {
     const T wide = gap - guard;
-    return T(0) < wide && dot(toward, d) <= slack + share * wide;
+    return T(0) < wide && dot(toward, d) <= slack + fraction * wide;
   }
 };
 
-// The exponent of a limit that keeps a vertex `offset` from the center of its room within the room.
+// The exponent of a limit that keeps a vertex, `offset` from the center of its trust region, within the radius.
 template <class T>
-DIFFVBD_FN int limit_by_room(const Vec3<T>& offset, const Vec3<T>& d, T room) {
+DIFFVBD_FN int limit_by_radius(const Vec3<T>& offset, const Vec3<T>& d, T trust_radius) {
   int exponent = 0;
   while (exponent < kNoMove) {
     const Vec3<T> end = offset + limit_of<T>(exponent) * d;
-    if (dot(end, end) <= room * room) break;
+    if (dot(end, end) <= trust_radius * trust_radius) break;
     ++exponent;
   }
   return exponent;
 }
 
-// What a listed pair knows beside its constants: the direction of the nearest gap around it and that gap, and the gap
-// of the pair itself, when it was found.
+// The hints of a listed pair: direction and size of the nearest gap around it, and its own gap, at the detection.
 template <class T>
 struct PairHints {
   Vec3<T> star;
@@ -105,27 +105,27 @@ DIFFVBD_FN Vec3<T> across(int kind, const Corners<T>& c) {
   return (toward < T(0) ? -scale : scale) * n;
 }
 
-// Whether corners that move by d[k], each as far as its share of the gap lets it, keep the sides apart along m, where
-// these lie as s says. guard: of their gap; bounded: no closer than `least`, or by but a little.
+// Whether corners that move by d[k], each within its fraction of the gap, keep the sides apart along m, where these lie
+// as in s. guard: uncertainty of the gap; bounded: no closer than `least`, or only slightly.
 template <class T>
 DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, T guard, T least, const Vec3<T> (&d)[4],
-                            const T (&share)[4], bool bounded, bool careful) {
+                            const T (&fraction)[4], bool bounded, bool careful) {
   if (!(T(kTrusted) * guard < s.gap)) return false;
   const T wide = guard < s.gap ? s.gap - guard : T(0), rounded = T(kClosedGuards) * guard;
   const T some = T(careful && wide < T(kTight) * least ? kTightest : kStartLeast) * wide;
   for (int k = 0; k < 4; ++k) {
     const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
-    T room = share[k] * wide;
+    T allowance = fraction[k] * wide;
     if (bounded) {
-      const T outside = share[k] * (wide - least);
-      room = some < outside ? outside : some;
+      const T outside = fraction[k] * (wide - least);
+      allowance = some < outside ? outside : some;
     }
-    if (!(toward <= s.slack[k] + (room + rounded))) return false;
+    if (!(toward <= s.slack[k] + (allowance + rounded))) return false;
   }
   return true;
 }
 
-// One pair as it is now, and what motions of its corners it lets pass.
+// One pair at its current positions, and the motions that it admits.
 template <class T>
 struct Gate {
   int kind;
@@ -144,20 +144,19 @@ struct Gate {
   }
   DIFFVBD_FN T least() const { return least_of(constants.dhat); }
 
-  // Whether corners that move by d[k], each as far as its share of the gap lets it, keep the sides apart along m.
-  // careful: the motion does not minimise the barrier.
-  DIFFVBD_FN bool holds(const Vec3<T>& m, const Vec3<T> (&d)[4], const T (&share)[4], bool careful, bool own) const {
+  // The same along m. careful: the motion does not minimise the barrier.
+  DIFFVBD_FN bool holds(const Vec3<T>& m, const Vec3<T> (&d)[4], const T (&fraction)[4], bool careful, bool own) const {
     const Separation<T> s(kind, corners, m, constants.offset);
     const T wide = s.gap - guard;
-    // other directions than that of the closest points must keep what is near
+    // a direction other than that of the closest points must keep small gaps
     const T near = hints.nearest < least() ? hints.nearest : least();
     if (!own && !(T(0.5) * near < wide)) return false;
-    return holds_along(kind, m, s, guard, least(), d, share, careful || !own, careful);
+    return holds_along(kind, m, s, guard, least(), d, fraction, careful || !own, careful);
   }
-  DIFFVBD_FN bool holds(const Vec3<T> (&d)[4], const T (&share)[4], bool careful) const {
-    if (holds(n, d, share, careful, true)) return true;
+  DIFFVBD_FN bool holds(const Vec3<T> (&d)[4], const T (&fraction)[4], bool careful) const {
+    if (holds(n, d, fraction, careful, true)) return true;
     if (kind == kPointPlane) return false;  // which ends nowhere
-    return holds(hints.star, d, share, careful, false) || holds(across(kind, corners), d, share, careful, false);
+    return holds(hints.star, d, fraction, careful, false) || holds(across(kind, corners), d, fraction, careful, false);
   }
 };
 
@@ -178,8 +177,8 @@ DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool carefu
   }
   const T total = one + other, wide = g.gap - g.guard, least = g.least();
   if (g.kind == kPointPlane || !(T(0) < wide)) return false;
-  // it may come as close as a start may bring it, and a little closer where it is close already
-  const T half = T(1 - kBothShare) * wide, most = least < half ? half : least;
+  // as close as a start may bring it, and slightly closer where it is close already
+  const T half = T(1 - kBothGapFraction) * wide, most = least < half ? half : least;
   const T part = wide < T(kTight) * least ? T(1) : T(1 - 2 * kStartLeast);
   const T keeps = !careful ? half : part * wide < most ? part * wide : most;
   const auto gap_at = [&](T time) {
@@ -192,11 +191,25 @@ DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool carefu
     if (!(keeps < now)) return total * (T(1) - time) <= T(0);
     time = time + (now - keeps) / total;
     if (!(time < T(1))) return true;
-    // most pairs that come too close are too close at the end of their way: one distance tells
+    // most pairs that come too close are too close at the end: one distance tells
     if (i == 0 && gap_at(T(1)) < keeps) return false;
     now = gap_at(time);
   }
   return false;
+}
+
+// An upper bound of how much the gap of a pair has shrunk since it was taken, by that of each vertex, bound [V] of its
+// scene: most pairs need no other test. Infinity where a corner is of a collider, whose gap may be older.
+template <class T>
+T most_closed(const int32_t* record, int32_t vertices, const T* bound) {
+  const int first = sides(record[4]);
+  T most[2] = {T(0), T(0)};
+  for (int k = 0; k < 4; ++k) {
+    if (record[k] >= vertices) return std::numeric_limits<T>::infinity();
+    T& side = most[k < first ? 0 : 1];
+    side = side < bound[record[k]] ? bound[record[k]] : side;
+  }
+  return most[0] + most[1];
 }
 
 }  // namespace diffvbd::contact

@@ -1,8 +1,7 @@
-// What one pair adds to the block of one of its corners, and the adjoint of exactly that (docs/method.md, section 12).
-// `together`: how many corners of the pair move at once with this one, itself included. The block takes so many times
-// the pair's stiffness along its normal, so that together they do not overshoot.
-// Barrier: gradient of e b(gap) and the part e b'' grad_gap grad_gap^T of its Hessian. Lagged terms: damping of
-// approach and smoothed friction, about a normal, weights and a normal force of the start of the step.
+// The barrier of a pair in the block of one of its corners, and the exact adjoint (docs/method.md, section 12): the
+// gradient of e b(gap), and of its Hessian e b'' grad_gap grad_gap^T. `together`: the number of corners that move at
+// once, this one included; the block takes so many times the stiffness along the normal, so that together they do not
+// overshoot.
 #pragma once
 
 #include "../energies/log_barrier.h"
@@ -19,7 +18,7 @@ struct PairConstants {
       : dhat(dhat), offset(offset), threshold(threshold) {}
 };
 
-// What belongs to corner i; in a pack of lanes each has an i of its own.
+// The item of corner i; in a pack of lanes each has an i of its own.
 template <class A>
 DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
   return a[i];
@@ -112,89 +111,6 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   }
   out.kappa = -phi;
   return active;
-}
-
-// A pair as it was at the start of the step, in the order in which tensors keep it.
-constexpr int kLagScalars = 9;
-template <class T>
-struct Lag {
-  T friction;  // coefficient times normal force [N]
-  T damping;   // [N s/m], 0 where the pair was not active
-  Vec3<T> n;
-  T w[4];
-  Lag() = default;
-  DIFFVBD_FN explicit Lag(const T* a) : friction(a[0]), damping(a[1]), n{a[2], a[3], a[4]}, w{a[5], a[6], a[7], a[8]} {}
-  DIFFVBD_FN bool active() const { return friction != T(0) || damping != T(0); }
-};
-
-// f1(|u|) / |u| of the friction potential of Li et al. (2020), smooth below eps [m], and its derivative over |u|
-constexpr double kRestingMotion = 1e-6;  // of eps
-template <class T>
-struct FrictionRate {
-  T value, curvature;
-  DIFFVBD_FN FrictionRate(T length, T eps) {
-    const bool sticks = length < eps;
-    value = sticks ? (T(2) - length / eps) / eps : T(1) / length;
-    const T slope = sticks ? -T(1) / (eps * eps) : -value * value;
-    // At rest value has a kink; below what rounding makes of zero its slope is taken as that of both sides together.
-    const double resting = kRestingMotion;  // a device has no namespace's constant that a Dual could refer to
-    curvature = T(resting) * eps < length ? slope / length : T(0);
-  }
-};
-
-// Adds the lagged part of the block of corner i; m [m] is the relative motion since the start of the step.
-template <class T>
-DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, T together, const Vec3<T>& m, T h, T eps, Vec3<T>& g, Sym3<T>& H) {
-  const T w = a.w[i], along = dot(a.n, m);
-  if (a.damping != T(0)) {
-    // the block damps both directions, the force approach alone: what rests must not depend on the sign of a rounding
-    const T c = h * a.damping * w;
-    if (along < T(0)) g += (c * along) * a.n;
-    add_outer(H, together * c * w, a.n);
-  }
-  if (a.friction != T(0)) {
-    const Vec3<T> u = m - along * a.n;
-    const FrictionRate<T> f(square_root(dot(u, u)), eps);
-    const T size = h * h * a.friction * f.value * w;
-    g += size * u;
-    add_diagonal(H, size * w);
-    add_outer(H, -size * w, a.n);
-  }
-}
-
-// Adjoint of phi = p . (g + H d_raw) of corner i, negated: toward m, and toward the lag at fixed m (a.w[k] also moves
-// m).
-template <class T>
-DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, T together, const Vec3<T>& m, T h, T eps, const Vec3<T>& p,
-                                  const Vec3<T>& d_raw, Lag<T>& bar) {
-  const T w = a.w[i], along = dot(a.n, m), n_p = dot(a.n, p), n_d = dot(a.n, d_raw), stiff = together * w * n_d;
-  Vec3<T> m_bar = zero3<T>();
-  bar.n = zero3<T>();
-  for (int k = 0; k < 4; ++k) bar.w[k] = T(0);
-  if (!a.active()) {  // nothing but its two coefficients can tell: floors that nothing touches are many
-    const Vec3<T> u = m - along * a.n;
-    const FrictionRate<T> f(square_root(dot(u, u)), eps);
-    bar.friction = -h * h * w * f.value * (dot(u, p) + w * dot(p - n_p * a.n, d_raw));
-    bar.damping = -h * w * ((along < T(0) ? along : T(0)) + stiff) * n_p;
-    return m_bar;
-  }
-  const Vec3<T> crossed = n_d * p + n_p * d_raw;
-  const T c = h * a.damping, approach = along < T(0) ? along : T(0);
-  bar.n -= (together * c * w * w) * crossed;
-  if (along < T(0)) {
-    m_bar -= (c * w * n_p) * a.n;
-    bar.n -= (c * w) * (n_p * m + along * p);
-  }
-  bar.w[i] = bar.w[i] - c * (approach + T(2) * stiff) * n_p;
-  bar.damping = -h * w * (approach + stiff) * n_p;
-  const Vec3<T> u = m - along * a.n, p_t = p - n_p * a.n;
-  const FrictionRate<T> f(square_root(dot(u, u)), eps);
-  const T size = h * h * a.friction * w, slid = dot(u, p), pushed = dot(p_t, d_raw), both = slid + w * pushed;
-  m_bar -= size * ((both * f.curvature) * u + f.value * p_t);
-  bar.n += size * ((both * f.curvature * along) * u + f.value * (along * p + n_p * m + w * crossed));
-  bar.w[i] = bar.w[i] - h * h * a.friction * f.value * (slid + T(2) * w * pushed);
-  bar.friction = -h * h * w * f.value * both;
-  return m_bar;
 }
 
 }  // namespace diffvbd::contact

@@ -48,7 +48,7 @@ template <class M, class R>
 DIFFVBD_FN Dual<R> select(const M& condition, const Dual<R>& a, const Dual<R>& b) {
   return {select(condition, a.value, b.value), select(condition, a.derivative, b.derivative)};
 }
-// What follows from these, of every scalar that is a class: of Dual and of packs of lanes, which alone have a select().
+// Derived operators for every scalar that is a class: Dual and packs of lanes, which alone have a select().
 template <class R>
 DIFFVBD_FN auto operator>(const R& a, const R& b) -> decltype(select(b < a, a, b), b < a) {
   return b < a;

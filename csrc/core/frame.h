@@ -82,7 +82,7 @@ DIFFVBD_FN Frame<Dual<R>> constant(const Frame<R>& f) {
   return {constant(f.first), constant(f.second), constant(f.third), Dual<R>(f.tiny), f.turned};
 }
 
-// Where no energy has planes.
+// The axes of the mesh, for sets without planes.
 template <class R>
 struct NoFrame {
   static constexpr bool turned = false;

@@ -18,7 +18,7 @@ struct StepParameters {
   bool saturates;     // whether c is given: asked once for a vertex, never inside its star
 };
 
-// Those of one sweep.
+// The parameters of one sweep.
 template <class T>
 DIFFVBD_FN StepParameters<T> of_sweep(StepParameters<T> q, bool last) {
   if (last) q.relaxation = q.last_relaxation;
@@ -43,7 +43,7 @@ DIFFVBD_FN Vec3<R> saturate_vjp(const Vec3<R>& d_raw, const Vec3<R>& d_bar, cons
   return s * d_bar - (s * s * along / R(q.saturation)) * d_raw;
 }
 
-// Fractions of a motion that are tried until the potential does not rise: 1, 1/2, ... 1/128; then 0. Decided, recorded
+// Trial fractions of a motion until the potential does not increase: 1, 1/2, ... 1/128; then 0. Decided, recorded
 // and constant to the reverse.
 constexpr int kFractions = 8;
 constexpr double kRounding = 8;  // ulps of the terms that a sum of them may lose

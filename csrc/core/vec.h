@@ -106,6 +106,24 @@ DIFFVBD_FN Vec3<R> zero3() {
   return {R(0), R(0), R(0)};
 }
 
+// Three scalars in memory: as they are, in double precision, written, and added to.
+template <class T>
+DIFFVBD_FN Vec3<T> vector_at(const T* p) {
+  return {p[0], p[1], p[2]};
+}
+template <class T>
+DIFFVBD_FN Vec3<double> wide_at(const T* p) {
+  return {double(p[0]), double(p[1]), double(p[2])};
+}
+template <class T, class S>
+DIFFVBD_FN void put(T* to, const Vec3<S>& a) {
+  to[0] = static_cast<T>(a.x), to[1] = static_cast<T>(a.y), to[2] = static_cast<T>(a.z);
+}
+template <class T, class S>
+DIFFVBD_FN void add_to(T* to, const Vec3<S>& a) {
+  put(to, Vec3<S>{S(to[0]), S(to[1]), S(to[2])} + a);
+}
+
 template <class R>
 struct Sym3 {
   R xx, xy, xz, yy, yz, zz;

@@ -7,7 +7,8 @@
 
 namespace diffvbd {
 
-// What an energy of one vertex may read. Positions are relative to `origin` (zero unless float32 asks for a local one).
+// The state that an energy of one vertex may read. Positions are relative to `origin` (zero unless float32 asks for a
+// local one).
 template <class R>
 struct VertexState {
   Vec3<R> x;       // current position [m]
@@ -22,7 +23,7 @@ struct Batched {
   T* data = nullptr;
   int64_t scene = 0, item = 1;
 };
-// Of several tensors: whether each holds one value for all items of a scene; whether the scenes share each.
+// Whether each of several tensors holds one value for all items of a scene; whether the scenes share each.
 template <class T, int n>
 DIFFVBD_FN bool one_for_items(const Batched<T> (&tensors)[n]) {
   bool one = true;
@@ -50,7 +51,7 @@ DIFFVBD_FN constexpr int other_corner(int i, int a) {
   return others[i][a];
 }
 
-// Where the weight of an edge stands among the six of a tet: k01 k02 k03 k12 k13 k23.
+// The place of the weight of an edge among the six of a tet: k01 k02 k03 k12 k13 k23.
 DIFFVBD_FN constexpr int weight_index(int a, int b) {
   constexpr int first[4] = {0, 3, 5, 0};
   return a < b ? first[a] + b - a - 1 : first[b] + a - b - 1;
@@ -59,7 +60,7 @@ DIFFVBD_FN constexpr int weight_index(int a, int b) {
 // Index data of one mesh in sweep order, all int32. Vertices of a color lie side by side, in blocks of `kLanes`; the
 // last block of a color is filled with phantom vertices. Inactive vertices (pinned, isolated) fill the blocks after the
 // last color. A position is block kLanes + lane. A slot is one incident tet for each lane of a block; a lane with fewer
-// tets is padded by pairs of itself. The reverse sends what an update adds to a neighbour along edges: a row for each
+// tets is padded by pairs of itself. The reverse scatters adjoints to neighbours along edges: a row for each
 // ordered pair (active vertex, neighbour), written by the vertex, read by the neighbour when its own turn comes.
 constexpr int kLanes = 8;
 constexpr int kRow = 4;  // scalars in a row: x, y, z and one unused; indices come multiplied by it
@@ -110,5 +111,74 @@ struct GroupPlan {
   const int32_t* visit_pair;  // [4 tets, 4]  j, k, l as in `local`, tet, pair (slot kSlice + lane), corner
 };
 constexpr int kSmallMesh = 64;
+
+// A plan is one int32 buffer: a header of sizes, then its arrays. These find the arrays, wherever the buffer lies.
+
+// vertices, tets, active, colors, blocks, slots, edge_slots, incoming_slots, and of the plan for CUDA entry_slots, the
+// largest number of neighbours and of pairs of an active vertex
+constexpr int kPlanHeader = 11;
+
+class PlanReader {
+ public:
+  PlanReader(const int32_t* sizes, const int32_t* buffer) : sizes_(sizes), at_(buffer + kPlanHeader) {}
+
+  const int32_t* take(int64_t size) {
+    const int32_t* here = at_;
+    at_ += size;
+    return here;
+  }
+
+  // what both plans share
+  template <class P>
+  void blocks(P& p, int lanes) {
+    p.num_vertices = sizes_[0];
+    p.num_tets = sizes_[1];
+    p.num_active = sizes_[2];
+    p.colors = sizes_[3];
+    p.blocks = sizes_[4];
+    p.slots = sizes_[5];
+    p.edge_slots = sizes_[6];
+    p.incoming_slots = sizes_[7];
+    p.color_block = take(p.colors + 1);
+    p.block_slot = take(p.blocks + 1);
+    p.block_rank = take(p.blocks + 1);
+    p.block_edge = take(p.blocks + 1);
+    p.block_incoming = take(p.blocks + 1);
+    p.order = take(int64_t{p.blocks} * lanes);
+  }
+
+ private:
+  const int32_t *sizes_, *at_;
+};
+
+inline Plan view_plan(const int32_t* buffer) {
+  Plan p{};
+  PlanReader read(buffer, buffer);
+  read.blocks(p, kLanes);
+  p.pair = read.take(int64_t{p.slots} * kLanes);
+  p.neighbors = read.take(int64_t{p.slots} * 3 * kLanes);
+  p.edge = read.take(int64_t{p.slots} * 3 * kLanes);
+  p.incoming = read.take(int64_t{p.incoming_slots} * kLanes);
+  return p;
+}
+
+// `sizes` is the header on the host, `buffer` the plan on the device.
+inline GroupPlan view_group_plan(const int32_t* sizes, const int32_t* buffer) {
+  GroupPlan p{};
+  PlanReader read(sizes, buffer);
+  read.blocks(p, kSlice);
+  p.pair = read.take(int64_t{p.slots} * kSlice);
+  p.local = read.take(int64_t{p.slots} * kSlice);
+  p.adjacent = read.take(int64_t{p.edge_slots} * kSlice);
+  p.incoming = read.take(int64_t{p.incoming_slots} * kSlice);
+  p.edge_entry = read.take(int64_t{p.edge_slots} + 1);
+  p.entry = read.take(int64_t{sizes[8]} * kSlice);
+  p.tet_pair = read.take(4 * int64_t{p.num_tets});
+  if (p.num_vertices <= kSmallMesh) {
+    p.visit = read.take(2 * int64_t{p.num_active});
+    p.visit_pair = read.take(16 * int64_t{p.num_tets});
+  }
+  return p;
+}
 
 }  // namespace diffvbd

@@ -5,8 +5,8 @@
 #include <atomic>
 #include <vector>
 
-#include "bounds.h"
-#include "grain.h"
+#include "../contact/limit.h"
+#include "threads.h"
 
 namespace diffvbd {
 
@@ -17,15 +17,15 @@ namespace {
 constexpr int64_t kPairGrain = 256;  // pairs that are worth one more thread
 constexpr int64_t kRowGrain = 16;    // vertices whose pairs are
 
-constexpr double kClearly = 1 - 1e-5;  // rounding of the bounds of a pair's way is far below the rest
+constexpr double kClearly = 1 - 1e-5;  // the rounding of the bounds is far below the rest
 
-// As stays_far_at_any_share(), by how far each vertex may be from where gaps were taken, bound [B, V].
+// The same by upper bounds of the displacements since gaps were taken, bound [B, V].
 template <class T>
 bool stays_far_by(const AdvanceInputs<T>& in, const T* bound, int64_t pair) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
   const T* constants = in.constants + kConstants * pair;
-  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
-  return most_closed(record, in.vertices, bound + int64_t{record[5]} * in.vertices) < T(kClearly) * room;
+  const T slack = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+  return most_closed(record, in.vertices, bound + int64_t{record[5]} * in.vertices) < T(kClearly) * slack;
 }
 
 // How many of n items f says yes to.
@@ -43,24 +43,22 @@ int64_t count(int64_t n, int64_t grain, const F& f) {
 }  // namespace
 
 template <class T>
-int64_t advance(const AdvanceInputs<T>& in, T* share) {
+int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
   const int64_t rows = in.scenes * in.vertices, units = in.units();
   const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
   std::vector<T> now(units);
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
   std::vector<uint8_t> far(pairs);  // in all rounds of a move
-  AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
-  int64_t stuck = 0;
-  // Of a vertex all pairs ask the same.
+  AdvanceState<T> s{fraction, now.data(), blocked.data(), stamp.data(), failed.data(), true};
+  int64_t infeasible = 0;
+  // Shared by all pairs of a vertex.
   std::vector<Motion<T>> motion(rows);
   std::vector<T> bound(rows);
   s.motion = motion.data();
   const auto vertex = [&](int64_t row) { return static_cast<int32_t>(row % in.vertices); };
   const auto unit = [&](int64_t row) { return in.unit(row / in.vertices, vertex(row)); };
   const auto look = [&] {
-    torch::stable::parallel_for(0, rows, kPairGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) motion[i] = motion_of(in, s, i / in.vertices, vertex(i));
-    });
+    for_each(rows, [&](int64_t i) { motion[i] = motion_of(in, s, i / in.vertices, vertex(i)); }, kPairGrain);
   };
   // How many pairs of the vertices that `goes` names do not pass; each is looked at once.
   const auto failing = [&](const auto& goes, const auto& passes) {
@@ -85,9 +83,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
     std::fill(far.begin(), far.end(), 0);
     std::fill(failed.begin(), failed.end(), 0);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
-    torch::stable::parallel_for(0, units, kGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) begin_move(in, s, i);
-    });
+    for_each(units, [&](int64_t i) { begin_move(in, s, i); });
     for (int round = 0; round < kRounds; ++round) {
       const bool begins = round == 0, last = round + 1 == kRounds;
       const auto fails = [&](int64_t scene, bool passes) {
@@ -101,14 +97,14 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
         bound[i] = square_root(since < end ? end : since) + guard_of_size(m.size);
       }
       const auto passes = [&](int64_t i) {
-        far[i] = far[i] || (begins && (stays_far_by(in, bound.data(), i) || stays_far_at_any_share(in, s, i)));
-        return far[i] || !fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
+        far[i] = far[i] || (begins && (stays_far_by(in, bound.data(), i) || stays_far_at_any_fraction(in, s, i)));
+        return far[i] || !fails(in.listed.pairs[kPairRow * i + 5], test_pair(in, s, i, last ? 0 : round));
       };
       int64_t found;
       if (last || (s.first && round == 0)) {
         found = count(pairs, kPairGrain, [&](int64_t i) { return !passes(i); });
       } else if (round == 0) {  // what the moves before have taken all the way does not move again
-        const auto open = [&](int64_t row) { return !in.held[vertex(row)] && share[unit(row)] < T(1); };
+        const auto open = [&](int64_t row) { return !in.pinned[vertex(row)] && fraction[unit(row)] < T(1); };
         found = failing(open, passes);
       } else {
         found = failing([&](int64_t row) { return stamp[unit(row)] == round; }, passes);
@@ -123,27 +119,25 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
     if (s.first && !clean) {
       look();
-      stuck = count(pairs, kPairGrain, [&](int64_t i) { return !far[i] && !try_pair(in, s, i, 0); });
+      infeasible = count(pairs, kPairGrain, [&](int64_t i) { return !far[i] && !test_pair(in, s, i, 0); });
     }
     bool open = false;
     for (int64_t i = 0; i < units; ++i) {
       end_move(s, i);
-      open = open || share[i] < T(1);
+      open = open || fraction[i] < T(1);
     }
     if (!open) break;
   }
-  return stuck;
+  return infeasible;
 }
 
 template <class T>
-void refresh_gaps(const NarrowInputs<T>& in, int64_t pairs, T* constants) {
-  torch::stable::parallel_for(0, pairs, kPairGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) narrow_pair(in, i, constants + kConstants * i);
-  });
+void refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants) {
+  for_each(pairs, [&](int64_t i) { refresh_gap(in, i, constants + kConstants * i); }, kPairGrain);
 }
 
-template void refresh_gaps<float>(const NarrowInputs<float>&, int64_t, float*);
-template void refresh_gaps<double>(const NarrowInputs<double>&, int64_t, double*);
+template void refresh_gaps<float>(const GapInputs<float>&, int64_t, float*);
+template void refresh_gaps<double>(const GapInputs<double>&, int64_t, double*);
 template int64_t advance<float>(const AdvanceInputs<float>&, float*);
 template int64_t advance<double>(const AdvanceInputs<double>&, double*);
 

@@ -1,17 +1,17 @@
-// How much of its way each vertex goes at the start of the sweeps (contact/advance.h), on the CPU.
+// Step fractions at the start of the sweeps (contact/advance.h), and gaps refreshed (contact/pair_list.h), on the CPU.
 #pragma once
 
 #include "../contact/advance.h"
-#include "../contact/narrow.h"
+#include "../contact/pair_list.h"
 
 namespace diffvbd {
 
-// share of each unit; returns how many pairs what is prescribed would bring too close.
+// fraction of each unit; returns the number of pairs that make the prescribed motion infeasible
 template <class T>
-int64_t advance(const contact::AdvanceInputs<T>& in, T* share);
+int64_t advance(const contact::AdvanceInputs<T>& in, T* fraction);
 
-// constants [pairs, 8] (contact/narrow.h).
+// constants [pairs, 8]
 template <class T>
-void refresh_gaps(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants);
+void refresh_gaps(const contact::GapInputs<T>& in, int64_t pairs, T* constants);
 
 }  // namespace diffvbd

@@ -3,10 +3,10 @@
 
 #include <vector>
 
-#include "../coarse/views.h"
+#include "../subspace/coarse.h"
 #include "kernels.h"
 #include "run.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 
@@ -26,13 +26,13 @@ class CoarseScene {
  private:
   T* tape(int k) const { return c_.tape + (scene_ * c_.corrections + k) * c_.tape_size(); }
   // The matrices with the blocks of vertex energies at s.x, factored.
-  void press(Team::Member& member);
+  void add_vertex_blocks(Team::Member& member);
   void solve(T* x, Team::Member& member) const;
   // q of the correction of number k
   T* turn(int k) const { return turns_.get() + (c_.matrix_bar ? k : 0) * int64_t{3} * c_.plan.functions; }
   int32_t body_of(int64_t function) const;
+  void prolong(const T* a, T sign, T* to, Team::Member& member);
   void decide(int32_t body, T* a, T* length);
-  T length_of(int32_t body, const T* a) const;
   void flush(Team::Member& member);
 
   const Plan& plan_;
@@ -43,7 +43,7 @@ class CoarseScene {
   const CoarseKernels<T> kernels_;
   std::vector<int> failures_;
   std::vector<char> plain_;  // bodies on whose vertices no energy acts, and whose matrix is factored
-  Buffer<T> gradient_, way_, wanted_, material_, coarse_, rows_, turns_, matrix_;
+  Buffer<T> gradient_, displacement_, wanted_, material_, coarse_, rows_, turns_, matrix_;
   Buffer<double> sums_;
   bool over_ = false;
 };

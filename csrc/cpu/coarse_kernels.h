@@ -38,7 +38,7 @@ __attribute__((flatten, optimize("no-tree-slp-vectorize"))) void reverse_gradien
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
     const BlockAdjoint<R> out = reverse_gradient<Set, kMaterial | kRest>(
-        b, star, load_rows(s.way, block), load_rows(s.wanted, block), q, s.data_bar != nullptr,
+        b, star, load_rows(s.displacement, block), load_rows(s.wanted, block), q, s.data_bar != nullptr,
         [&](int k, int i, const R& value) {
           const int64_t row = b.data[k] - values + i;
           LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
@@ -189,7 +189,7 @@ __attribute__((flatten)) void solve_rows(const T* factor, int64_t n, T* x) {
 
 template <class T>
 __attribute__((flatten)) void line_of_tets(const int32_t* corner, const T* rest, const T* material, const T* x,
-                                           const T* way, int64_t begin, int64_t end, double* coefficients) {
+                                           const T* displacement, int64_t begin, int64_t end, double* coefficients) {
   using R = Lanes<T>;
   R sum[TetLayout::line_degree];
   for (R& s : sum) s = R(T(0));
@@ -197,7 +197,7 @@ __attribute__((flatten)) void line_of_tets(const int32_t* corner, const T* rest,
     Vec3<R> at[4], p[4];
     for (int a = 0; a < 4; ++a) {
       at[a] = gather3(x, corner + (block * 4 + a) * kLanes);
-      p[a] = gather3(way, corner + (block * 4 + a) * kLanes);
+      p[a] = gather3(displacement, corner + (block * 4 + a) * kLanes);
     }
     R scalars[kRestScalars], m[kTetScalars];
     for (int i = 0; i < kRestScalars; ++i) scalars[i] = R::load(rest + (block * kRestScalars + i) * kLanes);
@@ -212,8 +212,8 @@ __attribute__((flatten)) void line_of_tets(const int32_t* corner, const T* rest,
 template <class T, int mask>
 constexpr CoarseKernels<T> coarse_variant() {
   if constexpr ((mask & kPaperBlock) == 0 && is_compiled(mask)) {
-    return {gradient_of_blocks<T, with_rare(mask)>,
-            reverse_gradient_of_blocks<T, with_rare(mask)>,
+    return {gradient_of_blocks<T, with_optional(mask)>,
+            reverse_gradient_of_blocks<T, with_optional(mask)>,
             gather_rows<T>,
             rotate_blocks<T>,
             factor_rows<T>,

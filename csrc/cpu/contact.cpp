@@ -2,8 +2,8 @@
 
 #include <algorithm>
 
-#include "../contact/sent.h"
-#include "pair_batches.h"
+#include "../contact/passes.h"
+#include "near.h"
 
 namespace diffvbd {
 
@@ -45,12 +45,12 @@ void ContactScene<T>::propose(int64_t first, int64_t last, int64_t begin, int64_
     const int32_t v = plan_.order[at];
     if (v < 0) continue;
     const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(s_.x + 4 * at) - from;
-    const OwnRoom<T> room(source, v);
-    const int exponent = room.limit(from, d);
+    const TrustRegion<T> region(source, v);
+    const int exponent = region.limit(from, d);
     limits[v] = static_cast<uint8_t>(exponent);
     if (!near_.has_pairs(v)) continue;
-    const Vec3<T> motion = source.moved(v), way = limit_of<T>(exponent) * d;
-    near_.go(v, motion, motion + way, length_of(way) / T(kBothShare) + room.guard(from));
+    const Vec3<T> motion = source.moved(v), displacement = limit_of<T>(exponent) * d;
+    near_.go(v, motion, motion + displacement, length_of(displacement) / T(kBothGapFraction) + region.guard(from));
   }
 }
 
@@ -63,12 +63,8 @@ void ContactScene<T>::search(int64_t begin, int64_t end) const {
 
 template <class T>
 void ContactScene<T>::settle(Team::Member& member) const {
-  member.each(0, in_.num_vertices, [&](int64_t begin, int64_t end) {
-    for (auto v = static_cast<int>(begin); v < end; ++v) near_.settle(v, source_.moved(v));
-  });
-  member.barrier();
-  member.each(0, near_.pairs(), [&](int64_t begin, int64_t end) { near_.sort(begin, end); });
-  member.barrier();
+  member.items_sync(in_.num_vertices, [&](int64_t v) { near_.settle(static_cast<int>(v), source_.moved(v)); });
+  member.items_sync(near_.pairs(), [&](int64_t p) { near_.sort(p); });
 }
 
 template <class T>
@@ -87,7 +83,7 @@ void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t 
     limits[v] = static_cast<uint8_t>(exponent);
     if (exponent > 0) {
       const Vec3<T> to = from + limit_of<T>(exponent) * d;
-      x[0] = to.x, x[1] = to.y, x[2] = to.z;
+      put(x, to);
     }
   }
 }
@@ -97,7 +93,7 @@ T* ContactScene<T>::record(int64_t block, int lane, int scalar) const {
   return s_.contact + (block * kContactScalars + scalar) * kLanes + lane;
 }
 
-// Calls f(vertex, block, lane) for the vertices of the blocks that have pairs or a floor to rub against.
+// Calls f(vertex, block, lane) for the vertices of the blocks that have pairs or friction on a floor.
 template <class T>
 template <class F>
 void ContactScene<T>::each_vertex(int64_t begin, int64_t end, const F& f) const {
@@ -133,7 +129,7 @@ void ContactScene<T>::each_pair(int32_t v, const F& look) const {
 // closer only where that does not settle it.
 template <class T>
 int ContactScene<T>::limit_by_near(const Source<T, Before>& source, int32_t v, const Vec3<T>& d, int exponent) const {
-  const T length = length_of(d), guard = OwnRoom<T>(source, v).guard(source.x(v));
+  const T length = length_of(d), guard = TrustRegion<T>(source, v).guard(source.x(v));
   const int64_t begin = 4 * source.positions.first, end = 4 * source.positions.last;
   const auto all = near_.of(v);
   for (int64_t e = all.first; e < all.first + all.count; ++e) {
@@ -143,12 +139,12 @@ int ContactScene<T>::limit_by_near(const Source<T, Before>& source, int32_t v, c
     for (int k = 0; k < 4; ++k) {
       both = both || (site.is_first(k) != first && begin <= site.at[k] && site.at[k] < end);
     }
-    const T share = both ? T(kBothShare) : T(kShare);
-    const Clearance<T>& room = near_.clearance(e);
+    const T fraction = both ? T(kBothGapFraction) : T(kGapFraction);
+    const Clearance<T>& clearance = near_.clearance(e);
     const uint8_t state = near_.state(e);
     const T part = limit_of<T>(exponent);
-    if (state == kFar && part * length / share + guard < room.gap) continue;
-    if (state >= kApart && room.holds(part * d, share, guard)) continue;
+    if (state == kFar && part * length / fraction + guard < clearance.gap) continue;
+    if (state >= kApart && clearance.holds(part * d, fraction, guard)) continue;
     exponent = limit_by_pair(source, near_.entry(e), d, length, guard, exponent);
   }
   return exponent;
@@ -205,9 +201,9 @@ void ContactScene<T>::prepare(int sweep, int64_t rows, int64_t begin, int64_t en
   }
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
     Vec3<T> now = zero3<T>(), prev = zero3<T>();
-    take_pairs(in_, *reverse_, scene_, v, 0, 1, now, prev);
-    add_at(s_.x_bar + 4 * (block * kLanes + lane), now);
-    add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), prev);
+    gather_pairs(in_, *reverse_, scene_, v, 0, 1, now, prev);
+    add_to(s_.x_bar + 4 * (block * kLanes + lane), now);
+    add_to(reverse_->prev + 3 * (scene_ * in_.corners + v), prev);
   });
 }
 
@@ -217,7 +213,8 @@ void ContactScene<T>::reverse(int64_t begin, int64_t end) const {
     near_.state(e) = active ? kTouching : kApart;
     if (!active) return;
     const int64_t entry = near_.entry(e);
-    send(*reverse_, entry, {vector_at(result), vector_at(result + 4), vector_at(result + 8), vector_at(result + 12)});
+    scatter(*reverse_, entry,
+            {vector_at(result), vector_at(result + 4), vector_at(result + 8), vector_at(result + 12)});
     reverse_->kappa[entry] += result[kPairKappa];
   };
   PairBatches<T, int64_t, decltype(deliver)> batches(kernels_.reverse, rows_, kappa(), h_ * h_, deliver);
@@ -228,8 +225,8 @@ void ContactScene<T>::reverse(int64_t begin, int64_t end) const {
     const Vec3<T> p{at(0), at(1), at(2)}, d_raw{at(3), at(4), at(5)};
     Vec3<T> own = zero3<T>();
     reverse_lags(source_, *reverse_, v, h_, p, d_raw, own);
-    add_at(s_.x_bar + 4 * (block * kLanes + lane), own);
-    add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), -own);
+    add_to(s_.x_bar + 4 * (block * kLanes + lane), own);
+    add_to(reverse_->prev + 3 * (scene_ * in_.corners + v), -own);
   });
   batches.flush();
 }
@@ -239,11 +236,11 @@ void ContactScene<T>::finish(T* collider_bar) const {
   for (int32_t v = 0; v < in_.corners; ++v) {
     near_.refresh(v);
     Vec3<T> now = zero3<T>(), prev = zero3<T>();
-    take_pairs(in_, *reverse_, scene_, v, 0, 1, now, prev);
-    add_at(v < in_.num_vertices ? s_.x_bar + int64_t{4} * positions_.position[v]
+    gather_pairs(in_, *reverse_, scene_, v, 0, 1, now, prev);
+    add_to(v < in_.num_vertices ? s_.x_bar + int64_t{4} * positions_.position[v]
                                 : collider_bar + 3 * (v - in_.num_vertices),
            now);
-    add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), prev);
+    add_to(reverse_->prev + 3 * (scene_ * in_.corners + v), prev);
   }
 }
 

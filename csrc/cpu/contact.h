@@ -3,11 +3,11 @@
 
 #include "kernels.h"
 #include "near.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 
-// One scene's part of a step with contact.
+// Contact of one scene in a step.
 template <class T>
 class ContactScene {
  public:
@@ -24,10 +24,10 @@ class ContactScene {
   void propose(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
   void search(int64_t begin, int64_t end) const;
   void limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
-  // After the first sweep, which goes farthest: what is near by the ways that are left.
+  // After the first sweep, which goes farthest: near pairs by the displacements that are left.
   void settle(Team::Member& member) const;
   // Reverse, before a color's turn: its vertices go back to the positions before their update, which the tape of `rows`
-  // scalars for each vertex has, and collect what pairs have sent them since their last turn.
+  // scalars for each vertex has, and gather what pairs have scattered to them since their last turn.
   void prepare(int sweep, int64_t rows, int64_t begin, int64_t end, const uint8_t* limits) const;
   // Reverse, after the turn: the adjoint of assemble().
   void reverse(int64_t begin, int64_t end) const;
@@ -39,16 +39,16 @@ class ContactScene {
     const T* rows;
     const int32_t* position;
     const PairRows<T>* colors;
-    Vec3<T> operator()(int v) const { return contact::vector_at(rows + int64_t{4} * position[v]); }
+    Vec3<T> operator()(int v) const { return vector_at(rows + int64_t{4} * position[v]); }
     bool together(int v, int u) const { return colors->are_together(v, u); }
   };
-  // Of a color whose vertices have moved, as they were before.
+  // Positions before the updates of a color.
   struct Before {
     const T *rows, *before;
     const int32_t* position;
     int64_t first, last;  // of the color
     bool goes(int v) const { return first <= position[v] && position[v] < last; }
-    Vec3<T> operator()(int v) const { return contact::vector_at((goes(v) ? before : rows) + int64_t{4} * position[v]); }
+    Vec3<T> operator()(int v) const { return vector_at((goes(v) ? before : rows) + int64_t{4} * position[v]); }
   };
   template <class F>
   void each_vertex(int64_t begin, int64_t end, const F& f) const;

@@ -1,15 +1,16 @@
+// The rigid correction of bodies that touch, on the CPU: groups, their systems and the solutions.
 #include "contact_rigid.h"
 
-#include <torch/csrc/stable/ops.h>
-
 #include <algorithm>
+#include <bitset>
 #include <cmath>
+#include <cstdint>
 #include <limits>
+#include <numeric>
+#include <utility>
 #include <vector>
 
-#include "../contact/rigid_slip.h"
-#include "bounds.h"
-#include "cholesky.h"
+#include "threads.h"
 
 namespace diffvbd {
 
@@ -17,6 +18,148 @@ using namespace contact;
 using rigid::Body, rigid::Vector;
 
 namespace {
+
+// The Cholesky factor of a matrix of blocks of six, one for each two bodies, in its lower triangle; what is no number
+// says that it is not positive definite. Blocks of zeros are left out: bodies touch few others.
+void cholesky(int64_t size, double* a) {
+  constexpr int kBlock = kUnknowns;
+  std::vector<double*> filled;  // rows of blocks below that on the diagonal
+  for (double *pivot = a, *end = a + size * size; pivot < end; pivot += kBlock * (size + 1)) {
+    for (int j = 0; j < kBlock; ++j) {
+      for (int i = j; i < kBlock; ++i) {
+        double sum = pivot[size * i + j];
+        for (int k = 0; k < j; ++k) sum -= pivot[size * i + k] * pivot[size * j + k];
+        pivot[size * i + j] = i == j ? std::sqrt(sum) : sum / pivot[size * j + j];
+      }
+    }
+    filled.clear();
+    for (double* block = pivot + kBlock * size; block < end; block += kBlock * size) {
+      bool any = false;
+      for (int i = 0; i < kBlock; ++i)
+        any = any || std::any_of(block + size * i, block + size * i + kBlock, [](double x) { return x != 0; });
+      if (any) filled.push_back(block);
+    }
+    for (double* block : filled) {
+      for (int i = 0; i < kBlock; ++i) {
+        double* row = block + size * i;
+        for (int j = 0; j < kBlock; ++j) {
+          double sum = row[j];
+          for (int k = 0; k < j; ++k) sum -= row[k] * pivot[size * j + k];
+          row[j] = sum / pivot[size * j + j];
+        }
+      }
+    }
+    for (size_t r = 0; r < filled.size(); ++r) {
+      for (size_t c = 0; c <= r; ++c) {
+        double* to = filled[r] + (filled[c] - pivot) / size;  // as far right as that is below
+        for (int i = 0; i < kBlock; ++i) {
+          for (int j = 0; j < kBlock; ++j) {
+            double sum = to[size * i + j];
+            for (int k = 0; k < kBlock; ++k) sum -= filled[r][size * i + k] * filled[c][size * j + k];
+            to[size * i + j] = sum;
+          }
+        }
+      }
+    }
+  }
+}
+
+// b = factor^-T factor^-1 b
+void cholesky_solve(int64_t size, const double* a, double* b) {
+  for (int64_t i = 0; i < size; ++i) {
+    for (int64_t k = 0; k < i; ++k) b[i] -= a[size * i + k] * b[k];
+    b[i] /= a[size * i + i];
+  }
+  for (int64_t i = size - 1; i >= 0; --i) {
+    b[i] /= a[size * i + i];
+    for (int64_t k = 0; k < i; ++k) b[k] -= a[size * i + k] * b[i];
+  }
+}
+
+// The order in which the bodies of a group are eliminated: always next the one that touches the fewest of those left,
+// and then these touch one another. touching [count]: a bit for each other body; left as it is then.
+std::vector<int32_t> elimination_order(std::vector<uint64_t>& touching) {
+  const auto count = static_cast<int32_t>(touching.size());
+  uint64_t left = count < 64 ? (uint64_t{1} << count) - 1 : ~uint64_t{0};
+  std::vector<int32_t> order;
+  while (left != 0) {
+    int32_t next = -1, fewest = 65;
+    for (int32_t k = 0; k < count; ++k) {
+      const auto degree = static_cast<int32_t>(std::bitset<64>(touching[k] & left).count());
+      if ((left >> k & 1) && degree < fewest) next = k, fewest = degree;
+    }
+    order.push_back(next);
+    left &= ~(uint64_t{1} << next);
+    const uint64_t rest = touching[next] & left;
+    for (int32_t k = 0; k < count; ++k) {
+      if (rest >> k & 1) touching[k] |= rest & ~(uint64_t{1} << k);
+    }
+  }
+  return order;
+}
+
+// Calls f(a, b) for the bodies that touch by barriers or lagged pairs.
+template <class T, class F>
+void each_touching(const RigidInputs<T>& in, int64_t scene, const std::vector<PairForce>& terms, const F& f) {
+  const auto touch = [&](int32_t a, int32_t b) {
+    if (0 <= a && 0 <= b && a != b) f(a, b);
+  };
+  for (const PairForce& term : terms) touch(term.body[0], term.body[1]);
+  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
+    if (!Lag<T>(in.lag + kLagScalars * i).active()) continue;
+    const int32_t* record = in.lagged.pairs + kPairRow * i;
+    touch(moving_body(in, record[0]), moving_body(in, record[sides(record[4])]));
+  }
+}
+
+// The groups of a scene, by its touching bodies; rows [4, bodies].
+template <class T>
+void find_groups(const RigidInputs<T>& in, int64_t scene, const std::vector<PairForce>& terms, int32_t* rows) {
+  const int32_t n = in.bodies();
+  std::vector<std::pair<int32_t, int32_t>> touching;
+  each_touching(in, scene, terms, [&](int32_t a, int32_t b) { touching.emplace_back(a, b); });
+  std::vector<int32_t> root(n), size(n, 0);
+  std::iota(root.begin(), root.end(), 0);
+  const auto root_of = [&](int32_t body) {
+    while (root[body] != body) body = root[body] = root[root[body]];
+    return body;
+  };
+  for (auto [a, b] : touching) {
+    a = root_of(a), b = root_of(b);
+    root[std::max(a, b)] = std::min(a, b);
+  }
+  for (int32_t k = 0; k < n; ++k) ++size[root_of(k)];
+  int32_t *member = rows, *first = rows + n, *rank = rows + 2 * n, *count = rows + 3 * n, place = 0;
+  std::fill_n(count, n, 0);
+  for (int32_t k = 0; k < n; ++k) {
+    const int32_t own = root_of(k);
+    const bool fits = size[own] <= most_grouped(n);
+    const int32_t lead = fits ? own : k;
+    if (lead == k) {
+      first[k] = place;
+      place += fits ? size[own] : 1;
+    }
+    first[k] = first[lead];
+    rank[k] = fits ? count[first[k]]++ : 0;
+    if (!fits) count[first[k]] = kLeft;
+    member[first[k] + rank[k]] = k;
+  }
+  std::vector<uint64_t> masks(n, 0);
+  for (const auto& [a, b] : touching) {
+    if (first[a] != first[b]) continue;
+    masks[first[a] + rank[a]] |= uint64_t{1} << rank[b];
+    masks[first[b] + rank[b]] |= uint64_t{1} << rank[a];
+  }
+  for (place = 0; place < n; ++place) {
+    if (count[place] <= kFew) continue;
+    std::vector<uint64_t> own(masks.begin() + place, masks.begin() + place + count[place]);
+    const std::vector<int32_t> before(member + place, member + place + count[place]), order = elimination_order(own);
+    for (int32_t i = 0; i < count[place]; ++i) {
+      member[place + i] = before[order[i]];
+      rank[member[place + i]] = i;
+    }
+  }
+}
 
 // A part of the matrix of a group, 6 x 6, between two of its bodies; `matrices` of the scene.
 struct MatrixPart {
@@ -30,25 +173,25 @@ struct MatrixPart {
   double& operator()(int i, int j) const { return at[i * stride + j]; }
 };
 
-void add_press(const PairPress& a, double share, const Groups& groups, const double* center, double* gradient,
-               double* matrix) {
-  double maps[2][kUnknowns][3], pressed[2][kUnknowns][3];
+void add_pair_force(const PairForce& a, double fraction, const Groups& groups, const double* center, double* gradient,
+                    double* matrix) {
+  double maps[2][kUnknowns][3], forces[2][kUnknowns][3];
   for (int side = 0; side < 2; ++side) {
     const int32_t body = a.body[side];
     if (body < 0) continue;
-    const Vector c = vector_of(center + 3 * body);
+    const Vector c = vector_at(center + 3 * body);
     const MatrixPart own(matrix, groups, body, body);
     for (int i = 0; i < kUnknowns; ++i) {
       gradient[kUnknowns * body + i] += a.gradient(side, i, c);
       const Vector m = a.map(side, i, c), q = a.stiffness * m;
       const double values[2][3] = {{m.x, m.y, m.z}, {q.x, q.y, q.z}};
-      std::copy_n(values[0], 3, maps[side][i]), std::copy_n(values[1], 3, pressed[side][i]);
+      std::copy_n(values[0], 3, maps[side][i]), std::copy_n(values[1], 3, forces[side][i]);
     }
     for (int i = 0; i < kUnknowns; ++i) {
       for (int j = 0; j < kUnknowns; ++j) {
         double sum = 0;
-        for (int k = 0; k < 3; ++k) sum += maps[side][i][k] * pressed[side][j][k];
-        own(i, j) += share * sum;
+        for (int k = 0; k < 3; ++k) sum += maps[side][i][k] * forces[side][j][k];
+        own(i, j) += fraction * sum;
       }
     }
   }
@@ -57,15 +200,15 @@ void add_press(const PairPress& a, double share, const Groups& groups, const dou
   for (int i = 0; i < kUnknowns; ++i) {
     for (int j = 0; j < kUnknowns; ++j) {
       double sum = 0;
-      for (int k = 0; k < 3; ++k) sum += maps[0][i][k] * pressed[1][j][k];
+      for (int k = 0; k < 3; ++k) sum += maps[0][i][k] * forces[1][j][k];
       upper(i, j) += sum, lower(j, i) += sum;
     }
   }
 }
 
 template <class T>
-void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& groups,
-                     const std::vector<PairPress>& presses, double* center, double* gradient, double* matrix) {
+void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& groups, const std::vector<PairForce>& terms,
+                     double* center, double* gradient, double* matrix) {
   std::vector<uint8_t> moves(in.bodies());  // nobody asks for the system of another
   for (int32_t k = 0; k < in.bodies(); ++k) moves[k] = in.moves(scene, groups, groups.first(k));
   for (int32_t k = 0; k < in.bodies(); ++k) {
@@ -79,13 +222,13 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
     }
     const bool free = in.free[k] && 0 < mass;
     const Vector c = 0 < mass ? (1 / mass) * sum : Vector{};
-    rigid::put(center + 3 * k, c);
+    put(center + 3 * k, c);
     if (!moves[k]) continue;
     for (int32_t i = 0; free && i < body.size(); ++i) {
       const int32_t v = body.vertex(i);
       Vector g;
       Sym3<double> H;
-      vertex_press(in, body, v, g, H);
+      vertex_force(in, body, v, g, H);
       const Vector arm = body.position(v) - c;
       rigid::add_vertex(arm, g, H, g6, block);
       spread += body.mass(v) * dot(arm, arm);
@@ -97,10 +240,10 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
       own(i, i) += free ? kLeastInertia * (i < 3 ? spread : mass) : 1;
     }
   }
-  for (const PairPress& press : presses) {
-    const int32_t a = press.body[0], b = press.body[1];
+  for (const PairForce& term : terms) {
+    const int32_t a = term.body[0], b = term.body[1];
     if (!(a >= 0 && moves[a]) && !(b >= 0 && moves[b])) continue;
-    add_press(press, borne(in, scene, press), groups, center, gradient, matrix);
+    add_pair_force(term, borne(in, scene, term), groups, center, gradient, matrix);
   }
 }
 
@@ -108,7 +251,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
 struct Systems {
   struct System {
     int32_t first, count;
-    Settling state = kOnItsWay;
+    Settling state = kIterating;
     int64_t size() const { return int64_t{kUnknowns} * count; }
   };
   Groups groups;
@@ -134,36 +277,37 @@ struct Systems {
   }
 };
 
-// Calls f(press) for all of a lagged pair that acts, or for each side that is solved for alone.
+// Calls f(term) for a lagged pair that acts, or for each side that is solved for alone.
 template <class T, class At, class F>
-void each_lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, const F& f) {
-  PairPress press;
-  if (!lagged_press(in, pair, at, slid, press, 0)) return;
-  f(press);
-  if (press.doubled == 1 || !lagged_press(in, pair, at, slid, press, 1)) return;
-  f(press);
+void each_lagged_force(const RigidInputs<T>& in, int64_t pair, const At& at, const BodyMotions& motions, const F& f) {
+  PairForce term;
+  if (!lagged_force(in, pair, at, motions, term, 0)) return;
+  f(term);
+  if (term.doubled == 1 || !lagged_force(in, pair, at, motions, term, 1)) return;
+  f(term);
 }
 
-// Calls f(press, pair) for what each lagged pair of a scene presses in systems that are not done.
+// Calls f(term, pair) for each lagged pair of a scene in systems that are not done.
 template <class T, class F>
-void each_lagged(const RigidInputs<T>& in, int64_t scene, const Slid& slid, const Systems& systems, const F& f) {
+void each_lagged(const RigidInputs<T>& in, int64_t scene, const BodyMotions& motions, const Systems& systems,
+                 const F& f) {
   const CornerPoints<T> at{in, false};
   for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
     const int32_t* record = in.lagged.pairs + kPairRow * i;
     const int32_t a = moving_body(in, record[0]), b = moving_body(in, record[sides(record[4])]);
     if (!systems.works(a) && !systems.works(b)) continue;
-    each_lagged_press(in, i, at, slid, [&](const PairPress& press) {
-      if (systems.works(press.body[0] < 0 ? press.body[1] : press.body[0])) f(press, i);
+    each_lagged_force(in, i, at, motions, [&](const PairForce& term) {
+      if (systems.works(term.body[0] < 0 ? term.body[1] : term.body[0])) f(term, i);
     });
   }
 }
 
-// What friction and damping add, linear about the motions of bodies.
+// Adds friction and damping, linear about the motions of bodies.
 template <class T>
-void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid, const Systems& systems,
+void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const BodyMotions& motions, const Systems& systems,
                          double* gradient, double* matrix) {
-  each_lagged(in, scene, slid, systems, [&](const PairPress& press, int64_t) {
-    add_press(press, 1, systems.groups, slid.center, gradient, matrix);
+  each_lagged(in, scene, motions, systems, [&](const PairForce& term, int64_t) {
+    add_pair_force(term, 1, systems.groups, motions.center, gradient, matrix);
   });
   for (int32_t k = 0; in.planes && k < in.bodies(); ++k) {
     if (!in.free[k] || !systems.works(k)) continue;
@@ -172,10 +316,10 @@ void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& sl
     double block[rigid::kSix] = {};
     for (int32_t i = 0; i < body.size(); ++i) {
       const int32_t v = body.vertex(i);
-      const Vector arm = body.position(v) - vector_of(slid.center + 3 * k);
+      const Vector arm = body.position(v) - vector_at(motions.center + 3 * k);
       Vector g{};
       Sym3<double> H{};
-      add_floor_friction(in, body, v, moved_by(slid.motion + kUnknowns * k, arm), g, H);
+      add_floor_friction(in, body, v, moved_by(motions.motion + kUnknowns * k, arm), g, H);
       rigid::add_vertex(arm, g, H, g6, block);
     }
     const MatrixPart own(matrix, systems.groups, k, k);
@@ -185,24 +329,25 @@ void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& sl
   }
 }
 
-// Slips along a step, and which system each has a say in.
+// Tangential displacements along a step, by system.
 template <class T>
-std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid,
-                                                  const Systems& systems, const double* step) {
-  std::vector<std::vector<SlipLine>> out(systems.all.size());
-  each_lagged(in, scene, slid, systems, [&](const PairPress& press, int64_t i) {
-    const int32_t body = press.body[0] < 0 ? press.body[1] : press.body[0];
-    out[systems.of[body]].push_back(slip_line(in, i, press, slid.center, step));
+std::vector<std::vector<FrictionLine>> lines_of_scene(const RigidInputs<T>& in, int64_t scene,
+                                                      const BodyMotions& motions, const Systems& systems,
+                                                      const double* step) {
+  std::vector<std::vector<FrictionLine>> out(systems.all.size());
+  each_lagged(in, scene, motions, systems, [&](const PairForce& term, int64_t i) {
+    const int32_t body = term.body[0] < 0 ? term.body[1] : term.body[0];
+    out[systems.of[body]].push_back(friction_line(in, i, term, motions.center, step));
   });
   for (int32_t k = 0; in.planes && k < in.bodies(); ++k) {
     const Body<T> body{in.scene, scene, k};
     const int64_t own = kUnknowns * k;
     for (int32_t i = 0; in.free[k] && systems.works(k) && i < body.size(); ++i) {
       const int32_t v = body.vertex(i);
-      const Vector arm = body.position(v) - vector_of(slid.center + 3 * k);
+      const Vector arm = body.position(v) - vector_at(motions.center + 3 * k);
       for (int plane = 0; plane < in.planes; ++plane) {
         if (bears(in, body, v, plane))
-          out[systems.of[k]].push_back(slip_line(in, body, v, plane, arm, slid.motion + own, step + own));
+          out[systems.of[k]].push_back(friction_line(in, body, v, plane, arm, motions.motion + own, step + own));
       }
     }
   }
@@ -227,37 +372,37 @@ void add_product(const double* matrix, int64_t size, const double* x, double* y)
   }
 }
 
-// Takes the motion from bodies of a scene of few that touch none that is to move.
+// Clears the motion of bodies of a scene of few that touch none that is to move.
 template <class T>
-void keep_few(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, double* motion) {
+void keep_few(const RigidInputs<T>& in, int64_t scene, const std::vector<PairForce>& terms, double* motion) {
   const int32_t n = in.bodies();
   uint8_t touching[kFew * kFew] = {};
   bool moves[kFew];
-  each_touching(in, scene, presses, [&](int32_t a, int32_t b) { touching[n * a + b] = 1; });
+  each_touching(in, scene, terms, [&](int32_t a, int32_t b) { touching[n * a + b] = 1; });
   find_moving(n, in.moving + n * scene, touching, moves);
   for (int32_t k = 0; k < n; ++k) {
     if (!moves[k]) std::fill_n(motion + kUnknowns * k, kUnknowns, 0.0);
   }
 }
 
-// The listed pairs of a scene that push.
+// The forces of the listed pairs of a scene within reach.
 template <class T>
-std::vector<PairPress> presses_of(const RigidInputs<T>& in, int64_t scene) {
+std::vector<PairForce> terms_of(const RigidInputs<T>& in, int64_t scene) {
   const int32_t vertices = in.gate.vertices;
   const int64_t row = scene * vertices;
   std::vector<double> since(vertices);  // how far each vertex is from where gaps were taken
   for (int32_t v = 0; v < vertices; ++v) {
-    const Vector d = Body<T>::at(in.scene.x + 3 * (row + v)) - Body<T>::at(in.gate.center + 3 * (row + v));
+    const Vector d = wide_at(in.scene.x + 3 * (row + v)) - wide_at(in.gate.center + 3 * (row + v));
     since[v] = std::sqrt(dot(d, d));
   }
   const auto is_far = [&](int64_t pair) {
     const T* constants = in.gate.constants + kConstants * pair;
-    const double room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
-    return most_closed(in.gate.listed.pairs + kPairRow * pair, vertices, since.data()) < (1 - 1e-6) * room;
+    const double slack = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+    return most_closed(in.gate.listed.pairs + kPairRow * pair, vertices, since.data()) < (1 - 1e-6) * slack;
   };
-  std::vector<PairPress> out(1);
+  std::vector<PairForce> out(1);
   for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
-    if (!is_far(i) && barrier_press(in, i, CornerPoints<T>{in, false}, out.back())) out.emplace_back();
+    if (!is_far(i) && barrier_force(in, i, CornerPoints<T>{in, false}, out.back())) out.emplace_back();
   }
   out.pop_back();
   return out;
@@ -269,30 +414,30 @@ template <class T>
 void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double* motion, double* factor,
                  int32_t* rows) {
   const int64_t unknowns = int64_t{kUnknowns} * in.bodies();
-  const std::vector<PairPress> presses = presses_of(in, scene);
-  if (rows) find_groups(in, scene, presses, rows);
+  const std::vector<PairForce> terms = terms_of(in, scene);
+  if (rows) find_groups(in, scene, terms, rows);
   Groups groups = in.groups_of(scene);
-  groups.room = most_grouped(in.bodies());
-  const int64_t size = kUnknowns * unknowns * groups.room;
+  groups.capacity = most_grouped(in.bodies());
+  const int64_t size = kUnknowns * unknowns * groups.capacity;
   std::vector<double> gradient(unknowns), matrix(size, 0.0), factors(size), step(unknowns), own(unknowns),
       whole(unknowns);
-  system_of_scene(in, scene, groups, presses, center, gradient.data(), matrix.data());
+  system_of_scene(in, scene, groups, terms, center, gradient.data(), matrix.data());
   std::fill_n(motion, unknowns, 0.0);
-  const Slid slid{center, motion};
+  const BodyMotions motions{center, motion};
   Systems systems(groups);
   for (auto& s : systems.all) {
     if (in.moves(scene, groups, s.first)) continue;
     s.state = kDone;
     factors[groups.matrix(s.first)] = std::numeric_limits<double>::quiet_NaN();
   }
-  const bool rubs = in.rubs(scene);
-  for (int iteration = 0; iteration < kSlipIterations && !systems.all_done(); ++iteration) {
+  const bool has_friction = in.has_friction_in(scene);
+  for (int iteration = 0; iteration < kFrictionIterations && !systems.all_done(); ++iteration) {
     for (const auto& s : systems.all) {
       if (s.state == kDone) continue;
       std::copy_n(matrix.data() + groups.matrix(s.first), s.size() * s.size(), &factors[groups.matrix(s.first)]);
       systems.each_unknown(s, [&](int, int64_t k) { step[k] = gradient[k]; });
     }
-    add_lagged_of_scene(in, scene, slid, systems, step.data(), factors.data());
+    add_lagged_of_scene(in, scene, motions, systems, step.data(), factors.data());
     for (const auto& s : systems.all) {
       if (s.state == kDone) continue;
       double* a = &factors[groups.matrix(s.first)];
@@ -303,33 +448,33 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double
       for (int64_t i = 0; i < s.size(); i += kUnknowns) keep_finite(own.data() + i);
       systems.each_unknown(s, [&](int i, int64_t k) { step[k] = own[i]; });
     }
-    if (!rubs) {
+    if (!has_friction) {
       for (const auto& s : systems.all) {
         if (s.state != kDone) systems.each_unknown(s, [&](int, int64_t k) { motion[k] = step[k]; });
       }
       break;
     }
-    const auto lines = lines_of_scene(in, scene, slid, systems, step.data());
+    const auto lines = lines_of_scene(in, scene, motions, systems, step.data());
     for (auto& s : systems.all) {
       if (s.state == kDone) continue;
       const double* a = &factors[groups.matrix(s.first)];
       systems.each_unknown(s, [&](int i, int64_t k) { own[i] = step[k], whole[i] = motion[k] + step[k]; });
-      const double fall = energy_of(a, s.size(), own.data());
+      const double decrease = energy_of(a, s.size(), own.data());
       const double all = energy_of(a, s.size(), whole.data());
-      const double share = settle(s.state, true, fall, all, [&](double most) {
-        return slip_share(most, [&](double tried) {
+      const double fraction = settle(s.state, true, decrease, all, [&](double most) {
+        return friction_fraction(most, [&](double tried) {
           double sum = 0;
-          for (const SlipLine& line : lines[&s - systems.all.data()]) sum += line.excess(tried, in.friction_eps);
+          for (const FrictionLine& line : lines[&s - systems.all.data()]) sum += line.excess(tried, in.friction_eps);
           return sum;
         });
       });
-      systems.each_unknown(s, [&](int, int64_t k) { motion[k] += share * step[k]; });
+      systems.each_unknown(s, [&](int, int64_t k) { motion[k] += fraction * step[k]; });
     }
   }
-  if (in.moving && in.together()) keep_few(in, scene, presses, motion);
+  if (in.moving && in.together()) keep_few(in, scene, terms, motion);
   const Groups kept = in.groups_of(scene);
   for (const auto& s : systems.all) {
-    const int64_t count = s.count <= kept.room ? s.size() * s.size() : 1;  // of others it says that there is none
+    const int64_t count = s.count <= kept.capacity ? s.size() * s.size() : 1;  // of others it says that there is none
     std::copy_n(&factors[groups.matrix(s.first)], count, factor + kept.matrix(s.first));
   }
 }
@@ -339,12 +484,11 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double
 template <class T>
 void rigid_system(const RigidInputs<T>& in, double* center, double* motion, double* factor, int32_t* groups) {
   const int64_t n = in.bodies();
-  torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t s = begin; s < end; ++s) {
-      solve_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s,
-                  groups ? groups + kGroupRows * n * s : nullptr);
-    }
-  });
+  const auto solve = [&](int64_t s) {
+    solve_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s,
+                groups ? groups + kGroupRows * n * s : nullptr);
+  };
+  for_each(in.scene.scenes, solve, 1);
 }
 
 template <class T>
@@ -354,7 +498,7 @@ void rigid_solve(const RigidInputs<T>& in, const double* factor, double* x) {
     const Systems systems(in.groups_of(scene));
     double* all = x + kUnknowns * in.bodies() * scene;
     for (const auto& s : systems.all) {
-      if (s.count > systems.groups.room) {  // it did not move
+      if (s.count > systems.groups.capacity) {  // it did not move
         systems.each_unknown(s, [&](int, int64_t k) { all[k] = 0; });
         continue;
       }
@@ -370,6 +514,5 @@ void rigid_solve(const RigidInputs<T>& in, const double* factor, double* x) {
   template void rigid_solve<T>(const RigidInputs<T>&, const double*, double*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
 
 }  // namespace diffvbd

@@ -3,7 +3,8 @@
 
 #include <vector>
 
-#include "../contact/candidates.h"
+#include "../contact/detection.h"
+#include "../contact/intersect.h"
 
 namespace diffvbd {
 
@@ -14,5 +15,10 @@ std::vector<uint64_t> detect(const contact::Surfaces<T>& in, const contact::Dete
 // The list, of as many of these pairs as there is room for: `pairs`, `constants`, `ptr`, `entry`.
 template <class T>
 void store_list(const contact::Surfaces<T>& in, const std::vector<uint64_t>& keys, const contact::Detected<T>& out);
+
+// Intersections of surfaces on the CPU: which edges pass through triangles, which points lie behind planes.
+
+template <class T>
+void find_intersections(const contact::Surfaces<T>& in, const contact::Intersections& out);
 
 }  // namespace diffvbd

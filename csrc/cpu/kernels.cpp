@@ -1,4 +1,4 @@
-// Which instruction set the sweeps run: the newest that the processor has, or an older one that DIFFVBD_ISA names.
+// The instruction set of the sweeps: the newest that the processor has, or an older one that DIFFVBD_ISA names.
 #include "kernels.h"
 
 #include <cstdlib>
@@ -76,7 +76,7 @@ template <class T>
 PairKernels<T> pair_kernels() {
   return kernels<T>().pairs;
 }
-MeetKernel meet_kernel() { return kernels<float>().meet; }
+OverlapKernel overlap_kernel() { return kernels<float>().meet; }
 
 template SweepKernel<float> forward_kernel<float>(int);
 template SweepKernel<double> forward_kernel<double>(int);

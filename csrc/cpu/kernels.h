@@ -1,8 +1,7 @@
 // The two hot loops of the CPU backend, chosen by a scene's energies and by what the processor can do.
 #pragma once
 
-#include "box_lanes.h"
-#include "pair_kernels.h"
+#include "contact_kernels.h"
 #include "scene.h"
 
 namespace diffvbd {
@@ -36,15 +35,15 @@ struct CoarseKernels {
                 int64_t end, T* to);
   // x := (L L^T)^-1 x
   void (*solve)(const T* factor, int64_t n, T* x);
-  // adds the coefficients of the tets' potential along `way`, blocks [begin, end) of the coarse plan
-  void (*line)(const int32_t* corner, const T* rest, const T* material, const T* x, const T* way, int64_t begin,
-               int64_t end, double* coefficients);
+  // adds the coefficients of the tets' potential along `displacement`, blocks [begin, end) of the coarse plan
+  void (*line)(const int32_t* corner, const T* rest, const T* material, const T* x, const T* displacement,
+               int64_t begin, int64_t end, double* coefficients);
 };
 template <class T>
 CoarseKernels<T> coarse_kernels(int energies);
 template <class T>
 PairKernels<T> pair_kernels();
-MeetKernel meet_kernel();
+OverlapKernel overlap_kernel();
 
 // The loops of one instruction set: each is compiled by itself (setup.py).
 template <class T>
@@ -52,7 +51,7 @@ struct Kernels {
   SweepKernel<T> (*forward)(int energies), (*reverse)(int energies);
   CoarseKernels<T> (*coarse)(int energies);
   PairKernels<T> pairs;
-  MeetKernel meet;
+  OverlapKernel meet;
 };
 namespace baseline {
 template <class T>

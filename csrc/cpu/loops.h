@@ -7,19 +7,18 @@
 #include <limits>
 #include <vector>
 
-#include "../coarse/rise.h"
-#include "../contact/lag.h"
-#include "../contact/lowest.h"
+#include "../contact/friction.h"
+#include "../contact/islands.h"
 #include "../contact/passes.h"
-#include "../contact/sweep_rooms.h"
-#include "../contact/translation.h"
-#include "../contact/unsupported.h"
-#include "../rigid/reverse.h"
-#include "../start/part.h"
-#include "bodies.h"
+#include "../contact/residual_acceleration.h"
+#include "../contact/trust_region.h"
+#include "../subspace/begin.h"
+#include "../subspace/coarse.h"
+#include "../subspace/rigid.h"
 #include "kernels.h"
 #include "reductions.h"
 #include "run.h"
+#include "threads.h"
 
 namespace diffvbd {
 
@@ -76,7 +75,8 @@ void begin(const start::Inputs<T>& in, const StartChoice<T>& of_corrected, const
   }
   if (of_others.two) {
     for_bodies(of_others.two->bodies, [&](const rigid::Body<T>& body, const Threads& team) {
-      of_others.taken[body.scene * in.others + body.body] = start::way_between(*of_others.two, body, team).rise <= 0;
+      of_others.taken[body.scene * in.others + body.body] =
+          start::path_between(*of_others.two, body, team).increase <= 0;
     });
     for_vertices(in.bodies, [&](int64_t scene, int32_t i) { choose_vertex(in, x_start, of_others.second, scene, i); });
   }
@@ -89,21 +89,21 @@ void begin(const start::Inputs<T>& in, const StartChoice<T>& of_corrected, const
   });
   if (of_corrected.two) {
     for_bodies(of_corrected.two->bodies, [&](const rigid::Body<T>& body, const Threads& team) {
-      start::part_body(in, *of_corrected.two, body, team, x_start, of_corrected.second, of_corrected.taken);
+      start::release_body(in, *of_corrected.two, body, team, x_start, of_corrected.second, of_corrected.taken);
     });
   }
 }
 template <class T>
-void begin_backward(const start::Inputs<T>& in, const start::Adjoints<T>& a, T* coasted, T* y) {
+void begin_backward(const start::Inputs<T>& in, const start::Adjoints<T>& a, T* extrapolated, T* y) {
   if (in.some_alone) {
     for_vertices(in.bodies, [&](int64_t scene, int32_t i) { reverse_vertex(in, a, scene, i); });
   }
   for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
     rigid::Iteration record[rigid::kMaxIterations];
     if (in.bodies.data.data != nullptr) {
-      start::reverse_body<true>(in, body, team, record, coasted, y, a);
+      start::reverse_body<true>(in, body, team, record, extrapolated, y, a);
     } else {
-      start::reverse_body<false>(in, body, team, record, coasted, y, a);
+      start::reverse_body<false>(in, body, team, record, extrapolated, y, a);
     }
   });
 }
@@ -111,15 +111,15 @@ void begin_backward(const start::Inputs<T>& in, const start::Adjoints<T>& a, T* 
 // out [B, bodies, 2]: the rise, and how much of it is rounding at most; infinite where a vertex would be too near a
 // plane.
 template <class T>
-void energy_increase(const coarse::RiseInputs<T>& in, double* out) {
+void energy_increase(const coarse::IncreaseInputs<T>& in, double* out) {
   static_assert(coarse::kBlockTets == kLanes);
   const int64_t scenes = in.bodies.scenes, vertices = in.bodies.vertices;
   // x[i] and to[i] - x[i] as rows of four
-  const Buffer<T> at(size_t(scenes * vertices) * 4, true), way(size_t(scenes * vertices) * 4, true);
+  const Buffer<T> at(size_t(scenes * vertices) * 4, true), displacement(size_t(scenes * vertices) * 4, true);
   for (int64_t v = 0; v < scenes * vertices; ++v) {
     for (int c = 0; c < 3; ++c) {
       at.get()[4 * v + c] = in.bodies.x[3 * v + c];
-      way.get()[4 * v + c] = in.to[3 * v + c] - in.bodies.x[3 * v + c];
+      displacement.get()[4 * v + c] = in.to[3 * v + c] - in.bodies.x[3 * v + c];
     }
   }
   const auto kernels = coarse_kernels<T>(kExactBlock);
@@ -127,7 +127,7 @@ void energy_increase(const coarse::RiseInputs<T>& in, double* out) {
     double single[3];
     team.template sum<3>(b.size(), single, [&](int32_t i, double* sum) {
       const int32_t v = b.vertex(i);
-      rigid::add_rise(b, v, rigid::Body<T>::at(in.to + 3 * b.row(v)), sum);
+      rigid::add_energy_increase(b, v, diffvbd::wide_at(in.to + 3 * b.row(v)), sum);
     });
     double change[2 * coarse::kDegree];
     const int64_t row = 4 * b.scene * vertices;
@@ -136,7 +136,7 @@ void energy_increase(const coarse::RiseInputs<T>& in, double* out) {
     const T* material = in.material.data + b.scene * in.material.scene;
     team.template sum<2 * coarse::kDegree>(in.block_ptr[b.body + 1] - first, change, [&](int32_t i, double* sum) {
       double c[coarse::kDegree] = {};
-      kernels.line(in.corner, rest, material, at.get() + row, way.get() + row, first + i, first + i + 1, c);
+      kernels.line(in.corner, rest, material, at.get() + row, displacement.get() + row, first + i, first + i + 1, c);
       for (int k = 0; k < coarse::kDegree; ++k) sum[k] += c[k], sum[coarse::kDegree + k] += std::abs(c[k]);
     });
     const double h2 = b.in.time_step * b.in.time_step;
@@ -151,29 +151,29 @@ void energy_increase(const coarse::RiseInputs<T>& in, double* out) {
 // ----------------------------------------------------------------------------------------------------------
 
 template <class T>
-void residual_acceleration(const contact::UnsupportedInputs<T>& in, T* out) {
+void residual_acceleration(const contact::ResidualInputs<T>& in, T* out) {
   for_bodies(in.scene,
-             [&](const rigid::Body<T>& b, const Threads& team) { contact::leave_unsupported(in, b, team, out); });
+             [&](const rigid::Body<T>& b, const Threads& team) { contact::residual_acceleration(in, b, team, out); });
 }
 template <class T>
-void residual_acceleration_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
-                                    const contact::UnsupportedAdjoints<T>& out) {
+void residual_acceleration_backward(const contact::ResidualInputs<T>& in, const T* bar,
+                                    const contact::ResidualAdjoints<T>& out) {
   for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
-    contact::reverse_unsupported(in, b, team, bar, out);
+    contact::reverse_residual_acceleration(in, b, team, bar, out);
   });
 }
 
 // wishes [B, bodies] and most [B]: memory
 template <class T>
-void sweep_radii(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* rooms) {
+void sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* trust_radii) {
   const int64_t grain = pieces_per_thread(in.bodies > 0 ? in.vertices / in.bodies : 0);
   for_items(in.scenes, in.bodies, grain, [&](int64_t scene, int32_t body) {
     const int64_t i = scene * in.bodies + body;
-    wishes[i] = contact::wish_of_body(in, contact::ways_of_body(in, scene, body, 0, 1), i);
+    wishes[i] = contact::wish_of_body(in, contact::displacements_of_body(in, scene, body, 0, 1), i);
   });
   for (int64_t s = 0; s < in.scenes; ++s) most[s] = contact::most_of_scene(in, wishes, s, 0, 1);
   for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
-    rooms[scene * in.vertices + v] = contact::sweep_room(in, most[scene], scene, v);
+    trust_radii[scene * in.vertices + v] = contact::sweep_radius(in, most[scene], scene, v);
   });
 }
 
@@ -213,13 +213,13 @@ void translation_backward(const contact::TranslationInputs<T>& in, const T* u_ba
                             planes_bar + row / in.bodies * scalars);
   }
   for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
-    contact::reverse_vertex_share(in, rate, mean, scene, v, move_bar, mass_bar);
+    contact::reverse_vertex_mean(in, rate, mean, scene, v, move_bar, mass_bar);
   });
 }
 
 // own [B, bodies, planes]: memory
 template <class T>
-void support_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out) {
+void support_vertices(const contact::SupportVertexInputs<T>& in, int32_t* own, int32_t* out) {
   const auto each = [&](auto&& f) {
     int64_t i = 0;
     for (int64_t b = 0; b < in.scenes; ++b) {
@@ -229,12 +229,12 @@ void support_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t*
     }
   };
   each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
-    own[i] = contact::lowest_of_body(in, b, body, plane, 0, 1).vertex;
+    own[i] = contact::support_vertex_of_body(in, b, body, plane, 0, 1).vertex;
   });
   each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
     const int32_t first = in.island[b * in.bodies + body];
     out[i] = first >= 0 && first < body ? out[i - int64_t{body - first} * in.num_planes]  // that of its first body
-                                        : contact::lowest_of_island(in, own, b, body, plane);
+                                        : contact::support_vertex_of_island(in, own, b, body, plane);
   });
 }
 
@@ -242,7 +242,7 @@ void support_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t*
 template <class T>
 struct UserPositions {
   const T* x;
-  Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+  Vec3<T> operator()(int v) const { return diffvbd::vector_at(x + int64_t{3} * v); }
 };
 // Calls f(pair, record, corners, constants, kappa) for each listed pair.
 template <class T, class F>
@@ -259,7 +259,7 @@ void for_pairs(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, 
 // Adds what the corners of a pair receive to points [B, N, 3].
 template <class T>
 void add_at_corners(const contact::ContactInputs<T>& in, const int32_t* record, const Vec3<T> (&values)[4], T* points) {
-  for (int k = 0; k < 4; ++k) contact::add_at(points + 3 * (record[5] * in.corners + record[k]), values[k]);
+  for (int k = 0; k < 4; ++k) diffvbd::add_to(points + 3 * (record[5] * in.corners + record[k]), values[k]);
 }
 
 template <class T>
@@ -286,8 +286,8 @@ void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoef
   std::fill_n(values, pairs * contact::kLagScalars, T(0)), std::fill_n(push, 3 * scenes * in.corners, T(0));
   for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
     const auto state = contact::lag_state(record[4], corners, a, stiffness);
-    contact::store_rubbing(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
-                           values + contact::kLagScalars * pair);
+    contact::store_lagged_friction(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
+                                   values + contact::kLagScalars * pair);
     Vec3<T> force[4];
     for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
     add_at_corners(in, record, force, push);
@@ -296,15 +296,15 @@ void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoef
 // friction and damping may be null
 template <class T>
 void lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                              const contact::RubbingBars<T>& given, const T* x, int64_t scenes, T* points, T* kappa,
-                              T* friction, T* damping) {
+                              const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes, T* points,
+                              T* kappa, T* friction, T* damping) {
   std::fill_n(points, 3 * scenes * in.corners, T(0));
   for (T* bars : {kappa, friction, damping}) {
     if (bars) std::fill_n(bars, scenes, T(0));
   }
   for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
     const int64_t scene = record[5];
-    contact::RubbingAdjoint<T> out;
+    contact::LaggedFrictionAdjoint<T> out;
     given.reverse(by, pair, record, corners, a, stiffness, out);
     add_at_corners(in, record, out.pair.x, points);
     kappa[scene] += out.pair.kappa;

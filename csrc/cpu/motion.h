@@ -1,25 +1,35 @@
-// Motion and rooms of bodies on the CPU.
+// Motions, islands and trust-region radii of bodies on the CPU, and sums over segments.
 #pragma once
 
-#include "../contact/coast.h"
-#include "../contact/rooms.h"
+#include "../contact/islands.h"
+#include "../contact/motion.h"
+#include "../contact/trust_region.h"
 
 namespace diffvbd {
 
 // Results as contact/motion.h has them.
 template <class T>
-void find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums);
+void find_motion(const contact::MotionInputs<T>& in, T* rigid, T* displacements, T* sums);
 template <class T>
 void reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a);
 
-// As contact/coast.h has it; a.rigid: the adjoint of `coasted`.
+// Results as in contact/motion.h; a.rigid: the adjoint of `extrapolated`.
 template <class T>
-void coast(const contact::MotionInputs<T>& in, double chord, T* coasted);
+void extrapolate(const contact::MotionInputs<T>& in, double lookback, T* extrapolated);
 template <class T>
-void reverse_coast(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a);
+void reverse_extrapolate(const contact::MotionInputs<T>& in, double lookback, const contact::MotionAdjoints<T>& a);
 
 // Fills all that `work` points to.
 template <class T>
-void find_trust_radii(contact::RoomInputs<T> in, const contact::RoomWork<T>& work);
+void find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work);
+
+// island [B, mesh_bodies]: the smallest body of each body's island, or -1 where the island must stay
+template <class T>
+void find_islands(const contact::IslandInputs<T>& in, int32_t* island);
+
+// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]), pairwise
+template <class T>
+void segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
+                 int64_t segments, int64_t c, T* out);
 
 }  // namespace diffvbd

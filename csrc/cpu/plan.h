@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "../core/plan_views.h"
+#include "../core/views.h"
 
 namespace diffvbd {
 
@@ -27,7 +27,7 @@ Adjacency build_adjacency(const int64_t* tets, const Stars& stars);
 // share a tet share a color.
 std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors);
 
-// The plan as one buffer (core/plan_views.h), for this backend and for CUDA.
+// The plan as one buffer (core/views.h), for this backend and for CUDA.
 std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
                                 const Adjacency& graph, const std::vector<int32_t>& color, int colors);
 std::vector<int32_t> build_group_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,

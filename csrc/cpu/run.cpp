@@ -2,18 +2,42 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdio>
 #include <optional>
 #include <stdexcept>
+#include <string>
+#include <type_traits>
 #include <vector>
 
 #include "coarse.h"
 #include "contact.h"
 #include "kernels.h"
-#include "message.h"
-#include "team.h"
+#include "threads.h"
 
 namespace diffvbd {
 namespace {
+
+// Text of an error. Not a stream: streams drag in the locale, which breaks where a toolchain links the C++ runtime
+// statically beside torch's own.
+struct Message {
+  std::string text;
+
+  Message& operator<<(const char* a) {
+    text += a;
+    return *this;
+  }
+  template <class T, std::enable_if_t<std::is_integral_v<T>, int> = 0>
+  Message& operator<<(T a) {
+    text += std::to_string(a);
+    return *this;
+  }
+  Message& operator<<(double a) {
+    char buffer[32];
+    std::snprintf(buffer, sizeof buffer, "%g", a);
+    text += buffer;
+    return *this;
+  }
+};
 
 // Below this many blocks in all colors and sweeps of a step, gathering a team costs more than it saves; below this many
 // in an average color, its barriers do.
@@ -29,38 +53,22 @@ int32_t source(const Plan& plan, int64_t block, int lane) {
   return v < 0 ? plan.order[block * kLanes] : v;
 }
 
-template <class T>
-void pack_vertices(const Plan& plan, const T* user, T* lanes) {
-  for (int64_t b = 0; b < plan.blocks; ++b) {
-    for (int l = 0; l < kLanes; ++l) {
-      const T* a = user + 3 * static_cast<int64_t>(source(plan, b, l));
-      for (int c = 0; c < 3; ++c) lanes[(b * 3 + c) * kLanes + l] = a[c];
-    }
-  }
-}
-template <class T>
-void unpack_vertices(const Plan& plan, const T* lanes, T* user) {
-  for (int64_t b = 0; b < plan.blocks; ++b) {
-    for (int l = 0; l < kLanes; ++l) {
-      const int32_t v = plan.order[b * kLanes + l];
-      if (v < 0) continue;
-      for (int c = 0; c < 3; ++c) user[3 * static_cast<int64_t>(v) + c] = lanes[(b * 3 + c) * kLanes + l];
-    }
-  }
-}
-template <class T>
-void pack_rows(const Plan& plan, const T* user, T* rows, bool phantoms) {
+// The place of component c of vertex i in sweep order: in packs [blocks, 3, kLanes], or in rows [blocks kLanes, 4].
+constexpr auto in_packs = [](int64_t i, int c) { return (i / kLanes * 3 + c) * kLanes + i % kLanes; };
+constexpr auto in_rows = [](int64_t i, int c) { return 4 * i + c; };
+
+template <class T, class Place>
+void pack(const Plan& plan, const T* user, T* to, const Place& place, bool phantoms = true) {
   for (int64_t i = 0; i < int64_t{plan.blocks} * kLanes; ++i) {
     const int32_t v = phantoms ? source(plan, i / kLanes, i % kLanes) : plan.order[i];
-    for (int c = 0; c < 3; ++c) rows[4 * i + c] = v < 0 ? T(0) : user[3 * static_cast<int64_t>(v) + c];
+    for (int c = 0; c < 3; ++c) to[place(i, c)] = v < 0 ? T(0) : user[3 * int64_t{v} + c];
   }
 }
-template <class T>
-void unpack_rows(const Plan& plan, const T* rows, T* user) {
+template <class T, class Place>
+void unpack(const Plan& plan, const T* from, T* user, const Place& place) {
   for (int64_t i = 0; i < int64_t{plan.blocks} * kLanes; ++i) {
     const int32_t v = plan.order[i];
-    if (v < 0) continue;
-    for (int c = 0; c < 3; ++c) user[3 * static_cast<int64_t>(v) + c] = rows[4 * i + c];
+    for (int c = 0; v >= 0 && c < 3; ++c) user[3 * int64_t{v} + c] = from[place(i, c)];
   }
 }
 
@@ -75,17 +83,17 @@ struct Scene {
   Scene(const Plan& plan, const StepInputs<T>& in, int64_t scene, const T* positions)
       : x(size_t(plan.blocks) * kLanes * 4), y(size_t(plan.blocks) * 3 * kLanes), mass(size_t(plan.blocks) * kLanes) {
     const bool lagged = any_x_prev(in.energies, VertexEnergies{});
-    pack_rows(plan, positions, x.get(), true);
-    pack_vertices(plan, in.y.data + scene * in.y.scene, y.get());
+    pack(plan, positions, x.get(), in_rows);
+    pack(plan, in.y.data + scene * in.y.scene, y.get(), in_packs);
     const T* m = in.mass.data + scene * in.mass.scene;
     for (int64_t i = 0; i < int64_t{plan.blocks} * kLanes; ++i) mass.get()[i] = m[source(plan, i / kLanes, i % kLanes)];
     if (lagged) {
       x_prev = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
-      pack_vertices(plan, in.x_prev.data + scene * in.x_prev.scene, x_prev.get());
+      pack(plan, in.x_prev.data + scene * in.x_prev.scene, x_prev.get(), in_packs);
     }
     if (in.origin.data) {
       origin = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
-      pack_vertices(plan, in.origin.data + scene * in.origin.scene, origin.get());
+      pack(plan, in.origin.data + scene * in.origin.scene, origin.get(), in_packs);
     }
     view.x = x.get();
     view.y = y.get();
@@ -120,7 +128,7 @@ struct Scene {
   }
 };
 
-// Where each vertex stands in sweep order: asked for by contact, whose pairs name vertices.
+// The place of each vertex in sweep order: the pairs of contact name vertices.
 std::vector<int32_t> positions_of(const Plan& plan) {
   std::vector<int32_t> out(plan.num_vertices);
   for (int32_t at = 0; at < plan.blocks * kLanes; ++at) {
@@ -131,13 +139,8 @@ std::vector<int32_t> positions_of(const Plan& plan) {
 
 template <class F>
 void for_scenes(int64_t scenes, bool parallel, const F& f) {
-  if (parallel && scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) {
-    torch::stable::parallel_for(0, scenes, 1, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) f(i);
-    });
-  } else {
-    for (int64_t i = 0; i < scenes; ++i) f(i);
-  }
+  if (parallel && scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) return for_each(scenes, f, 1);
+  for (int64_t i = 0; i < scenes; ++i) f(i);
 }
 template <class T>
 int64_t team_size(const Plan& plan, const StepInputs<T>& in) {
@@ -176,10 +179,146 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
   }
 }
 
+// --- values that a step cannot work with, found before any work is done
+
+template <class T>
+int64_t distinct_scenes(const Batched<const T>& t, int64_t scenes) {
+  return t.scene == 0 ? std::min<int64_t>(scenes, 1) : scenes;
+}
+
+template <class Law, class T>
+void check_material(const StepInputs<T>& in, int64_t tets) {
+  const int64_t distinct = one_for_scenes(in.material) ? std::min<int64_t>(in.scenes, 1) : in.scenes;
+  const int64_t count = one_for_items(in.material) ? std::min<int64_t>(tets, 1) : tets;
+  for (int64_t b = 0; b < distinct; ++b) {
+    for (int64_t i = 0; i < count; ++i) {
+      T material[kMaterialScalars];  // x_prev has been looked at
+      for (int m = 0; m < kMaterialScalars; ++m) {
+        material[m] = in.material[m].data[b * in.material[m].scene + i * in.material[m].item];
+      }
+      for (int m = 0; m < kMaterialScalars; ++m) {
+        const char* message = Law::invalid(material, m);
+        if (!message) continue;
+        Message out;
+        out << message << ", got " << material[m];
+        for (int other = 0; other < m; ++other) out << " with " << Law::material_names[other] << " " << material[other];
+        out << " at tet " << i << " of scene " << b;
+        throw std::invalid_argument(out.text);
+      }
+    }
+  }
+}
+
+template <class T>
+void check_vectors(const char* name, const Batched<const T>& t, int64_t scenes, int64_t vertices) {
+  for (int64_t b = 0; b < distinct_scenes(t, scenes); ++b) {
+    for (int64_t i = 0; i < 3 * vertices; ++i) {
+      const T value = t.data[b * t.scene + i];
+      if (std::isfinite(value)) continue;
+      Message out;
+      out << name << ": expected finite values, got " << value << " at vertex " << i / 3 << " of scene " << b;
+      throw std::invalid_argument(out.text);
+    }
+  }
+}
+
+template <class T>
+void check_energy_data(const Plan& plan, const StepInputs<T>& in) {
+  for (int64_t b = 0; b < distinct_scenes(in.data, in.scenes); ++b) {
+    const T* at = in.data.data + b * in.data.scene;
+    for (int k = 0; k < kVertexEnergies; ++k) {
+      const int64_t size = int64_t{in.data_count[k]} * (is_per_vertex(k, VertexEnergies{}) ? plan.num_vertices : 1);
+      const int stride = data_stride(k, VertexEnergies{});
+      for (int64_t i = 0; i < size; i += stride) {
+        const char* message = invalid_data(k, at + i, VertexEnergies{});
+        for (int64_t c = i; !message && c < i + stride; ++c) {
+          if (!std::isfinite(at[c])) message = "parameters: expected finite values";
+        }
+        if (!message) continue;
+        Message out;
+        out << message << ", got (";
+        for (int64_t c = i; c < i + stride; ++c) out << (c > i ? ", " : "") << at[c];
+        out << ") in record " << i / stride << " of scene " << b;
+        throw std::invalid_argument(out.text);
+      }
+      at += size;
+    }
+  }
+}
+
+// The step filter needs a positive gap to start from.
+template <class T>
+void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
+  for (int64_t b = 0; b < in.scenes; ++b) {
+    const T* planes = in.data.data + b * in.data.scene;
+    for (int k = 0; k < in.data_count[0]; k += FloorBarrier::stride) {
+      std::vector<int32_t> below;
+      for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
+        const int32_t v = plan.order[i];
+        if (v < 0) continue;
+        const auto at = [&](const Batched<const T>& t) {
+          const T* a = t.data + b * t.scene + 3 * int64_t{v};
+          return vector_at(a);
+        };
+        VertexState<T> state{at(in.x_prev), zero3<T>(), zero3<T>(), T(0)};
+        if (in.origin.data) state.origin = at(in.origin);
+        const FloorBarrier::Plane<T> plane(planes + k, state);
+        if (T(0) < plane.gap(state.x)) continue;
+        below.push_back(v);
+      }
+      if (below.empty()) continue;
+      std::sort(below.begin(), below.end());
+      Message out;
+      out << "x: expected every unpinned vertex above floor plane " << k / FloorBarrier::stride << ", got "
+          << below.size() << " on or below it in scene " << b << ": vertices ";
+      for (size_t i = 0; i < std::min<size_t>(below.size(), 5); ++i) out << (i > 0 ? ", " : "") << below[i];
+      if (below.size() > 5) out << ", ...";
+      throw std::invalid_argument(out.text);
+    }
+  }
+}
+
 }  // namespace
 
 template <class T>
-void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut) {
+void check_values(const Plan& plan, const StepInputs<T>& in) {
+  const int64_t n = plan.num_vertices;
+  check_vectors("x", in.x_prev, in.scenes, n);
+  check_vectors("predictor (x, v, force, gravity, prescribed)", in.y, in.scenes, n);
+  check_vectors("start (x, v, force, gravity, prescribed)", in.x_start, in.scenes, n);
+  if (in.energies & kExactBlock) check_material<StableNeoHookean<true>>(in, plan.num_tets);
+  if (in.energies & kPaperBlock) check_material<StableNeoHookean<false>>(in, plan.num_tets);
+  // Vertices that no sweep moves need no mass: an isolated vertex has none.
+  for (int64_t b = 0; b < distinct_scenes(in.mass, in.scenes); ++b) {
+    for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
+      const int32_t v = plan.order[i];
+      if (v < 0) continue;
+      const T m = in.mass.data[b * in.mass.scene + v];
+      if (m > 0 && std::isfinite(m)) continue;
+      Message out;
+      out << "density or rest_points: expected a finite mass > 0 kg, got " << m << " at vertex " << v << " of scene "
+          << b;
+      throw std::invalid_argument(out.text);
+    }
+  }
+  check_energy_data(plan, in);
+  if (any_filter(in.energies, VertexEnergies{})) check_above_planes(plan, in);
+}
+
+template <class T>
+void check_masses(const T* fractions, int64_t scenes, int64_t tets, int64_t stride) {
+  for (int64_t i = 0; i < scenes * tets; ++i) {
+    const T mass = 4 * fractions[i * stride];
+    if (mass > 0 && std::isfinite(mass)) continue;
+    Message out;
+    out << "density or rest_points: expected density > 0 kg/m^3 and positive volume, got a mass of " << mass
+        << " kg at tet " << i % tets << " of scene " << i / tets;
+    throw std::invalid_argument(out.text);
+  }
+}
+
+template <class T>
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* truncations) {
   const auto kernel = forward_kernel<T>(in.energies);
   const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, kept_scalars(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
@@ -208,30 +347,26 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
-            member.each(first, last, [&](int64_t begin, int64_t end) {
+            member.each_sync(first, last, [&](int64_t begin, int64_t end) {
               contact->assemble(begin, end);
               contact->remember(begin, end);
             });
-            member.barrier();
           }
-          member.each(first, last, [&](int64_t begin, int64_t end) {
+          uint8_t* limits = contact ? truncations + (b * in.sweeps + k) * plan.num_vertices : nullptr;
+          member.each_sync(first, last, [&](int64_t begin, int64_t end) {
             kernel(plan, scene.view, q, k, in.tape_policy, begin, end);
-            if (contact) contact->propose(first, last, begin, end, cut + (b * in.sweeps + k) * plan.num_vertices);
+            if (contact) contact->propose(first, last, begin, end, limits);
           });
-          member.barrier();
           if (contact) {
-            uint8_t* limits = cut + (b * in.sweeps + k) * plan.num_vertices;
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
-            member.barrier();
-            member.each(first, last,
-                        [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
-            member.barrier();
+            member.each_sync(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
+            member.each_sync(first, last,
+                             [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
           }
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
         }
       }
     });
-    unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
+    unpack(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices}, in_rows);
   });
 }
 
@@ -254,7 +389,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true),
         material_bar(wants_material ? kTetScalars * pairs : 0, true), rest_bar(out.rest ? kPairRest * pairs : 0, true),
         data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
-    pack_rows(plan, x_bar + b * 3 * n, x_rows.get(), false);
+    pack(plan, x_bar + b * 3 * n, x_rows.get(), in_rows, false);
     s.x_bar = x_rows.get();
     s.y_bar = y_bar.get();
     s.x_prev_bar = x_prev_bar.get();
@@ -280,32 +415,25 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       for (int c = plan.colors - 1; c >= 0; --c) {
         const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
         if (contact) {
-          member.each(first, last, [&](int64_t begin, int64_t end) {
+          member.each_sync(first, last, [&](int64_t begin, int64_t end) {
             contact->prepare(k, rows_of_tape, begin, end, limits + (b * in.sweeps + k) * n);
           });
-          member.barrier();
           member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
           if (in.tape_policy != kFullTape) {
             member.barrier();
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
-            member.barrier();
+            member.each_sync(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
           }
         }
-        member.each(first, last,
-                    [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
-        member.barrier();
-        if (contact) {
-          member.each(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
-          member.barrier();
-        }
+        member.each_sync(first, last,
+                         [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
+        if (contact) member.each_sync(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
       }
       // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
-      member.each(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
+      member.each_sync(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
         for (int64_t block = begin; block < end; ++block) {
           store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
         }
       });
-      member.barrier();
     };
     Team::run(team_size(plan, in), [&](Team::Member member) {
       int corrections = in.coarse ? in.coarse->corrections : 0;
@@ -317,9 +445,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     });
     collect_last(plan, s.rows, s.x_bar);
     if (contact) contact->finish(out.collider + b * 3 * (in.contact->corners - n));
-    unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
-    unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
-    if (s.x_prev) unpack_vertices(plan, s.x_prev_bar, out.x_prev + b * 3 * n);
+    unpack(plan, s.x_bar, out.x_start + b * 3 * n, in_rows);
+    unpack(plan, s.y_bar, out.y + b * 3 * n, in_packs);
+    if (s.x_prev) unpack(plan, s.x_prev_bar, out.x_prev + b * 3 * n, in_packs);
     if (out.mass) {
       for (int64_t i = 0; i < lanes; ++i) {
         if (plan.order[i] >= 0) out.mass[b * n + plan.order[i]] = s.mass_bar[i];
@@ -386,12 +514,13 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                  \
+  template void check_masses<T>(const T*, int64_t, int64_t, int64_t);                                           \
+  template void check_values<T>(const Plan&, const StepInputs<T>&);                                             \
   template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);                            \
   template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, const uint8_t*, \
                                const StepAdjoints<T>&);                                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
-#undef DIFFVBD_INSTANTIATE
 
 }  // namespace diffvbd

@@ -2,8 +2,8 @@
 // colors.
 #pragma once
 
-#include "../coarse/views.h"
 #include "../contact/passes.h"
+#include "../subspace/coarse.h"
 #include "plan.h"
 #include "scene.h"
 
@@ -45,12 +45,12 @@ void check_values(const Plan& plan, const StepInputs<T>& in);
 
 // shares [B, T, stride] of the tets' masses in their corners: finite and > 0
 template <class T>
-void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride);
+void check_masses(const T* fractions, int64_t scenes, int64_t tets, int64_t stride);
 
 // x [B, V, 3], tape [B, sweeps, tape_rows, active]; cut with contact: [B, sweeps, V] exponents of limits
 // (contact/limit.h)
 template <class T>
-void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut = nullptr);
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* truncations = nullptr);
 
 // x and limits are what run_forward returned, x_bar is the adjoint of x; both [B, V, 3]
 template <class T>

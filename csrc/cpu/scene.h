@@ -42,11 +42,11 @@ struct SceneView {
   const T* data;      // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies];
-  T* tape;      // [sweeps, rows, active]
-  T* contact;   // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks
-  T* gradient;  // [blocks kLanes, 4] of the potential, for a coarse correction
-  T* way;       // [blocks kLanes, 4] along which one goes; in the reverse what the gradient is multiplied with,
-  T* wanted;    // and along which one wanted to go
+  T* tape;          // [sweeps, rows, active]
+  T* contact;       // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks
+  T* gradient;      // [blocks kLanes, 4] of the potential, for a coarse correction
+  T* displacement;  // [blocks kLanes, 4] along which one goes; in the reverse what the gradient is multiplied with,
+  T* wanted;        // and along which one wanted to go
 
   // reverse only
   T* x_bar;         // [blocks kLanes, 4]
@@ -163,9 +163,9 @@ struct LaneStar {
     if (wishes & kMaterial) return diffvbd::multiply_tets<Law, kMaterial>(*this, x, w, minus_h2);
     return diffvbd::multiply_tets<Law, kState>(*this, x, w, minus_h2);
   }
-  DIFFVBD_FN PairWay<Lanes<T>> way(int e) const {
+  DIFFVBD_FN PairDisplacement<Lanes<T>> displacement(int e) const {
     const int32_t* j = plan.neighbors + (first + e) * 3 * kLanes;
-    return {gather3(s.way, j), gather3(s.way, j + kLanes), gather3(s.way, j + 2 * kLanes)};
+    return {gather3(s.displacement, j), gather3(s.displacement, j + kLanes), gather3(s.displacement, j + 2 * kLanes)};
   }
   template <int wanted>
   DIFFVBD_FN bool wants(int what) const {

@@ -18,7 +18,7 @@ constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each grid-wide vo
 // Out of line, so that all callers get the same bits.
 template <class T>
 __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
-  return try_pair(in, s, pair, round);
+  return test_pair(in, s, pair, round);
 }
 template <class T>
 __device__ __noinline__ bool passes_quickly(const AdvanceInputs<T>& in, const AdvanceState<T>& s, PairPlane<T>& plane,
@@ -99,7 +99,7 @@ struct NearPairs {
     for (int k = static_cast<int>(threadIdx.x); place(k) < pairs.end; k += kThreads) {
       const int64_t i = place(k);
       const bool open = s.first || is_open(in, s, in.listed.pairs + kPairRow * i);
-      if (open && !stays_far_at_any_share(in, s, i)) near[place(atomicAdd(count, 1))] = static_cast<int32_t>(i);
+      if (open && !stays_far_at_any_fraction(in, s, i)) near[place(atomicAdd(count, 1))] = static_cast<int32_t>(i);
     }
     __syncthreads();
     for (int k = static_cast<int>(threadIdx.x); k < *count; k += kThreads) plane[place(k)].forget();
@@ -184,7 +184,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
     bool open = false;
     team.each(units, [&](int64_t i) {
       end_move(s, i);
-      open = open || s.share[i] < T(1);
+      open = open || s.fraction[i] < T(1);
     });
     if (!team.any(open)) break;
   }
@@ -220,9 +220,9 @@ __global__ void __launch_bounds__(kThreads, 2)
 
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    refresh_kernel(const __grid_constant__ NarrowInputs<T> in, int64_t pairs, T* constants) {
+    refresh_kernel(const __grid_constant__ GapInputs<T> in, int64_t pairs, T* constants) {
   const int64_t i = own_item(kThreads);
-  if (i < pairs) narrow_pair(in, i, constants + kConstants * i);
+  if (i < pairs) refresh_gap(in, i, constants + kConstants * i);
 }
 
 // Parts of the workspace; without memory, its size.
@@ -260,7 +260,7 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   std::vector<Span> zeros{{infeasible, sizeof(*infeasible)}};
   if (rows == 0) return clear(zeros, stream);
   AdvanceWork<T> work(in, capacity, clusters, workspace);
-  work.state.share = share, work.state.first = true;
+  work.state.fraction = share, work.state.first = true;
   auto* found = reinterpret_cast<unsigned long long*>(infeasible);
   if (clusters) {
     if (in.scenes > 1) {  // a single scene clears it itself
@@ -283,7 +283,7 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
 }
 
 template <class T>
-cudaError_t refresh_gaps(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
+cudaError_t refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
   if (pairs == 0) return cudaSuccess;
   const auto blocks = blocks_for(pairs, kThreads);
   refresh_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);

@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "../core/plan_views.h"
+#include "../core/views.h"
 
 namespace diffvbd::cuda {
 

@@ -32,7 +32,7 @@ struct Choose {
   uint8_t* falls;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    const double rise = start::way_between(two, body, team).rise;
+    const double rise = start::path_between(two, body, team).increase;
     if (team.leads()) falls[body.scene * two.bodies.bodies + body.body] = rise <= 0;
   }
 };
@@ -56,7 +56,7 @@ struct Part {
   uint8_t* alone;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    start::part_body(in, two, body, team, x_start, apart, alone);
+    start::release_body(in, two, body, team, x_start, apart, alone);
   }
 };
 template <class T, bool energies>

@@ -5,7 +5,7 @@
 #include <cooperative_groups.h>
 #include <math_constants.h>
 
-#include "../rigid/body.h"
+#include "../subspace/rigid.h"
 #include "bodies.h"
 #include "common.cuh"
 #include "warp_reduce.cuh"

@@ -5,9 +5,9 @@
 
 #include <cstdint>
 
-#include "../coarse/rise.h"
-#include "../rigid/reverse.h"
-#include "../start/part.h"
+#include "../subspace/begin.h"
+#include "../subspace/coarse.h"
+#include "../subspace/rigid.h"
 
 namespace diffvbd::cuda {
 
@@ -46,12 +46,12 @@ cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups,
 
 // Doubles that energy_increase works in.
 template <class T>
-int64_t energy_increase_workspace(const coarse::RiseInputs<T>& in) {
+int64_t energy_increase_workspace(const coarse::IncreaseInputs<T>& in) {
   return 2 * in.bodies.scenes * (in.blocks + in.listed);
 }
 
 // out [B, bodies, 2]: increase and magnitude of the terms; infinite or NaN where a vertex comes too near a plane.
 template <class T>
-cudaError_t energy_increase(const coarse::RiseInputs<T>& in, double* workspace, double* out, cudaStream_t stream);
+cudaError_t energy_increase(const coarse::IncreaseInputs<T>& in, double* workspace, double* out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

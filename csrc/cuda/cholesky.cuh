@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "../contact/groups.h"
+#include "../subspace/contact_rigid.h"
 
 namespace diffvbd::cuda {
 

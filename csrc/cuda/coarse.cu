@@ -1,5 +1,5 @@
 // Coarse correction: gradient, restriction, solve, prolongation, step length, motion; and their transposes.
-#include "../coarse/line.h"
+#include "../subspace/coarse.h"
 #include "bodies.cuh"
 #include "coarse.h"
 #include "common.cuh"
@@ -370,7 +370,7 @@ cudaError_t Corrections<T>::reverse(int k, int wanted) const {
 template <class T>
 cudaError_t Corrections<T>::invert_with_vertex_blocks() const {
   const View<T> a{s, *in.coarse, w};
-  if (!a.c.pressed) return cudaSuccess;
+  if (!a.c.has_vertex_blocks) return cudaSuccess;
   if (auto error = launch(vertex_block_rows<T>, s.scenes * a.c.plan.listed, kRowThreads, stream, a, in)) return error;
   return inverse_with_vertex_blocks(a.c, s.base, s.scenes, s.positions, w.vertex_blocks, w.matrix, w.inverse, stream);
 }

@@ -1,8 +1,8 @@
 // Coarse corrections (docs/method.md, section 15): what run.cuh launches between sweeps, and the matrices of a step.
 #pragma once
 
-#include "../coarse/length.h"
-#include "../coarse/matrix.h"
+#include "../subspace/coarse.h"
+#include "../subspace/coarse_matrix.h"
 #include "step.h"
 
 namespace diffvbd::cuda {

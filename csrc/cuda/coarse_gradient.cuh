@@ -32,7 +32,7 @@ struct DisplacementStar : GroupStar<T, lanes> {
     }
     __syncwarp();
   }
-  __device__ __forceinline__ PairWay<T> way(int) const {
+  __device__ __forceinline__ PairDisplacement<T> displacement(int) const {
     const auto of = [&](int a) {
       const T* from = displacements + a * 3 * P::groups;
       return Vec3<T>{from[0], from[P::groups], from[2 * P::groups]};

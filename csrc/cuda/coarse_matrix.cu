@@ -1,5 +1,5 @@
 // Matrices of a step, their inverses body by body, and the transpose.
-#include "../coarse/line.h"
+#include "../subspace/coarse.h"
 #include "bodies.cuh"
 #include "coarse.h"
 #include "common.cuh"

@@ -14,14 +14,14 @@ using namespace contact;
 constexpr int kThreads = 128, kWarp = 32;
 
 template <class T>
-__global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ KeepInputs<T> in, int32_t* kept) {
+__global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ CompactInputs<T> in, int32_t* kept) {
   const int64_t i = own_item(kThreads);
   if (i <= in.count) kept[i] = i < in.count && stays(in, i) ? 1 : 0;
 }
 // Calls f(number(entry), index in the compact list) for the entries of a corner point whose pairs stay, a warp for each
 // corner. Returns how many there are.
 template <class T, class Number, class F>
-__device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Number& number, const F& f) {
+__device__ int32_t each_kept(const CompactInputs<T>& in, int64_t corner, const Number& number, const F& f) {
   constexpr int kAhead = 8;  // entries of a thread that are read at once: a corner of a collider may have thousands
   const unsigned lane = threadIdx.x % kWarp;
   const int32_t end = in.ptr[corner + 1];
@@ -47,15 +47,15 @@ __device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Numb
   return count;
 }
 template <class T>
-__device__ void count_entries_of(const KeepInputs<T>& in, int64_t corner, int32_t* counts) {
+__device__ void count_entries_of(const CompactInputs<T>& in, int64_t corner, int32_t* counts) {
   if (corner > in.corners) return;
   const int32_t count =
       corner < in.corners ? each_kept(in, corner, [](int32_t entry) { return entry; }, [](int32_t, int32_t) {}) : 0;
   if (threadIdx.x % kWarp == 0) counts[corner] = count;
 }
 template <class T>
-__device__ void copy_entries_of(const KeepInputs<T>& in, const int32_t* kept, int64_t corner, int32_t first,
-                                const Kept<T>& out) {
+__device__ void copy_entries_of(const CompactInputs<T>& in, const int32_t* kept, int64_t corner, int32_t first,
+                                const CompactList<T>& out) {
   int32_t* to = out.entry + first;
   each_kept(
       in, corner, [&](int32_t entry) { return 4 * kept[entry >> 2] + (entry & 3); },
@@ -63,12 +63,13 @@ __device__ void copy_entries_of(const KeepInputs<T>& in, const int32_t* kept, in
 }
 
 template <class T>
-__global__ void __launch_bounds__(kThreads) count_entries(const __grid_constant__ KeepInputs<T> in, int32_t* counts) {
+__global__ void __launch_bounds__(kThreads)
+    count_entries(const __grid_constant__ CompactInputs<T> in, int32_t* counts) {
   count_entries_of(in, own_item(kThreads) / kWarp, counts);
 }
 template <class T>
-__global__ void __launch_bounds__(kThreads)
-    copy_pairs(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
+__global__ void __launch_bounds__(kThreads) copy_pairs(const __grid_constant__ CompactInputs<T> in, const int32_t* kept,
+                                                       const __grid_constant__ CompactList<T> out) {
   const int64_t i = own_item(kThreads);
   if (i >= in.count) return;
   if (stays(in, i)) copy_pair(in, i, kept[i], out);
@@ -76,7 +77,8 @@ __global__ void __launch_bounds__(kThreads)
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    copy_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
+    copy_entries(const __grid_constant__ CompactInputs<T> in, const int32_t* kept,
+                 const __grid_constant__ CompactList<T> out) {
   const int64_t i = own_item(kThreads) / kWarp;
   if (i < in.corners) copy_entries_of(in, kept, i, out.ptr[i], out);
 }
@@ -85,7 +87,7 @@ __global__ void __launch_bounds__(kThreads)
 constexpr int64_t kFewPairs = 1 << 15, kFewCorners = 1 << 12;
 
 template <class T>
-bool are_few(const KeepInputs<T>& in) {
+bool are_few(const CompactInputs<T>& in) {
   return in.count <= kFewPairs && in.corners <= kFewCorners;
 }
 
@@ -119,8 +121,8 @@ __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
 // The first blocks copy pairs; the others count the entries that corner points keep.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    compact_few_pairs(const __grid_constant__ KeepInputs<T> in, unsigned blocks, int32_t* kept, int32_t* counts,
-                      const __grid_constant__ Kept<T> out) {
+    compact_few_pairs(const __grid_constant__ CompactInputs<T> in, unsigned blocks, int32_t* kept, int32_t* counts,
+                      const __grid_constant__ CompactList<T> out) {
   if (blockIdx.x >= blocks) {
     count_entries_of(in, (static_cast<int64_t>(blockIdx.x - blocks) * kThreads + threadIdx.x) / kWarp, counts);
     return;
@@ -142,8 +144,8 @@ __global__ void __launch_bounds__(kThreads)
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    compact_few_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const int32_t* counts,
-                        const __grid_constant__ Kept<T> out) {
+    compact_few_entries(const __grid_constant__ CompactInputs<T> in, const int32_t* kept, const int32_t* counts,
+                        const __grid_constant__ CompactList<T> out) {
   const int64_t i = own_item(kThreads) / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
   int before = sums_before(first, first, [&](int64_t corner) { return counts[corner]; }).all;
   if (i > in.corners) return;
@@ -155,7 +157,7 @@ __global__ void __launch_bounds__(kThreads)
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 255) / 256 * 256; }
 
 template <class T>
-size_t scan_bytes(const KeepInputs<T>& in) {
+size_t scan_bytes(const CompactInputs<T>& in) {
   size_t of_pairs = 0, of_corners = 0;
   int32_t* none = nullptr;
   cub::DeviceScan::ExclusiveSum(nullptr, of_pairs, none, none, in.count + 1);
@@ -166,13 +168,13 @@ size_t scan_bytes(const KeepInputs<T>& in) {
 }  // namespace
 
 template <class T>
-int64_t compact_list_bytes(const KeepInputs<T>& in) {
+int64_t compact_list_bytes(const CompactInputs<T>& in) {
   if (are_few(in)) return aligned(in.count * sizeof(int32_t)) + aligned((in.corners + 1) * sizeof(int32_t));
   return aligned((in.count + 1) * sizeof(int32_t)) + aligned(static_cast<int64_t>(scan_bytes(in)));
 }
 
 template <class T>
-cudaError_t compact_list(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, cudaStream_t stream) {
+cudaError_t compact_list(const CompactInputs<T>& in, const CompactList<T>& out, void* workspace, cudaStream_t stream) {
   auto* kept = static_cast<int32_t*>(workspace);
   const unsigned of_corners = blocks_for((in.corners + 1) * kWarp, kThreads);
   if (are_few(in)) {

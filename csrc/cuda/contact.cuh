@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "../contact/lag.h"
+#include "../contact/friction.h"
 #include "common.cuh"
 #include "contact.h"
 #include "contact_sweep.cuh"
@@ -14,7 +14,7 @@ namespace {
 
 constexpr int kContactThreads = kWarpsPerBlock * kSlice;
 // Threads for a vertex of a color, for a vertex of a small color, and for a corner point.
-constexpr int kShare = 8, kWide = 32, kCornerShare = 8;
+constexpr int kGapFraction = 8, kWide = 32, kCornerShare = 8;
 
 // Vertices of the blocks [begin, end) that a warp works on, as one of `roles` warps.
 template <int share>
@@ -78,7 +78,7 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
 
 template <class T>
 __device__ __forceinline__ void add_row(T* rows, int64_t row, const Vec3<T>& a) {
-  contact::add_at(rows + kRow * row, a);
+  diffvbd::add_to(rows + kRow * row, a);
 }
 
 template <int share, class T>
@@ -93,7 +93,7 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
   if (!__any_sync(kWholeWarp, pairs.touches())) return;
   T now[3];
   take_scattered(c, pairs, now);
-  if (pairs.touches() && at.lane == 0) add_row(s.w.x_bar, part.row(s, at), contact::vector_at(now));
+  if (pairs.touches() && at.lane == 0) add_row(s.w.x_bar, part.row(s, at), diffvbd::vector_at(now));
 }
 
 template <int share, class T>
@@ -126,8 +126,8 @@ __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __g
   const bool there = local < s.scenes;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();
   if (there) {
-    contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kCornerShare), kCornerShare,
-                        now, prev);
+    contact::gather_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kCornerShare), kCornerShare,
+                          now, prev);
   }
   sum_share<kCornerShare, T>(now, prev);
   if (!there || i % kCornerShare != 0) return;
@@ -137,7 +137,7 @@ __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __g
     T* to = collider_bar + 3 * (scene * (in.corners - in.num_vertices) + corner - in.num_vertices);
     to[0] = now.x, to[1] = now.y, to[2] = now.z;
   }
-  contact::add_at(slots.prev + 3 * (scene * in.corners + corner), prev);
+  diffvbd::add_to(slots.prev + 3 * (scene * in.corners + corner), prev);
 }
 
 template <class T>
@@ -146,13 +146,13 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
   const int64_t i = own_item();
   const int64_t local = i / in.corners, corner = i - local * in.corners, scene = s.base + local;
   if (local >= s.scenes) return;
-  const Vec3<T> own = contact::vector_at(prev + 3 * (scene * in.corners + corner));
+  const Vec3<T> own = diffvbd::vector_at(prev + 3 * (scene * in.corners + corner));
   if (corner >= in.num_vertices) {
     T* to = out.collider_prev + 3 * (scene * (in.corners - in.num_vertices) + corner - in.num_vertices);
     to[0] = own.x, to[1] = own.y, to[2] = own.z;
     return;
   }
-  contact::add_at(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
+  diffvbd::add_to(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
 }
 
 constexpr int kSumThreads = 1024;
@@ -278,8 +278,8 @@ __global__ void friction_forward(const __grid_constant__ ContactInputs<T> in, co
   const LagPair<T> at(in, x, pair);
   const int64_t scene = at.record[5];
   const auto state = contact::lag_state(at.record[4], at.corners, at.constants, at.kappa);
-  contact::store_rubbing(state, by.friction_of(scene), by.damping_of(scene), at.kappa, at.constants.dhat,
-                         values + contact::kLagScalars * pair);
+  contact::store_lagged_friction(state, by.friction_of(scene), by.damping_of(scene), at.kappa, at.constants.dhat,
+                                 values + contact::kLagScalars * pair);
   Vec3<T> force[4];
   for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
   store_slots(force, {}, slots + kLagSlots * pair);
@@ -287,12 +287,12 @@ __global__ void friction_forward(const __grid_constant__ ContactInputs<T> in, co
 
 template <class T>
 __global__ void friction_reverse(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
-                                 const contact::RubbingBars<T> given, const T* x, int64_t scenes, int64_t pairs,
+                                 const contact::LaggedFrictionBars<T> given, const T* x, int64_t scenes, int64_t pairs,
                                  T* slots) {
   const int64_t pair = own_item();
   if (pair >= pairs || 4 * pair >= in.listed.ptr[scenes * in.corners]) return;
   const LagPair<T> at(in, x, pair);
-  contact::RubbingAdjoint<T> out;
+  contact::LaggedFrictionAdjoint<T> out;
   given.reverse(by, pair, at.record, at.corners, at.constants, at.kappa, out);
   store_slots(out.pair.x, {out.pair.kappa, out.friction, out.damping}, slots + kLagSlots * pair);
 }
@@ -305,7 +305,7 @@ __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t
   const auto lane = static_cast<int>(i % kSlice);
   Vec3<T> sum = zero3<T>();
   for (int e = in.listed.ptr[row] + lane; e < in.listed.ptr[row + 1]; e += kSlice) {
-    sum += contact::vector_at(slots + int64_t{4} * in.listed.entry[e]);
+    sum += diffvbd::vector_at(slots + int64_t{4} * in.listed.entry[e]);
   }
   sum_share<kSlice, T>(sum);
   if (lane != 0) return;
@@ -340,20 +340,20 @@ cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t 
 }
 template <class T>
 cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool dependent) const {
-  return over(assemble_contact<kShare, T>, begin, end, kShare, dependent, sweep);
+  return over(assemble_contact<kGapFraction, T>, begin, end, kGapFraction, dependent, sweep);
 }
 template <class T>
 cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool dependent) const {
-  return over(limit_contact<kShare, T>, begin, end, kShare, dependent, sweep);
+  return over(limit_contact<kGapFraction, T>, begin, end, kGapFraction, dependent, sweep);
 }
 template <class T>
 cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool dependent) const {
-  return over(prepare_contact<kShare, T>, begin, end, kShare, dependent);
+  return over(prepare_contact<kGapFraction, T>, begin, end, kGapFraction, dependent);
 }
 template <class T>
 cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool dependent) const {
   if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, dependent, kRoles);
-  return over(reverse_contact<kShare, T>, begin, end, kShare, dependent, 1);
+  return over(reverse_contact<kGapFraction, T>, begin, end, kGapFraction, dependent, 1);
 }
 template <class T>
 cudaError_t ContactPasses<T>::collect(const StepAdjoints<T>& out) const {
@@ -401,8 +401,9 @@ cudaError_t lagged_friction(const ContactInputs<T>& in, const contact::LagCoeffi
 
 template <class T>
 cudaError_t lagged_friction_backward(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                                     const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs,
-                                     T* slots, T* points, T* kappa, T* friction, T* damping, cudaStream_t stream) {
+                                     const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes,
+                                     int64_t pairs, T* slots, T* points, T* kappa, T* friction, T* damping,
+                                     cudaStream_t stream) {
   if (auto error = launch_contact(friction_reverse<T>, pairs, stream, in, by, given, x, scenes, pairs, slots)) {
     return error;
   }

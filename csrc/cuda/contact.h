@@ -5,22 +5,18 @@
 
 #include <cstddef>
 
-#include "../contact/above_floor_reverse.h"
+#include "../contact/above_floor.h"
 #include "../contact/advance.h"
-#include "../contact/candidates.h"
-#include "../contact/coast.h"
+#include "../contact/detection.h"
+#include "../contact/friction.h"
 #include "../contact/intersect.h"
 #include "../contact/islands.h"
-#include "../contact/keep.h"
-#include "../contact/lag.h"
-#include "../contact/lowest.h"
-#include "../contact/narrow.h"
-#include "../contact/part.h"
+#include "../contact/motion.h"
+#include "../contact/pair_list.h"
 #include "../contact/passes.h"
-#include "../contact/rooms.h"
-#include "../contact/sweep_rooms.h"
-#include "../contact/translation.h"
-#include "../contact/unsupported.h"
+#include "../contact/residual_acceleration.h"
+#include "../contact/start.h"
+#include "../contact/trust_region.h"
 
 namespace diffvbd::cuda {
 
@@ -45,8 +41,9 @@ cudaError_t lagged_friction(const contact::ContactInputs<T>& in, const contact::
                             int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
 template <class T>
 cudaError_t lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                                     const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs,
-                                     T* slots, T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
+                                     const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes,
+                                     int64_t pairs, T* slots, T* points, T* kappa, T* friction, T* damping,
+                                     cudaStream_t stream);
 
 // Bytes of workspace.
 template <class T>
@@ -84,17 +81,18 @@ cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* sh
 
 // constants [pairs, 8] (contact/narrow.h).
 template <class T>
-cudaError_t refresh_gaps(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
+cudaError_t refresh_gaps(const contact::GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
 
 template <class T>
-int64_t compact_list_bytes(const contact::KeepInputs<T>& in);
+int64_t compact_list_bytes(const contact::CompactInputs<T>& in);
 template <class T>
-cudaError_t compact_list(const contact::KeepInputs<T>& in, const contact::Kept<T>& out, void* workspace,
+cudaError_t compact_list(const contact::CompactInputs<T>& in, const contact::CompactList<T>& out, void* workspace,
                          cudaStream_t stream);
 
 // own, out: [B, bodies, planes]
 template <class T>
-cudaError_t support_vertices(const contact::LowestInputs<T>& in, int32_t* own, int32_t* out, cudaStream_t stream);
+cudaError_t support_vertices(const contact::SupportVertexInputs<T>& in, int32_t* own, int32_t* out,
+                             cudaStream_t stream);
 
 template <class T>
 cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream);
@@ -103,14 +101,14 @@ cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::Mo
                            cudaStream_t stream);
 
 template <class T>
-cudaError_t coast(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
+cudaError_t extrapolate(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
 template <class T>
-cudaError_t reverse_coast(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
-                          cudaStream_t stream);
+cudaError_t reverse_extrapolate(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
+                                cudaStream_t stream);
 
 // islands: memory of islands_workspace_bytes().
 template <class T>
-cudaError_t find_trust_radii(contact::RoomInputs<T> in, const contact::RoomWork<T>& work, void* islands,
+cudaError_t find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work, void* islands,
                              cudaStream_t stream);
 
 // Calls act(body, team) for all bodies of all scenes, a block each.
@@ -132,13 +130,13 @@ cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const 
 
 // radii [B, V]; wishes [B, bodies], most [B]: workspace
 template <class T>
-cudaError_t sweep_radii(const contact::SweepRoomInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream);
+cudaError_t sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream);
 
 // out [B, V, 3]
 template <class T>
-cudaError_t residual_acceleration(const contact::UnsupportedInputs<T>& in, T* out, cudaStream_t stream);
+cudaError_t residual_acceleration(const contact::ResidualInputs<T>& in, T* out, cudaStream_t stream);
 template <class T>
-cudaError_t residual_acceleration_backward(const contact::UnsupportedInputs<T>& in, const T* bar,
-                                           const contact::UnsupportedAdjoints<T>& out, cudaStream_t stream);
+cudaError_t residual_acceleration_backward(const contact::ResidualInputs<T>& in, const T* bar,
+                                           const contact::ResidualAdjoints<T>& out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -153,7 +153,7 @@ __global__ void __launch_bounds__(kOne) fill_kernel(const __grid_constant__ Rigi
 // Whether groups of more than kFew bodies may move.
 template <class T>
 bool has_many(const RigidInputs<T>& in) {
-  return !in.together() && in.room > kFew;
+  return !in.together() && in.capacity > kFew;
 }
 
 constexpr int64_t kRowsOfBlock = 16384;  // rows of a scene up to which its block lists them
@@ -170,7 +170,7 @@ struct SystemWork {
   SystemWork(const RigidInputs<T>& in, const PairCapacity& capacity, void* workspace) {
     Parts<16> take(workspace);
     const int64_t scenes = in.scene.scenes, bodies = scenes * in.bodies(), rows = capacity.rows();
-    take(memory.sides, 2 * rows), take(memory.forces, capacity.listed * kPressDoubles);
+    take(memory.sides, 2 * rows), take(memory.forces, capacity.listed * kForceDoubles);
     take(memory.steps, bodies * kUnknowns), take(memory.found, 2 * rows), take(memory.rows, 2 * rows);
     take(memory.counts, counters(bodies));
     memory.filled = memory.counts + 2 * bodies, memory.begins = memory.filled + 2 * bodies;

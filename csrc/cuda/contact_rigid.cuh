@@ -30,7 +30,7 @@ enum FrictionScalar : int {
 // Memory of a correction. Rows: first the listed pairs, then the lagged ones.
 struct GroupMemory {
   int32_t* sides;          // [rows, 2]: bodies, -1 where nothing moves
-  double *forces, *steps;  // [listed, kPressDoubles], [B, bodies, 6]
+  double *forces, *steps;  // [listed, kForceDoubles], [B, bodies, 6]
   double* friction;        // [kFrictionScalars, lagged]: neighbouring threads read neighbouring pairs
   double* bases;           // like the factors
   // Twice the row of a pair that acts plus the side of the body, for all bodies of a group in a row: first listed

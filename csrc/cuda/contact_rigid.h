@@ -3,8 +3,8 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/rigid_reverse.h"
-#include "../contact/rigid_tries.h"
+#include "../subspace/contact_rigid.h"
+#include "../subspace/contact_rigid_reverse.h"
 
 namespace diffvbd::cuda {
 

@@ -2,7 +2,7 @@
 // small scenes, a cluster each.
 #include <algorithm>
 
-#include "../contact/rigid_reverse.h"
+#include "../subspace/contact_rigid_reverse.h"
 #include "arrays.h"
 #include "cholesky.cuh"
 #include "cluster.cuh"
@@ -88,7 +88,7 @@ __device__ void solve_group(const RigidInputs<T>& in, int64_t scene, int32_t fir
   const auto each = [&](const auto& f) {
     for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) f(i);
   };
-  if (count > in.room) return each([&](int32_t i) { at(i) = 0; });
+  if (count > in.capacity) return each([&](int32_t i) { at(i) = 0; });
   bool any = false;
   each([&](int32_t i) { memory.own[i] = at(i), any = any || memory.own[i] != 0; });
   if (!__syncthreads_or(any)) return;

@@ -1,5 +1,5 @@
 // Rigid correction of small groups of bodies: all of Newton's method in one launch, a block for each group.
-#include "../contact/rigid_slip.h"
+#include "../subspace/contact_rigid.h"
 #include "cholesky.cuh"
 #include "cluster.cuh"
 #include "common.cuh"
@@ -56,7 +56,7 @@ struct System {
   __device__ void add_own(const Forces& forces, int32_t b, int32_t entry, double* out) const {
     const Vector c = center_of(b);
     const int side = entry & 1;
-    const PairPress a = forces(entry >> 1, side);
+    const PairForce a = forces(entry >> 1, side);
     const double share = borne(in, scene, a);
 #pragma unroll
     for (int j = 0; j < kUnknowns; ++j) {
@@ -101,7 +101,7 @@ struct System {
             const int32_t entry = rows.memory.rows[range.x + e];
             if (rows.memory.sides[entry ^ 1] != member(other)) return;
             const int side = entry & 1;
-            const PairPress a = forces(entry >> 1, side);
+            const PairForce a = forces(entry >> 1, side);
 #pragma unroll
             for (int j = 0; j < kUnknowns; ++j) {
               const Vector force = a.stiffness * a.map(1 - side, j, d);
@@ -123,14 +123,14 @@ struct System {
   __device__ void add_vertices(int32_t b, const By& by) const {
     const Body<T> own = body(b);
     const Whole whole = whole_of(own, by);
-    if (by.leads()) rigid::put(center + 3 * own.body, whole.center);
+    if (by.leads()) diffvbd::put(center + 3 * own.body, whole.center);
     const bool free = in.free[own.body] && 0 < whole.mass;
     double total[kOwn + 1];  // and the sum of m r^2
     by.template sum<kOwn + 1>(free ? own.size() : 0, total, [&](int32_t i, double* out) {
       const int32_t v = own.vertex(i);
       Vector g;
       Sym3<double> H;
-      vertex_press(in, own, v, g, H);
+      vertex_force(in, own, v, g, H);
       const Vector arm = own.position(v) - whole.center;
       rigid::add_vertex(arm, g, H, out, out + kUnknowns);
       out[kOwn] += own.mass(v) * dot(arm, arm);
@@ -209,23 +209,23 @@ struct System {
       const int2 range = rows_of(friction, b);
       team.each(range.y, [&](int32_t e) {
         const int32_t entry = rows.memory.rows[range.x + e];
-        const PairPress a = friction(entry >> 1, entry & 1);
+        const PairForce a = friction(entry >> 1, entry & 1);
         if ((entry & 1) == (a.body[0] < 0 ? 1 : 0))
-          f(slip_line(in, (entry >> 1) - friction.listed, a, center, steps));  // once
+          f(friction_line(in, (entry >> 1) - friction.listed, a, center, steps));  // once
       });
       team.each(own.size() * in.planes, [&](int32_t i) {
         const int32_t v = own.vertex(i / in.planes), k = i % in.planes;
         if (!bears(in, own, v, k)) return;
         const Vector arm = own.position(v) - center_of(b);
-        f(slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
+        f(friction_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
       });
     }
   }
   // Number of lines of a thread; the first ones are stored in its slots.
   __device__ int keep_lines(const LaggedForces<T>& friction) const {
     int lines = 0;
-    each_line(friction, [&](const SlipLine& a) {
-      const double values[] = {a.start, a.along, a.way, a.size, a.rate, a.bend};
+    each_line(friction, [&](const FrictionLine& a) {
+      const double values[] = {a.start, a.along, a.step_square, a.size, a.rate, a.bend};
       for (int i = 0; lines < kSlots && i < kLineDoubles; ++i) slots[lines][i][threadIdx.x] = values[i];
       ++lines;
     });
@@ -233,18 +233,18 @@ struct System {
   }
   __device__ double share(const LaggedForces<T>& friction, double fall) const {
     const int lines = keep_lines(friction);
-    return slip_share(fall, [&](double tried) {
+    return friction_fraction(fall, [&](double tried) {
       double total[1] = {0};
       for (int l = 0; l < lines && l < kSlots; ++l) {
         const auto at = [&](int i) { return slots[l][i][threadIdx.x]; };
-        SlipLine line;
-        line.start = at(0), line.along = at(1), line.way = at(2), line.size = at(3), line.rate = at(4),
+        FrictionLine line;
+        line.start = at(0), line.along = at(1), line.step_square = at(2), line.size = at(3), line.rate = at(4),
         line.bend = at(5);
         total[0] += line.excess(tried, in.friction_eps);
       }
       if (lines > kSlots) {
         int seen = 0;
-        each_line(friction, [&](const SlipLine& line) {
+        each_line(friction, [&](const FrictionLine& line) {
           if (seen++ >= kSlots) total[0] += line.excess(tried, in.friction_eps);
         });
       }
@@ -254,9 +254,9 @@ struct System {
   }
 
   __device__ void solve(const LaggedForces<T>& friction) const {
-    Settling state = kOnItsWay;  // the same for all threads
-    const bool has_friction = in.rubs(scene);
-    for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
+    Settling state = kIterating;  // the same for all threads
+    const bool has_friction = in.has_friction_in(scene);
+    for (int iteration = 0; iteration < kFrictionIterations && state != kDone; ++iteration) {
       team.each(size() * size(), [&](int32_t i) { matrix[i] = base[i]; });
       team.each(size(), [&](int32_t i) { step[i] = gradient[i]; });
       team.meet();
@@ -302,7 +302,7 @@ __global__ void __launch_bounds__(kThreads) few_kernel(const __grid_constant__ R
   const auto first = static_cast<int32_t>(blockIdx.x % places);
   const Groups groups = in.groups_of(scene);
   const int32_t count = groups.count(first), size = kUnknowns * count;
-  if (count == 0 || (kFew < count && count <= in.room)) return;
+  if (count == 0 || (kFew < count && count <= in.capacity)) return;
   double* factor = factors + in.matrix_size() * scene + groups.matrix(first);
   const GroupRows<T> rows{in, capacity, memory, scene, groups, first, count};
   const System<T> system{in,
@@ -327,7 +327,7 @@ __global__ void __launch_bounds__(kThreads) few_kernel(const __grid_constant__ R
   if (!in.moves(scene, groups, first)) {
     const auto find_center = [&](int32_t b, const auto& by) {
       const Whole whole = whole_of(system.body(b), by);
-      if (by.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
+      if (by.leads()) diffvbd::put(system.center + 3 * system.member(b), whole.center);
     };
     system.each_body(find_center);
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // solving with it gives NaN

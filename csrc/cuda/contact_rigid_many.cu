@@ -76,7 +76,7 @@ struct GroupSystem {
     each(size(), [&](int32_t i) { unknown(motion, i) = 0; });
     each_body([&](int32_t b) {
       const Whole whole = whole_of(body(b), Warp());
-      if (Warp().leads()) rigid::put(center + 3 * member(b), whole.center);
+      if (Warp().leads()) diffvbd::put(center + 3 * member(b), whole.center);
     });
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // solving with it gives NaN
   }
@@ -94,7 +94,7 @@ struct GroupSystem {
     const Body<T> own = body(b);
     const Warp warp;
     const Whole whole = whole_of(own, warp);
-    if (warp.leads()) rigid::put(center + 3 * own.body, whole.center);
+    if (warp.leads()) diffvbd::put(center + 3 * own.body, whole.center);
     warp.meet();
     const bool free = in.free[own.body] && 0 < whole.mass;
     double total[32] = {};  // and the sum of m r^2
@@ -103,7 +103,7 @@ struct GroupSystem {
       const Vector arm = own.position(v) - whole.center;
       Vector g{};
       Sym3<double> H{};
-      vertex_press(in, own, v, g, H);
+      vertex_force(in, own, v, g, H);
       total[kOwn] += own.mass(v) * dot(arm, arm);
       rigid::add_vertex(arm, g, H, total, total + kUnknowns);
     }
@@ -135,7 +135,7 @@ struct GroupSystem {
       const Vector arm = own.position(v) - c;
       Vector g{};
       Sym3<double> H{};
-      add_floor_slip(in, own, v, place % in.planes, moved_by(motion + kUnknowns * own.body, arm), g, H);
+      add_plane_friction(in, own, v, place % in.planes, moved_by(motion + kUnknowns * own.body, arm), g, H);
       rigid::add_vertex(arm, g, H, out, out + kUnknowns);
     }
   }
@@ -149,7 +149,7 @@ struct GroupSystem {
     double own[32] = {};
     if constexpr (lagged_rows) add_floors(b, own);
     for (int32_t e = from + lane; e < to; e += 32) {
-      const PairPress a = force_of<lagged_rows>(rows[e] >> 1);
+      const PairForce a = force_of<lagged_rows>(rows[e] >> 1);
       const int side = rows[e] & 1;
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
@@ -167,7 +167,7 @@ struct GroupSystem {
       for (int32_t e = from + lane; e < to; e += 32) {
         const int32_t entry = rows[e];
         if (sides[entry ^ 1] != number) continue;
-        const PairPress a = force_of<lagged_rows>(entry >> 1);
+        const PairForce a = force_of<lagged_rows>(entry >> 1);
         const int side = entry & 1;
 #pragma unroll
         for (int j = 0; j < kUnknowns; ++j) {
@@ -189,9 +189,9 @@ struct GroupSystem {
     }
   }
   template <bool lagged_rows>
-  __device__ PairPress force_of(int64_t row) const {
-    if constexpr (!lagged_rows) return load_press(forces + kPressDoubles * row, sides + 2 * row);
-    PairPress a = friction_sides(row);
+  __device__ PairForce force_of(int64_t row) const {
+    if constexpr (!lagged_rows) return load_force(forces + kForceDoubles * row, sides + 2 * row);
+    PairForce a = friction_sides(row);
     a.force = friction_vector(kForce, row);
     const auto s = [&](int k) { return friction(kStiffness + k, row); };
     a.stiffness = {s(0), s(1), s(2), s(3), s(4), s(5)};
@@ -208,8 +208,8 @@ struct GroupSystem {
     friction(k, row) = a.x, friction(k + 1, row) = a.y, friction(k + 2, row) = a.z;
   }
   // Sides of a lagged pair.
-  __device__ PairPress friction_sides(int64_t row) const {
-    PairPress a;
+  __device__ PairForce friction_sides(int64_t row) const {
+    PairForce a;
     for (int side = 0; side < 2; ++side) {
       a.body[side] = sides[2 * row + side];
       a.weight[side] = friction(kWeight + side, row), a.at[side] = friction_vector(kAt + 3 * side, row);
@@ -239,8 +239,8 @@ struct GroupSystem {
     each_body([&](int32_t b) { add_pairs<false>(b, base, gradient); });
     if (in.lag) {
       each_row([&](int64_t row) {
-        PairPress a;
-        Rubbing load;
+        PairForce a;
+        LaggedFriction load;
         lagged_sides(in, row - capacity.listed, CornerPoints<T>{in, false}, -1, a,
                      load);  // rows exist only for pairs that act
         put_friction(kNormal, row, load.n), put_friction(kTangentialBefore, row, load.u);
@@ -258,11 +258,11 @@ struct GroupSystem {
   __device__ void add_friction() const {
     if (in.lag)
       each_row([&](int64_t row) {
-        PairPress a = friction_sides(row);
-        const Rubbing own = {friction_vector(kNormal, row), friction_vector(kTangentialBefore, row),
-                             friction(kLoad, row), friction(kDamping, row), friction(kApproach, row)};
-        contact::rub(own, way_of(a, {center, motion}), in.friction_eps, a);
-        put_friction(kForce, row, a.force), put_friction(kTangential, row, a.slip);
+        PairForce a = friction_sides(row);
+        const LaggedFriction own = {friction_vector(kNormal, row), friction_vector(kTangentialBefore, row),
+                                    friction(kLoad, row), friction(kDamping, row), friction(kApproach, row)};
+        contact::lagged_friction_force(own, displacement_of(a, {center, motion}), in.friction_eps, a);
+        put_friction(kForce, row, a.force), put_friction(kTangential, row, a.tangential);
         const Sym3<double>& s = a.stiffness;
         const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz};
         for (int k = 0; k < 6; ++k) friction(kStiffness + k, row) = entries[k];
@@ -321,8 +321,9 @@ struct GroupSystem {
   __device__ void each_line(const F& f) const {
     if (in.lag) {
       each_row([&](int64_t row) {
-        const Vector n = friction_vector(kNormal, row), way = way_of(friction_sides(row), {center, steps});
-        f(SlipLine(friction_vector(kTangential, row), way - dot(n, way) * n, friction(kLoad, row), in.friction_eps));
+        const Vector n = friction_vector(kNormal, row), way = displacement_of(friction_sides(row), {center, steps});
+        f(FrictionLine(friction_vector(kTangential, row), way - dot(n, way) * n, friction(kLoad, row),
+                       in.friction_eps));
       });
     }
     if (in.planes == 0) return;
@@ -332,23 +333,23 @@ struct GroupSystem {
         const int32_t place = floors_of(own)[i], v = own.vertex(place / in.planes);
         const Vector arm = own.position(v) - center_of(b);
         const int64_t at = int64_t{kUnknowns} * own.body;
-        f(slip_line(in, own, v, place % in.planes, arm, motion + at, steps + at));
+        f(friction_line(in, own, v, place % in.planes, arm, motion + at, steps + at));
       }
     });
   }
   __device__ double share(double fall) const {
-    SlipLine kept[kLines];
+    FrictionLine kept[kLines];
     int lines = 0;
-    each_line([&](const SlipLine& a) {
+    each_line([&](const FrictionLine& a) {
       if (lines < kLines) kept[lines] = a;
       ++lines;
     });
-    return slip_share(fall, [&](double tried) {
+    return friction_fraction(fall, [&](double tried) {
       double total[1] = {0};
       for (int l = 0; l < lines && l < kLines; ++l) total[0] += kept[l].excess(tried, in.friction_eps);
       if (lines > kLines) {
         int seen = 0;
-        each_line([&](const SlipLine& line) {
+        each_line([&](const FrictionLine& line) {
           if (seen++ >= kLines) total[0] += line.excess(tried, in.friction_eps);
         });
       }
@@ -358,9 +359,9 @@ struct GroupSystem {
   }
 
   __device__ void solve(Pivots& pivots) const {
-    Settling state = kOnItsWay;  // the same for all threads
-    const bool has_friction = in.rubs(scene);
-    for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
+    Settling state = kIterating;  // the same for all threads
+    const bool has_friction = in.has_friction_in(scene);
+    for (int iteration = 0; iteration < kFrictionIterations && state != kDone; ++iteration) {
       each_body([&](int32_t b) { copy_column(b); });
       each(size(), [&](int32_t i) { step[i] = gradient[i]; });
       __syncthreads();
@@ -464,7 +465,7 @@ __global__ void __launch_bounds__(kTeam) groups_kernel(const __grid_constant__ R
   const auto first = static_cast<int32_t>(blockIdx.x % n);
   const Groups groups = in.groups_of(scene);
   const int32_t count = groups.count(first), size = kUnknowns * count;
-  if (count <= kFew || count > in.room) return;
+  if (count <= kFew || count > in.capacity) return;
   const int64_t at = in.matrix_size() * scene + groups.matrix(first);
   const GroupRows<T> rows{in, capacity, memory, scene, groups, first, count};
   // in shared memory for lack of registers

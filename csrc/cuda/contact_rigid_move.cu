@@ -2,7 +2,7 @@
 // scenes of any size, or in one launch for small ones.
 #include <algorithm>
 
-#include "../contact/rigid_tries.h"
+#include "../subspace/contact_rigid.h"
 #include "atomics.cuh"
 #include "cluster.cuh"
 #include "common.cuh"
@@ -41,7 +41,7 @@ __device__ void begin_body(const RigidInputs<T>& in, const Trial<T>& t, int64_t 
   t.displacement[unit] = t.size[unit] = 0;
   t.lead[unit] = static_cast<int32_t>(unit % in.bodies());
   t.decided[unit] = 0;
-  t.state.share[unit] = T(0), t.state.now[unit] = T(1);
+  t.state.fraction[unit] = T(0), t.state.now[unit] = T(1);
   t.state.blocked[unit] = t.state.stamp[unit] = 0;
 }
 
@@ -68,7 +68,7 @@ __device__ void find_displacement(const RigidInputs<T>& in, const Trial<T>& t, i
   const Vertex<T> at(in, row);
   const Body<T> body{in.scene, at.scene, at.body};
   const Farthest own = farthest_of(in, body, at.v, t.center + 3 * at.unit, t.motion + kUnknowns * at.unit);
-  raise_to(t.displacement + at.unit, own.way), raise_to(t.size + at.unit, own.size);
+  raise_to(t.displacement + at.unit, own.displacement), raise_to(t.size + at.unit, own.size);
 }
 
 // Lists the pairs that may act, and unites bodies that decide jointly, in any order.
@@ -78,7 +78,7 @@ __device__ void join_pair(const RigidInputs<T>& in, const Trial<T>& t, int64_t p
   const int64_t scene = record[5], first = scene * in.bodies();
   if (repels) {
     t.pair_energy[pair] = 0;
-    if (!may_press(in, pair, t.displacement + first, t.size + first)) return;
+    if (!may_touch(in, pair, t.displacement + first, t.size + first)) return;
     if (owner_of(in, record) >= 0)
       t.near[in.first_listed(scene) + atomicAdd(t.near_count + scene, 1)] = static_cast<int32_t>(pair);
   } else if (!Lag<T>(in.lag + kLagScalars * pair).active()) {
@@ -92,8 +92,8 @@ template <class T>
 __device__ void displace(const RigidInputs<T>& in, const Trial<T>& t, int64_t row, T* x) {
   const Vertex<T> at(in, row);
   if (!x && t.decided[at.unit]) return;
-  const Vector r = Body<T>::at(in.scene.x + 3 * row) - vector_of(t.center + 3 * at.unit);
-  rigid::put(t.move + 3 * row, displaced(t.motion + kUnknowns * at.unit, t.share[at.unit], r));
+  const Vector r = diffvbd::wide_at(in.scene.x + 3 * row) - vector_of(t.center + 3 * at.unit);
+  diffvbd::put(t.move + 3 * row, displaced(t.motion + kUnknowns * at.unit, t.share[at.unit], r));
   if (!x) {
     t.motions[row] = motion_of(in.gate, t.state, at.scene, at.v);
     return;
@@ -122,10 +122,10 @@ __device__ void test_pair_of(const RigidInputs<T>& in, const Trial<T>& t, int64_
   const int32_t owner = owner_of(in, record);
   if (owner < 0 || t.decided[record[5] * int64_t{in.bodies()} + owner]) return;
   const CornerPoints<T> at{in, moved};
-  PairPress a;
-  const bool acts = repels ? barrier_press(in, pair, at, a) : lagged_press(in, pair, at, Slid{}, a, -1);
+  PairForce a;
+  const bool acts = repels ? barrier_force(in, pair, at, a) : lagged_force(in, pair, at, BodyMotions{}, a, -1);
   value = acts ? a.value : 0;
-  if (moved && repels) try_pair(in.gate, t.state, pair, 0);
+  if (moved && repels) test_pair(in.gate, t.state, pair, 0);
   if (moved || !repels || !acts || a.body[0] < 0 || a.body[1] < 0) return;
   const int64_t scene = record[5];
   int32_t* to = t.contacts + 2 * (in.first_listed(scene) + atomicAdd(t.contact_count + scene, 1));
@@ -246,7 +246,7 @@ __device__ bool decide(const RigidInputs<T>& in, const Trial<T>& t, int64_t scen
   });
   __syncthreads();
   bool open = false;
-  const bool last = attempt + 1 == kTries;
+  const bool last = attempt + 1 == kTrials;
   each_pending([&](int64_t k, int64_t of) {
     const bool fits = !own.stopped[of], finite = own.largest[of] < bits_of(CUDART_INF);
     const auto before = static_cast<long long>(own.total[of]), rise = static_cast<long long>(own.increase[of]);
@@ -285,10 +285,10 @@ __device__ void end_scene(const RigidInputs<T>& in, const double* motion, const 
   const int64_t first = in.bodies() * scene, last = first + in.bodies();
   bool some = false;
   for (int64_t unit = first + threadIdx.x; unit < last; unit += blockDim.x) {
-    some = end_tries(in, motion, unit, out) || some;
+    some = finish_trials(in, motion, unit, out) || some;
   }
   if (__syncthreads_or(some)) return;
-  for (int64_t unit = first + threadIdx.x; unit < last; unit += blockDim.x) out.held[unit] = false;
+  for (int64_t unit = first + threadIdx.x; unit < last; unit += blockDim.x) out.blocked[unit] = false;
 }
 
 constexpr int64_t kLargeBody = 32;  // vertices from which a block sums a body rather than a warp
@@ -430,7 +430,7 @@ __global__ void __launch_bounds__(kThreads)
   });
   cluster.meet();
   const int32_t near = t.near_count[scene];
-  for (int attempt = -1; attempt < kTries; ++attempt) {  // -1: before any motion
+  for (int attempt = -1; attempt < kTrials; ++attempt) {  // -1: before any motion
     const bool moved = 0 <= attempt;
     double* const to = (moved ? t.after : t.before) + unit;
     if (moved) {
@@ -482,7 +482,7 @@ Trial<T> lay_out(const RigidInputs<T>& in, const PairCapacity& capacity, Parts<1
   take(t.before, units), take(t.after, units), take(t.largest, units), take(t.increase, units), take(t.total, units);
   take(t.vertex_energy, rows), take(t.pair_energy, capacity.rows());
   take(t.lead, units), take(t.together, units), take(t.contacts, 2 * capacity.listed), take(t.contact_count, scenes);
-  take(t.near, capacity.listed), take(t.near_count, scenes), take(t.state.share, units), take(t.state.now, units);
+  take(t.near, capacity.listed), take(t.near_count, scenes), take(t.state.fraction, units), take(t.state.now, units);
   take(t.state.blocked, units), take(t.state.stamp, units), take(t.decided, units), take(t.stopped, units);
   take(t.done, scenes), take(t.motions, rows);
   t.state.motion = t.motions;
@@ -506,7 +506,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairCapacity& capacity, c
   if (rows == 0 || units == 0) return cudaSuccess;
   Parts<16> take(workspace);
   Trial<T> t = lay_out(in, capacity, take);
-  t.center = center, t.motion = motion, t.share = out.share, t.move = move;
+  t.center = center, t.motion = motion, t.share = out.fraction, t.move = move;
   if (has_block_each(in.scene.vertices, scenes, capacity.rows())) {
     return launch_clusters(scene_kernel<T>, scenes, capacity.rows(), kThreads, stream, in, t, capacity.listed, out, x);
   }
@@ -525,7 +525,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairCapacity& capacity, c
     }
   };
   look(false, t.before);
-  for (int attempt = 0; attempt < kTries; ++attempt) {
+  for (int attempt = 0; attempt < kTrials; ++attempt) {
     displace_kernel<T><<<blocks_for(rows, kOne), kOne, 0, stream>>>(in, t, nullptr);
     look(true, t.after);
     decide_kernel<T><<<static_cast<unsigned>(scenes), kOne, 0, stream>>>(in, t, attempt);

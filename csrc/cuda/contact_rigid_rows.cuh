@@ -1,8 +1,7 @@
 // Rows of pairs of the groups of a rigid correction: sides, forces and the lists of each body.
 #pragma once
 
-#include "../contact/rigid_rub.h"
-#include "../contact/rigid_slip.h"
+#include "../subspace/contact_rigid.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -34,16 +33,16 @@ template <class T>
 __device__ void force_row(const RigidInputs<T>& in, const PairCapacity& capacity, const GroupMemory& memory,
                           int64_t row) {
   const CornerPoints<T> at{in, false};
-  PairPress a;
+  PairForce a;
   const int64_t scene = scene_of_row(in, capacity, row);
   bool acts = false;
   if (in.together() && !in.moves(scene, in.groups_of(scene), 0)) {
     // nothing moves: a captured step launches all corrections, and most move nothing
   } else if (row < capacity.listed) {
-    acts = barrier_press(in, row, at, a);
-    if (acts) store_press(a, memory.forces + kPressDoubles * row);
+    acts = barrier_force(in, row, at, a);
+    if (acts) store_force(a, memory.forces + kForceDoubles * row);
   } else {
-    acts = lagged_press(in, row - capacity.listed, at, Slid{}, a, -1);
+    acts = lagged_force(in, row - capacity.listed, at, BodyMotions{}, a, -1);
   }
   for (int side = 0; side < 2; ++side) memory.sides[2 * row + side] = acts ? a.body[side] : -1;
 }
@@ -162,8 +161,8 @@ struct BarrierForces {
   const int32_t* sides;
   const double* forces;
   static constexpr bool lagged = false;
-  __device__ PairPress operator()(int64_t row, int) const {
-    return load_press(forces + kPressDoubles * row, sides + 2 * row);
+  __device__ PairForce operator()(int64_t row, int) const {
+    return load_force(forces + kForceDoubles * row, sides + 2 * row);
   }
 };
 // Friction and damping of lagged pairs, for one side.
@@ -171,11 +170,11 @@ template <class T>
 struct LaggedForces {
   const RigidInputs<T>& in;
   int64_t listed;
-  Slid slid;
+  BodyMotions slid;
   static constexpr bool lagged = true;
-  __device__ PairPress operator()(int64_t row, int side) const {
-    PairPress a;
-    lagged_press(in, row - listed, CornerPoints<T>{in, false}, slid, a, side);
+  __device__ PairForce operator()(int64_t row, int side) const {
+    PairForce a;
+    lagged_force(in, row - listed, CornerPoints<T>{in, false}, slid, a, side);
     return a;
   }
 };

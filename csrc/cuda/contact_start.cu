@@ -7,8 +7,8 @@
 namespace diffvbd::cuda {
 namespace {
 
-using contact::LowestInputs, contact::SweepRoomInputs, contact::TranslationInputs;
-using contact::UnsupportedAdjoints, contact::UnsupportedInputs;
+using contact::ResidualAdjoints, contact::ResidualInputs;
+using contact::SupportVertexInputs, contact::SweepRadiusInputs, contact::TranslationInputs;
 
 constexpr int kHalfBlock = 128;  // threads of the kernels with a short reduction
 
@@ -16,22 +16,23 @@ constexpr int kHalfBlock = 128;  // threads of the kernels with a short reductio
 
 // A block for each scene, body and plane.
 template <class T>
-__global__ void support_of_bodies(const __grid_constant__ LowestInputs<T> in, int32_t* own) {
-  __shared__ contact::Lowest<T> part[kHalfBlock];
+__global__ void support_of_bodies(const __grid_constant__ SupportVertexInputs<T> in, int32_t* own) {
+  __shared__ contact::SupportVertex<T> part[kHalfBlock];
   const int32_t plane = static_cast<int32_t>(blockIdx.x % in.num_planes), thread = static_cast<int32_t>(threadIdx.x);
   const int64_t row = blockIdx.x / in.num_planes;
-  part[threadIdx.x] =
-      contact::lowest_of_body(in, row / in.bodies, static_cast<int32_t>(row % in.bodies), plane, thread, kHalfBlock);
+  part[threadIdx.x] = contact::support_vertex_of_body(in, row / in.bodies, static_cast<int32_t>(row % in.bodies), plane,
+                                                      thread, kHalfBlock);
   reduce_block<kHalfBlock>(part, [](auto& own, const auto& other) { own.keep(other); });
   if (threadIdx.x == 0) own[blockIdx.x] = part[0].vertex;
 }
 
 template <class T>
-__global__ void support_of_islands(const __grid_constant__ LowestInputs<T> in, const int32_t* own, int32_t* out) {
+__global__ void support_of_islands(const __grid_constant__ SupportVertexInputs<T> in, const int32_t* own,
+                                   int32_t* out) {
   const int64_t i = own_item(kHalfBlock), row = i / in.num_planes;
   if (row >= in.scenes * in.bodies) return;
-  out[i] = contact::lowest_of_island(in, own, row / in.bodies, static_cast<int32_t>(row % in.bodies),
-                                     static_cast<int32_t>(i % in.num_planes));
+  out[i] = contact::support_vertex_of_island(in, own, row / in.bodies, static_cast<int32_t>(row % in.bodies),
+                                             static_cast<int32_t>(i % in.num_planes));
 }
 
 // --- translations of islands (contact/translation.h) ---
@@ -70,8 +71,8 @@ __global__ void reverse_vertices(const __grid_constant__ TranslationInputs<T> in
                                  T* move_bar, T* mass_bar) {
   const int64_t row = own_item(kHalfBlock);
   if (row >= in.scenes * in.vertices) return;
-  contact::reverse_vertex_share(in, rate, mean, row / in.vertices, static_cast<int32_t>(row % in.vertices), move_bar,
-                                mass_bar);
+  contact::reverse_vertex_mean(in, rate, mean, row / in.vertices, static_cast<int32_t>(row % in.vertices), move_bar,
+                               mass_bar);
 }
 
 template <class T>
@@ -87,11 +88,11 @@ __global__ void sum_planes(const T* slots, int64_t scenes, int32_t bodies, int32
 
 // A block for each body of each scene.
 template <class T>
-__global__ void __launch_bounds__(kHalfBlock) wish_kernel(const __grid_constant__ SweepRoomInputs<T> in, T* wishes) {
-  __shared__ contact::SweepWays<T> part[kHalfBlock];
+__global__ void __launch_bounds__(kHalfBlock) wish_kernel(const __grid_constant__ SweepRadiusInputs<T> in, T* wishes) {
+  __shared__ contact::SweepDisplacements<T> part[kHalfBlock];
   const int64_t row = blockIdx.x;
-  part[threadIdx.x] =
-      contact::ways_of_body(in, row / in.bodies, row % in.bodies, static_cast<int32_t>(threadIdx.x), kHalfBlock);
+  part[threadIdx.x] = contact::displacements_of_body(in, row / in.bodies, row % in.bodies,
+                                                     static_cast<int32_t>(threadIdx.x), kHalfBlock);
   reduce_block<kHalfBlock>(part, [](auto& own, const auto& other) { own.keep(other); });
   if (threadIdx.x == 0) wishes[row] = contact::wish_of_body(in, part[0], row);
 }
@@ -99,7 +100,7 @@ __global__ void __launch_bounds__(kHalfBlock) wish_kernel(const __grid_constant_
 // A block for each scene.
 template <class T>
 __global__ void __launch_bounds__(kHalfBlock)
-    most_kernel(const __grid_constant__ SweepRoomInputs<T> in, const T* wishes, T* most) {
+    most_kernel(const __grid_constant__ SweepRadiusInputs<T> in, const T* wishes, T* most) {
   __shared__ T part[kHalfBlock];
   part[threadIdx.x] =
       contact::most_of_scene(in, wishes, int64_t{blockIdx.x}, static_cast<int32_t>(threadIdx.x), kHalfBlock);
@@ -109,44 +110,44 @@ __global__ void __launch_bounds__(kHalfBlock)
 
 template <class T>
 __global__ void __launch_bounds__(kHalfBlock)
-    radius_kernel(const __grid_constant__ SweepRoomInputs<T> in, const T* most, T* radii) {
+    radius_kernel(const __grid_constant__ SweepRadiusInputs<T> in, const T* most, T* radii) {
   const int64_t row = own_item(kHalfBlock);
   if (row >= in.scenes * in.vertices) return;
   const int64_t scene = row / in.vertices;
-  radii[row] = contact::sweep_room(in, most[scene], scene, row % in.vertices);
+  radii[row] = contact::sweep_radius(in, most[scene], scene, row % in.vertices);
 }
 
 // --- residual acceleration (contact/unsupported.h) ---
 
 template <class T>
-unsigned blocks_of_bodies(const UnsupportedInputs<T>& in) {
+unsigned blocks_of_bodies(const ResidualInputs<T>& in) {
   return static_cast<unsigned>(in.scene.scenes * in.scene.bodies);
 }
 // The body of a block.
 template <class T>
-__device__ rigid::Body<T> own_body(const UnsupportedInputs<T>& in) {
+__device__ rigid::Body<T> own_body(const ResidualInputs<T>& in) {
   const int64_t item = blockIdx.x;
   return {in.scene, item / in.scene.bodies, static_cast<int32_t>(item % in.scene.bodies)};
 }
 
 template <class T>
-__global__ void __launch_bounds__(kThreads) residual_kernel(const __grid_constant__ UnsupportedInputs<T> in, T* out) {
+__global__ void __launch_bounds__(kThreads) residual_kernel(const __grid_constant__ ResidualInputs<T> in, T* out) {
   __shared__ double part[kWarps][kMostSums];
-  contact::leave_unsupported(in, own_body(in), BlockTeam{part}, out);
+  contact::residual_acceleration(in, own_body(in), BlockTeam{part}, out);
 }
 
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    residual_vjp_kernel(const __grid_constant__ UnsupportedInputs<T> in, const T* bar,
-                        const __grid_constant__ UnsupportedAdjoints<T> out) {
+    residual_vjp_kernel(const __grid_constant__ ResidualInputs<T> in, const T* bar,
+                        const __grid_constant__ ResidualAdjoints<T> out) {
   __shared__ double part[kWarps][kMostSums];
-  contact::reverse_unsupported(in, own_body(in), BlockTeam{part}, bar, out);
+  contact::reverse_residual_acceleration(in, own_body(in), BlockTeam{part}, bar, out);
 }
 
 }  // namespace
 
 template <class T>
-cudaError_t support_vertices(const LowestInputs<T>& in, int32_t* own, int32_t* out, cudaStream_t stream) {
+cudaError_t support_vertices(const SupportVertexInputs<T>& in, int32_t* own, int32_t* out, cudaStream_t stream) {
   const int64_t items = in.scenes * in.bodies * in.num_planes;
   if (items == 0) return cudaSuccess;
   support_of_bodies<<<static_cast<unsigned>(items), kHalfBlock, 0, stream>>>(in, own);
@@ -180,7 +181,7 @@ cudaError_t translation_backward(const TranslationInputs<T>& in, const T* u_bar,
 }
 
 template <class T>
-cudaError_t sweep_radii(const SweepRoomInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream) {
+cudaError_t sweep_radii(const SweepRadiusInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream) {
   const int64_t vertices = in.scenes * in.vertices;
   if (vertices == 0) return cudaSuccess;
   wish_kernel<T><<<static_cast<unsigned>(in.scenes * in.bodies), kHalfBlock, 0, stream>>>(in, wishes);
@@ -190,15 +191,15 @@ cudaError_t sweep_radii(const SweepRoomInputs<T>& in, T* wishes, T* most, T* rad
 }
 
 template <class T>
-cudaError_t residual_acceleration(const UnsupportedInputs<T>& in, T* out, cudaStream_t stream) {
+cudaError_t residual_acceleration(const ResidualInputs<T>& in, T* out, cudaStream_t stream) {
   if (blocks_of_bodies(in) == 0) return cudaSuccess;
   residual_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, out);
   return cudaGetLastError();
 }
 
 template <class T>
-cudaError_t residual_acceleration_backward(const UnsupportedInputs<T>& in, const T* bar,
-                                           const UnsupportedAdjoints<T>& out, cudaStream_t stream) {
+cudaError_t residual_acceleration_backward(const ResidualInputs<T>& in, const T* bar, const ResidualAdjoints<T>& out,
+                                           cudaStream_t stream) {
   if (blocks_of_bodies(in) == 0) return cudaSuccess;
   residual_vjp_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, bar, out);
   return cudaGetLastError();

@@ -3,7 +3,6 @@
 #pragma once
 
 #include "../contact/passes.h"
-#include "../contact/sent.h"
 #include "group.cuh"
 
 namespace diffvbd::cuda {
@@ -152,7 +151,7 @@ struct TapeRows {
 template <class T>
 struct UserRows {
   const T* x;
-  __device__ __forceinline__ Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+  __device__ __forceinline__ Vec3<T> operator()(int v) const { return diffvbd::vector_at(x + int64_t{3} * v); }
 };
 
 using contact::ContactAdjoints;
@@ -253,11 +252,11 @@ struct PairsOf {
     sums.store(to);
   }
 
-  __device__ __forceinline__ contact::OwnRoom<T> trust_region() const {
-    return vertex < 0 ? contact::OwnRoom<T>{} : contact::OwnRoom<T>(source, vertex);
+  __device__ __forceinline__ contact::TrustRegion<T> trust_region() const {
+    return vertex < 0 ? contact::TrustRegion<T>{} : contact::TrustRegion<T>(source, vertex);
   }
   // Exponent of the limit of an update by d from the position `from`.
-  __device__ __forceinline__ int limit(const contact::OwnRoom<T>& own, const Vec3<T>& from, const Vec3<T>& d) {
+  __device__ __forceinline__ int limit(const contact::TrustRegion<T>& own, const Vec3<T>& from, const Vec3<T>& d) {
     int exponent = 0;
     T length = T(0), guard = T(0);
     if (vertex >= 0) exponent = own.limit(from, d), length = contact::length_of(d), guard = own.guard(from);
@@ -276,7 +275,7 @@ struct PairsOf {
       __syncwarp();
       exponent = memory.exponents[at.group];
     };
-    const T reach = contact::limit_of<T>(least) * length / T(contact::kBothShare) + guard;
+    const T reach = contact::limit_of<T>(least) * length / T(contact::kBothGapFraction) + guard;
     if (remembers && __all_sync(kWholeWarp, kept <= kKept && reach < clear)) {
       const auto thread = static_cast<int>(threadIdx.x % kSlice);
       for (int first = 0; first < kept; first += kSlice) {
@@ -348,13 +347,13 @@ __device__ __forceinline__ void take_scattered(const ContactView<T>& c, const Pa
   const int64_t scene = pairs.source.scene;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();
   if (pairs.touches()) {
-    contact::take_pairs(c.in, c.slots, scene, pairs.vertex, pairs.at.lane, pairs.share, now, prev);
+    contact::gather_pairs(c.in, c.slots, scene, pairs.vertex, pairs.at.lane, pairs.share, now, prev);
   }
   __syncwarp();
   pairs.at.template sum<T>(now, prev);
   if (pairs.vertex < 0 || pairs.at.lane != 0) return;
   bar[0] = now.x, bar[1] = now.y, bar[2] = now.z;
-  if (pairs.touches()) contact::add_at(c.slots.prev + 3 * (scene * c.in.corners + pairs.vertex), prev);
+  if (pairs.touches()) diffvbd::add_to(c.slots.prev + 3 * (scene * c.in.corners + pairs.vertex), prev);
 }
 
 // Scatters the adjoints of the pair terms of a warp's vertices into the slots of the pairs.
@@ -372,7 +371,7 @@ __device__ __forceinline__ void scatter_pairs(const StepView<T>& s, const Contac
   Vec3<T> p = zero3<T>(), d_raw = zero3<T>();
   if (touches) {
     const T* turn = s.w.reversed + 6 * row;
-    p = contact::vector_at(turn), d_raw = contact::vector_at(turn + 3);
+    p = diffvbd::vector_at(turn), d_raw = diffvbd::vector_at(turn + 3);
   }
   // f(vertex, p, d_raw), of the thread that found the entry
   const auto reverse = [&](const Found& found, const auto& f) {
@@ -406,8 +405,8 @@ __device__ __forceinline__ void scatter_pairs(const StepView<T>& s, const Contac
   __syncwarp();
   at.template sum<T>(own);
   if (!touches || at.lane != 0) return;
-  contact::add_at(s.w.x_bar + kRow * row, own);
-  contact::add_at(c.slots.prev + 3 * (pairs.source.scene * in.corners + pairs.vertex), -own);
+  diffvbd::add_to(s.w.x_bar + kRow * row, own);
+  diffvbd::add_to(c.slots.prev + 3 * (pairs.source.scene * in.corners + pairs.vertex), -own);
 }
 
 template <class T>

@@ -43,13 +43,13 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   const MovingRows<T> rows = Set::contact ? turn.rows(s) : MovingRows<T>{s.w.x, s.w.x};
   const Block<T> b = load_block<Set>(s, at, s.own, rows.x);
   if (s.has_tets) star.template fetch_neighbours<Set::contact>(s.own, rows, turn.first());
-  if constexpr (Set::usual && Set::filters) {
+  if constexpr (Set::well_conditioned && Set::filters) {
     if (star.any(is_oblique<Set>(b, b.state.x))) return false;
   }
   const StepParameters<T> q = of_sweep(s.parameters, turn.sweep + 1 == s.sweeps);
   const NewtonStep<T> newton = newton_step<Set>(b, star, q);
-  if constexpr (Set::usual) {
-    if (is_rare<Set>(b, star, newton.H)) return false;
+  if constexpr (Set::well_conditioned) {
+    if (needs_refinement<Set>(b, star, newton.H)) return false;
   }
   const Update<T> u = update_of<Set>(b, newton, q);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
@@ -77,7 +77,7 @@ __device__ __noinline__ Path<T> ill_conditioned_update(const StepView<T>& s, T* 
 template <class Set, class T, int lanes>
 __device__ __forceinline__ Path<T> update_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
   Path<T> path{};
-  if (!update<Usual<Set>, T, lanes>(s, shared, turn, pairs, path)) {
+  if (!update<WellConditioned<Set>, T, lanes>(s, shared, turn, pairs, path)) {
     path = ill_conditioned_update<Set, T, lanes>(s, shared, turn, pairs);
   }
   return path;
@@ -95,13 +95,13 @@ __device__ __forceinline__ void update_cooperative(const StepView<T>& s, const C
   if (role >= 0) {
     const SweepRows<T> rows = sweep_rows(s, at.scene, turn.begin, turn.end, turn.rows(s));
     PairsOf<T, kManyLanes, SweepRows<T>> pairs(s, c.in, at, rows, role);
-    const contact::OwnRoom<T> region = pairs.trust_region();  // loaded long before it is needed
+    const contact::TrustRegion<T> region = pairs.trust_region();  // loaded long before it is needed
     pairs.gather(message.term[role]);
     sync_cooperative();  // pair terms are ready
     sync_cooperative();  // the end of the update is ready
     if (role != kLagged) {
-      const Vec3<T> from = contact::vector_at(message.from);
-      const int exponent = pairs.limit(region, from, contact::vector_at(message.to) - from);
+      const Vec3<T> from = diffvbd::vector_at(message.from);
+      const int exponent = pairs.limit(region, from, diffvbd::vector_at(message.to) - from);
       if (at.lane == 0) message.exponents[role] = exponent;
     }
     sync_cooperative();  // the exponents are ready

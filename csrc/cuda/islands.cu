@@ -54,7 +54,7 @@ __global__ void bodies_sync_kernel(const IslandInputs<T> in, IslandWork<T> work)
   BodySum<T> own = nothing<T>();
   for (int32_t k = in.body_ptr[body] + static_cast<int32_t>(threadIdx.x); k < in.body_ptr[body + 1];
        k += static_cast<int32_t>(blockDim.x)) {
-    own.add(vertex_share(in, scene, in.body_order[k]));
+    own.add(vertex_sum(in, scene, in.body_order[k]));
   }
   const BodySum<T> sum = block_sum(own, part, [](BodySum<T>& a, const BodySum<T>& b) { a.add(b); });
   if (threadIdx.x == 0) work.bodies[blockIdx.x] = sum;

@@ -131,7 +131,7 @@ struct SceneIslands {
     const auto size = [&](int32_t b) { return in.body_ptr[b + 1] - in.body_ptr[b]; };
     each_body_of(in.mesh_bodies, BlockTeam{nullptr}, size, [&](int32_t b, const auto& by) {
       BodySum<T> own = nothing<T>();
-      by.each(size(b), [&](int32_t k) { own.add(vertex_share(in, scene, in.body_order[in.body_ptr[b] + k])); });
+      by.each(size(b), [&](int32_t k) { own.add(vertex_sum(in, scene, in.body_order[in.body_ptr[b] + k])); });
       const BodySum<T> sum = sum_of(by, own);
       if (by.leads()) work.bodies[first() + b] = sum;
       by.meet();

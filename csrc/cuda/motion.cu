@@ -42,7 +42,7 @@ struct Extrapolate {
   double chord;
   T* coasted;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::coast(b, team, chord, coasted);
+    contact::extrapolate(b, team, chord, coasted);
   }
 };
 template <class T>
@@ -50,49 +50,49 @@ struct ReverseExtrapolate {
   double chord;
   MotionAdjoints<T> a;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::reverse_coast(b, team, chord, a);
+    contact::reverse_extrapolate(b, team, chord, a);
   }
 };
 template <class T>
 struct WantedRadius {
-  RoomInputs<T> in;
-  RoomWork<T> work;
+  RadiusInputs<T> in;
+  RadiusWork<T> work;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const { wish_of_body(in, b, team, work); }
 };
 template <class T>
 struct IslandRadius {
-  RoomInputs<T> in;
-  RoomWork<T> work;
+  RadiusInputs<T> in;
+  RadiusWork<T> work;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    room_beside_island(in, b, team, work);
+    radius_beside_island(in, b, team, work);
   }
 };
 
 // A block for each scene.
 template <class T, bool first>
 __global__ void __launch_bounds__(kThreads)
-    each_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
+    each_scene(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work) {
   __shared__ double part[kWarps][kMostSums];
   if constexpr (first) {
     prepare_scene(in, blockIdx.x, BlockTeam{part}, work);
   } else {
-    end_rooms(in, blockIdx.x, BlockTeam{part}, work);
+    finish_radii(in, blockIdx.x, BlockTeam{part}, work);
   }
 }
 
 // A thread for each body.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    others_kernel(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
+    others_kernel(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work) {
   const int64_t place = own_item(kThreads), bodies = in.motion.bodies;
   if (place >= in.motion.scenes * bodies) return;
-  room_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
+  radius_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
 }
 
 // All radii of a small scene, by a block with a warp for each of its bodies in turn. It ends once no radius changes.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    radii_of_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work,
+    radii_of_scene(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work,
                    const __grid_constant__ IslandWork<T> of_islands) {
   __shared__ double part[kWarps][kMostSums];
   const SceneIslands<T> islands{in.islands, of_islands, blockIdx.x, islands_memory<T>()};
@@ -105,7 +105,7 @@ __global__ void __launch_bounds__(kThreads)
         [&](int32_t b, const auto& by) { f(body(b), by); });
     __syncthreads();
   };
-  const auto room = [&](int32_t body) { return room_at(in, work.room, scene, body); };
+  const auto room = [&](int32_t body) { return radius_at(in, work.trust_radius, scene, body); };
   prepare_scene(in, scene, team, work);
   __syncthreads();
   for_each_body([&](const MovingBody<T>& b, const auto& by) { wish_of_body(in, b, by, work); });
@@ -113,25 +113,25 @@ __global__ void __launch_bounds__(kThreads)
   bool changes = true;
   for (int round = -1;; ++round) {  // -1: radii among other bodies; then next to islands
     if (changes) islands.find(work.island);
-    if (round == kRoomRounds) break;
+    if (round == kRadiusRounds) break;
     changes = false;
     if (round < 0) {
       islands.each(in.motion.bodies, [&](int32_t body) {
         const T before = room(body);
-        room_among_others(in, work, scene, body, true);
+        radius_among_others(in, work, scene, body, true);
         changes = changes || !(room(body) == before);
       });
     } else {
       for_each_body([&](const MovingBody<T>& b, const auto& by) {
         const T before = by.leads() ? room(b.body) : T(0);  // only the leader writes it
-        room_beside_island(in, b, by, work);
+        radius_beside_island(in, b, by, work);
         if (by.leads()) changes = changes || !(room(b.body) == before);
       });
     }
     changes = __syncthreads_or(changes);
     if (0 <= round && !changes) break;
   }
-  end_rooms(in, scene, team, work);
+  finish_radii(in, scene, team, work);
 }
 
 }  // namespace
@@ -147,21 +147,22 @@ cudaError_t reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a
 }
 
 template <class T>
-cudaError_t coast(const MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream) {
+cudaError_t extrapolate(const MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream) {
   return for_bodies(in, Extrapolate<T>{chord, coasted}, stream);
 }
 
 template <class T>
-cudaError_t reverse_coast(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a, cudaStream_t stream) {
+cudaError_t reverse_extrapolate(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a,
+                                cudaStream_t stream) {
   return for_bodies(in, ReverseExtrapolate<T>{chord, a}, stream);
 }
 
 template <class T>
-cudaError_t find_trust_radii(RoomInputs<T> in, const RoomWork<T>& work, void* islands, cudaStream_t stream) {
+cudaError_t find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work, void* islands, cudaStream_t stream) {
   const auto scenes = static_cast<unsigned>(in.motion.scenes);
   const int64_t bodies = in.motion.scenes * in.motion.bodies;
   if (scenes == 0) return cudaSuccess;
-  in.islands.room = work.room;
+  in.islands.trust_radius = work.trust_radius;
   const int64_t of_scene = in.motion.bodies;
   if (0 < of_scene && of_scene <= kMostOfBlock && in.motion.vertices <= kSmallScene &&
       in.islands.colliders() <= kSmallScene) {
@@ -174,7 +175,7 @@ cudaError_t find_trust_radii(RoomInputs<T> in, const RoomWork<T>& work, void* is
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
     others_kernel<T><<<blocks_for(bodies, kThreads), kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
-    for (int round = 0; round < kRoomRounds; ++round) {
+    for (int round = 0; round < kRadiusRounds; ++round) {
       if (const auto error = for_bodies(in.motion, IslandRadius<T>{in, work}, stream)) return error;
       if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     }
@@ -185,8 +186,8 @@ cudaError_t find_trust_radii(RoomInputs<T> in, const RoomWork<T>& work, void* is
 
 DIFFVBD_INSTANTIATE(find_motion)
 DIFFVBD_INSTANTIATE(reverse_motion)
-DIFFVBD_INSTANTIATE(coast)
-DIFFVBD_INSTANTIATE(reverse_coast)
+DIFFVBD_INSTANTIATE(extrapolate)
+DIFFVBD_INSTANTIATE(reverse_extrapolate)
 DIFFVBD_INSTANTIATE(find_trust_radii)
 
 }  // namespace diffvbd::cuda

@@ -64,14 +64,14 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   }
   Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at, incoming);
   if (s.has_tets) star.fetch_neighbours(false);
-  if constexpr (Set::usual) {
+  if constexpr (Set::well_conditioned) {
     if constexpr (Set::filters) {
       if (star.any(is_oblique<Set>(b, r.x_old, s.w.data_bar != nullptr))) return false;
     }
     if (full) {
       Block<T> before = b;
       if constexpr (Set::keeps_positions) before.state.x = r.x_old;
-      if (is_rare<Set>(before, star, r.H)) return false;
+      if (needs_refinement<Set>(before, star, r.H)) return false;
     }
   }
   if (s.has_tets) star.clear_sums(shared);
@@ -80,8 +80,8 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   if constexpr (Set::contact) x_bar = contact::limit_of<T>(exponent) * end_bar;
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
   const Update<T> u = replayed<Set>(b, star, r, full, q);
-  if constexpr (Set::usual) {
-    if (!full && is_rare<Set>(b, star, r.H)) return false;
+  if constexpr (Set::well_conditioned) {
+    if (!full && needs_refinement<Set>(b, star, r.H)) return false;
   }
   star.repeats = false;
   BlockAdjoint<T> out =
@@ -127,7 +127,7 @@ __device__ __noinline__ void reverse_ill_conditioned(const StepView<T>& s, T* sh
 
 template <class Set, int wanted, class T, int lanes>
 __device__ __forceinline__ void reverse_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
-  if (!reverse_update<Usual<Set>, wanted, T, lanes>(s, shared, turn, pairs)) {
+  if (!reverse_update<WellConditioned<Set>, wanted, T, lanes>(s, shared, turn, pairs)) {
     reverse_ill_conditioned<Set, wanted, T, lanes>(s, shared, turn, pairs);
   }
 }

@@ -39,12 +39,12 @@ __global__ void __launch_bounds__(kVertexThreads)
   if (row.exists) reverse_kept(in, a, row.scene, row.vertex);
 }
 
-using coarse::kBlockTets, coarse::kDegree, coarse::RiseInputs;
+using coarse::kBlockTets, coarse::kDegree, coarse::IncreaseInputs;
 using rigid::Body, rigid::Vector;
 
 // Coefficients of h^2 times the energy of a lane's tet along the displacement.
 template <class T>
-__device__ void tet_line(const RiseInputs<T>& in, int64_t scene, int64_t block, int lane, double (&c)[kDegree]) {
+__device__ void tet_line(const IncreaseInputs<T>& in, int64_t scene, int64_t block, int lane, double (&c)[kDegree]) {
   constexpr int kRest = kRestScalars, kMaterial = kTetScalars;
   const T* rest = in.rest.data + scene * in.rest.scene + block * kRest * kBlockTets + lane;
   const T* material = in.material.data + scene * in.material.scene + block * kMaterial * kBlockTets + lane;
@@ -55,8 +55,8 @@ __device__ void tet_line(const RiseInputs<T>& in, int64_t scene, int64_t block, 
   for (int k = 0; k < 4; ++k) {
     const int64_t v = in.corner[(4 * block + k) * kBlockTets + lane] / 4;
     const int64_t row = 3 * (scene * in.bodies.vertices + v);
-    at[k] = Body<T>::at(in.bodies.x + row);
-    way[k] = Body<T>::at(in.to + row) - at[k];
+    at[k] = diffvbd::wide_at(in.bodies.x + row);
+    way[k] = diffvbd::wide_at(in.to + row) - at[k];
   }
   TetLaw::line(at, way, own_rest, own_material, c);
   for (double& power : c) power *= in.bodies.time_step * in.bodies.time_step;
@@ -64,7 +64,8 @@ __device__ void tet_line(const RiseInputs<T>& in, int64_t scene, int64_t block, 
 
 // Increase and magnitude of each block of tets and of each listed vertex, a thread for each tet and vertex.
 template <class T>
-__global__ void __launch_bounds__(kThreads) increase_of_parts(const __grid_constant__ RiseInputs<T> in, double* parts) {
+__global__ void __launch_bounds__(kThreads)
+    increase_of_parts(const __grid_constant__ IncreaseInputs<T> in, double* parts) {
   const int64_t item = own_item(kThreads);
   const int64_t tets = in.bodies.scenes * in.blocks * kBlockTets, rows = in.blocks + in.listed;
   if (item < tets) {
@@ -87,7 +88,7 @@ __global__ void __launch_bounds__(kThreads) increase_of_parts(const __grid_const
   const Body<T> all{in.bodies, scene, 0};  // any body will do
   const int32_t v = in.bodies.order[place];
   double sum[3] = {0, 0, 0};
-  rigid::add_rise(all, v, Body<T>::at(in.to + 3 * all.row(v)), sum);
+  rigid::add_energy_increase(all, v, diffvbd::wide_at(in.to + 3 * all.row(v)), sum);
   double* to = parts + 2 * (scene * rows + in.blocks + place);
   to[0] = sum[2] > 0 ? CUDART_INF : sum[0], to[1] = sum[1];
 }
@@ -95,7 +96,7 @@ __global__ void __launch_bounds__(kThreads) increase_of_parts(const __grid_const
 // A block for each body of each scene.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    increase_of_bodies(const __grid_constant__ RiseInputs<T> in, const double* parts, double* out) {
+    increase_of_bodies(const __grid_constant__ IncreaseInputs<T> in, const double* parts, double* out) {
   __shared__ double part[kWarps][kMostSums];
   const int32_t n = in.bodies.bodies, k = static_cast<int32_t>(blockIdx.x % n);
   const double* own = parts + 2 * (blockIdx.x / n) * (in.blocks + in.listed);
@@ -135,7 +136,7 @@ cudaError_t rigid_reverse(const rigid::Inputs<T>& in, const BodyGroups& groups, 
 }
 
 template <class T>
-cudaError_t energy_increase(const RiseInputs<T>& in, double* workspace, double* out, cudaStream_t stream) {
+cudaError_t energy_increase(const IncreaseInputs<T>& in, double* workspace, double* out, cudaStream_t stream) {
   const int64_t bodies = in.bodies.scenes * in.bodies.bodies;
   if (bodies == 0) return cudaSuccess;
   const int64_t items = in.bodies.scenes * (in.blocks * kBlockTets + in.listed);

@@ -36,10 +36,10 @@ CoarseWork<T> carve_coarse(const coarse::Inputs<T>& in, int64_t positions, int64
   w.displacement = take(true, scenes * kRow * positions);
   w.restricted = take(true, scenes * 3 * p.functions);
   w.solved = take(reverse, scenes * in.corrections * 3 * p.functions);
-  w.wanted = take(reverse && in.pressed, scenes * kRow * positions);
-  w.inverse = take(in.pressed, scenes * 9 * p.cells);
+  w.wanted = take(reverse && in.has_vertex_blocks, scenes * kRow * positions);
+  w.inverse = take(in.has_vertex_blocks, scenes * 9 * p.cells);
   const auto doubles = [&](int64_t count) {
-    return reinterpret_cast<double*>(take(in.pressed, bytes(scenes * count, sizeof(double))));
+    return reinterpret_cast<double*>(take(in.has_vertex_blocks, bytes(scenes * count, sizeof(double))));
   };
   w.vertex_blocks = doubles(6 * positions);
   w.matrix = {nullptr, doubles(int64_t{9} * p.cells), doubles(int64_t{6} * p.functions * kEdge),

@@ -17,7 +17,7 @@ constexpr int kColumn = kSlice + 1;  // stride of a column: one more than a warp
 // A step takes two kernels: one of well-conditioned sets for all scenes, and one for the scenes that it has marked.
 template <int mask>
 struct WellConditionedVariant {
-  using Set = Usual<EnergySet<mask>>;
+  using Set = WellConditioned<EnergySet<mask>>;
 };
 template <int mask>
 struct IllConditionedVariant {
@@ -25,13 +25,13 @@ struct IllConditionedVariant {
 };
 template <class Set>
 constexpr bool marks() {
-  return Set::usual;
+  return Set::well_conditioned;
 }
 // Bit set of the threads of the warp that have a scene to do.
 template <class Set>
 __device__ __forceinline__ unsigned scenes_to_do(const uint8_t* ill_conditioned, int64_t scene, int64_t scenes) {
   bool mine = scene < scenes;
-  if constexpr (!Set::usual) mine = mine && ill_conditioned[scene] != 0;
+  if constexpr (!Set::well_conditioned) mine = mine && ill_conditioned[scene] != 0;
   return __ballot_sync(kWholeWarp, mine);
 }
 

@@ -16,12 +16,12 @@ __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs
   data_starts(in, plan, start);
   const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
   const Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-  if constexpr (Set::usual && Set::filters) {
+  if constexpr (Set::well_conditioned && Set::filters) {
     if (is_oblique<Set>(b, b.state.x)) return false;
   }
   const NewtonStep<T> newton = newton_step<Set>(b, star, q);
-  if constexpr (Set::usual) {
-    if (is_rare<Set>(b, star, newton.H)) return false;
+  if constexpr (Set::well_conditioned) {
+    if (needs_refinement<Set>(b, star, newton.H)) return false;
   }
   const Update<T> u = update_of<Set>(b, newton, q);
   set_column3(x, vertex, moved<Set>(b.state.x, u));

@@ -83,12 +83,12 @@ struct ReverseVisits {
     const int vertex = star.go_to(rank);
     const StepParameters<T> q = of_sweep(in.parameters, last);
     Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, columns.x, columns.y);
-    if constexpr (Set::usual && Set::filters) {
+    if constexpr (Set::well_conditioned && Set::filters) {
       if (is_oblique<Set>(b, now.x_old, out.data != nullptr)) return false;
     }
     const Update<T> u = replayed<Set>(b, star, now, full, q);
-    if constexpr (Set::usual) {
-      if (is_rare<Set>(b, star, now.H)) return false;
+    if constexpr (Set::well_conditioned) {
+      if (needs_refinement<Set>(b, star, now.H)) return false;
     }
     set_column3(columns.x, vertex, b.state.x);
     const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
@@ -167,7 +167,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, scene_reverse_blocks<T>())
         });
     __syncwarp();
     if (mine >> lane & 1) {
-      if constexpr (!Set::usual) clear_scene(in, out, plan, scene);
+      if constexpr (!Set::well_conditioned) clear_scene(in, out, plan, scene);
       const Columns<T> columns{x, y, x_bar, y_bar};
       ReverseVisits<Set, wanted, common, T> visits(in, tape, out, plan, list, columns, scene);
       const int left = visits.run(in.sweeps * plan.num_active);

@@ -3,10 +3,10 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../coarse/views.h"
 #include "../contact/passes.h"
-#include "../core/plan_views.h"
+#include "../core/views.h"
 #include "../energies/energies.h"
+#include "../subspace/coarse.h"
 
 namespace diffvbd::cuda {
 

@@ -93,14 +93,14 @@ cudaError_t act_on_vertices(const Act& act, cudaStream_t stream) {
 #define DIFFVBD_ACT(on, Act)                                                  \
   template cudaError_t act_on_##on(const contact::Act<float>&, cudaStream_t); \
   template cudaError_t act_on_##on(const contact::Act<double>&, cudaStream_t);
-DIFFVBD_ACT(bodies, AboveFloorWays)
+DIFFVBD_ACT(bodies, AboveFloorDisplacements)
 DIFFVBD_ACT(bodies, ReverseAboveFloor)
 DIFFVBD_ACT(bodies, Frames)
 DIFFVBD_ACT(bodies, Bends)
-DIFFVBD_ACT(bodies, HeldUp)
+DIFFVBD_ACT(bodies, BlockedBodies)
 DIFFVBD_ACT(vertices, Wishes)
-DIFFVBD_ACT(vertices, Holds)
-DIFFVBD_ACT(vertices, Falls)
+DIFFVBD_ACT(vertices, Freeze)
+DIFFVBD_ACT(vertices, GravityMoves)
 DIFFVBD_ACT(vertices, Starts)
 DIFFVBD_ACT(vertices, ReverseStarts)
 #undef DIFFVBD_ACT

@@ -4,7 +4,7 @@
 
 #include <cub/device/device_radix_sort.cuh>
 
-#include "../contact/candidates.h"
+#include "../contact/detection.h"
 #include "atomics.cuh"
 #include "common.cuh"
 #include "warp_reduce.cuh"

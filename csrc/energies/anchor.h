@@ -10,7 +10,7 @@ struct Anchor {
   static constexpr int stride = 4;
   static constexpr bool has_filter = false;
   static constexpr bool reads_x_prev = false;
-  static constexpr bool rare = true;
+  static constexpr bool optional = true;
 
   template <class T>
   static const char* invalid(const T* a) {

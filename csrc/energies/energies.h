@@ -1,7 +1,7 @@
 // THE list of energies. A scene's energies form a mask; each mask is a compiled variant, so an absent energy costs no
-// instruction, but for one that is rare: on the CPU it costs a test. An energy of one vertex is a struct with stride,
-// per_vertex, has_filter, reads_x_prev, rare, block() and value(); with a block_vjp() too it is hot, without one Dual
-// derives its adjoint.
+// instruction, but for one that is optional: on the CPU it costs a test. An energy of one vertex is a struct with
+// stride, per_vertex, has_filter, reads_x_prev, optional, block() and value(); with a block_vjp() too it is hot,
+// without one Dual derives its adjoint.
 #pragma once
 
 #include <type_traits>
@@ -52,15 +52,15 @@ constexpr bool is_compiled(int mask) { return (mask & kPaperBlock) == 0; }
 #else
 constexpr bool is_compiled(int) { return true; }
 #endif
-// Bits of the energies that are rare. The CPU compiles them into every variant, where an absent one is a loop of no
+// Bits of the optional energies. The CPU compiles them into every variant, where an absent one is a loop of no
 // turns: variants then double with hot energies alone.
 template <class... E>
-constexpr int rare_bits(EnergyList<E...>) {
+constexpr int optional_bits(EnergyList<E...>) {
   int k = kFirstVertexBit, bits = 0;
-  ((bits |= int(E::rare) << k++), ...);
+  ((bits |= int(E::optional) << k++), ...);
   return bits;
 }
-constexpr int with_rare(int mask) { return mask | rare_bits(VertexEnergies{}); }
+constexpr int with_optional(int mask) { return mask | optional_bits(VertexEnergies{}); }
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
 
 // One block update, from the Newton step to the executed one.
@@ -96,7 +96,7 @@ constexpr bool any_filter(int mask, EnergyList<E...>) {
 // Whether a vertex must come back to its old position exactly in the reverse: gaps depend on it to the bit, and an undo
 // by subtraction is an ulp off at times.
 constexpr bool keeps_positions(int mask) { return (mask & kContact) != 0 || any_filter(mask, VertexEnergies{}); }
-// What a tape keeps for that: the old position and, with a step filter, the fraction of the update (sweep/descent.h).
+// What a tape keeps for that: the old position and, with a step filter, the fraction of the update (sweep/vertex.h).
 constexpr int kept_scalars(int mask) { return any_filter(mask, VertexEnergies{}) ? 4 : keeps_positions(mask) ? 3 : 0; }
 constexpr bool has_vertex_energy(int mask) { return (mask >> kFirstVertexBit) != 0; }
 template <class... E>
@@ -107,7 +107,7 @@ constexpr bool any_x_prev(int mask, EnergyList<E...>) {
 
 template <int mask>
 struct EnergySet {
-  static constexpr bool usual = false;
+  static constexpr bool well_conditioned = false;
   static constexpr bool contact = (mask & kContact) != 0;
   static constexpr bool of_vertices = has_vertex_energy(mask);
   using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
@@ -132,11 +132,11 @@ struct EnergySet {
   }
 };
 
-// The same energies for blocks that need neither axes along planes nor a refined solve (core/frame.h, sweep/uneven.h):
+// The same energies for blocks that need neither axes along planes nor a refined solve (core/frame.h, sweep/refine.h):
 // nearly all of them. CUDA does these first, with fewer registers, and the others once more by themselves.
 template <class Set>
-struct Usual : Set {
-  static constexpr bool usual = true;
+struct WellConditioned : Set {
+  static constexpr bool well_conditioned = true;
 };
 
 template <class E, class = void>
@@ -144,7 +144,7 @@ struct has_block_vjp : std::false_type {};
 template <class E>
 struct has_block_vjp<E, std::void_t<decltype(&E::template block_vjp<double>)>> : std::true_type {};
 
-// A plane as a step has met it: out of line, so that no compiler fuses its products in one place and not in another.
+// A plane after a step: out of line, so that no compiler fuses its products in one place and not in another.
 template <class E, class R>
 struct PlanePush {
   Vec3<R> n;
@@ -156,7 +156,7 @@ DIFFVBD_COLD PlanePush<E, R> push_of(const VertexState<R>& s, const R* record, c
   const auto f = E::push(s, record, axes);
   return {f.n, f.curvature, f.slope + f.curvature * dot(f.n, d_raw)};
 }
-// The axes of p and d_raw, and a small part of d_raw that is kept apart (sweep/uneven.h). The reaction of a plane is
+// The axes of p and d_raw, and a small part of d_raw that is kept apart (sweep/refine.h). The reaction of a plane is
 // the small difference of a large slope and a large answer to it: that part gives it its digits.
 template <class R>
 struct PlaneStep {
@@ -178,7 +178,7 @@ DIFFVBD_FN NoFrame<R> plane_step(const NoFrame<R>& axes, const Vec3<R>&) {
 }
 
 // Adjoint of phi = p . (g + H d_raw) for one record of an energy's data, by one Dual evaluation for each input. The
-// records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted.
+// records of an energy only add up. CompactList out of line: it is shared by all variants and seldom wanted.
 template <class E, class R, class Planes = NoFrame<R>>
 struct DualAdjoint {
   const VertexState<R>& s;
@@ -282,7 +282,8 @@ DIFFVBD_FN void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, i
   for (int k = 0; k < count; k += E::stride) {
     R data_bar[E::stride];
     if constexpr (E::has_filter) {
-      // The record that set alpha is the first of the smallest fraction; a vertex that was held (0) follows no datum.
+      // The record that set alpha is the first of the smallest fraction; a vertex that was stopped (0) depends on no
+      // datum.
       const R own = E::fraction(s, data + k, u.step, q);
       const R same = select(own < u.alpha, R(0), select(u.alpha < own, R(0), R(1)));
       const R binds = select(own < alpha, same, R(0));

@@ -17,7 +17,7 @@ struct FloorBarrier {
   static constexpr int stride = 7;
   static constexpr bool has_filter = true;
   static constexpr bool reads_x_prev = true;
-  static constexpr bool rare = false;
+  static constexpr bool optional = false;
 
   // what is wrong with the data of one plane, or null
   template <class T>
@@ -110,16 +110,16 @@ struct FloorBarrier {
     return Frame<R>::template along<T>(select(turns, n1, zero3<R>()), select(turns, n2, zero3<R>()));
   }
 
-  // What share of its damping a vertex has that began the step at a gap, and the share's derivative by the gap. It
-  // fades in with the normal force A there, A / (A + kappa dhat / 10), as that of pairs does (diffvbd/energies.py):
-  // switched on at dhat, it would let a motion jump where a vertex comes there a step sooner, and gradients miss what
-  // jumps add up to. kappa cancels; without a barrier there is no damping.
+  // The damping fraction of a vertex that began the step at a gap, and its derivative by the gap. It fades in with the
+  // normal force A there, A / (A + kappa dhat / 10), as that of pairs does (diffvbd/energies.py): switched on at dhat,
+  // damping would make a motion jump where a vertex comes there a step sooner, and gradients miss jumps. kappa cancels;
+  // without a barrier there is no damping.
   template <class R>
-  struct Share {
+  struct DampingFraction {
     R value, slope;
   };
   template <class R>
-  DIFFVBD_FN static Share<R> share(const Plane<R>& plane, const R& gap) {
+  DIFFVBD_FN static DampingFraction<R> damping_fraction(const Plane<R>& plane, const R& gap) {
     const LogBarrier<R> b(gap, plane.dhat, R(1));
     const R half = R(fade()) * plane.dhat, inv = R(1) / (half - b.first);
     const auto acts = R(0) < plane.kappa;
@@ -135,7 +135,7 @@ struct FloorBarrier {
     return true;
   }
 
-  // What one plane adds to the block: slope n to g, curvature n n^T to H.
+  // The part of one plane in the block: slope n in g, curvature n n^T in H.
   template <class R>
   struct Push {
     Vec3<R> n;  // in the axes of the block
@@ -149,7 +149,7 @@ struct FloorBarrier {
     if (damps(plane.damping) && any(before < plane.dhat)) {
       const R approach = dot(plane.n, s.x - s.x_prev);
       // H has it for both directions, as for pairs: where a start has left no approach, rounding would switch it.
-      out.curvature = plane.damping * s.h * share(plane, before).value;
+      out.curvature = plane.damping * s.h * damping_fraction(plane, before).value;
       out.slope = out.curvature * select(approach < R(0), approach, R(0));
     }
     if (any(d < plane.dhat)) {
@@ -181,7 +181,7 @@ struct FloorBarrier {
     }
     return sum;
   }
-  // By how much it changes along a step, or by how much more than its part of g and H says; the sizes of the terms are
+  // The change along a step, or its excess over the quadratic model of g and H; the sizes of the terms are
   // added to `size`. The gap after the step comes from the gap before: the difference of two positions would round by
   // far more than a small step changes.
   template <bool beyond_quadratic = false, class R>
@@ -202,7 +202,7 @@ struct FloorBarrier {
     }
     return sum;
   }
-  // Of one plane, at a gap and after a travel away from it within the step.
+  // The potential of one plane, at a gap and after a travel away from it within the step.
   template <class R>
   DIFFVBD_FN static R potential(const VertexState<R>& s, const Plane<R>& plane, const R& gap, const R& travel) {
     R out = R(0);
@@ -210,18 +210,18 @@ struct FloorBarrier {
     const R before = plane.gap(s.x_prev);
     if (!damps(plane.damping) || !any(before < plane.dhat)) return out;
     const R approach = select(travel < R(0), travel, R(0));
-    return out + R(0.5) * plane.damping * s.h * share(plane, before).value * approach * approach;
+    return out + R(0.5) * plane.damping * s.h * damping_fraction(plane, before).value * approach * approach;
   }
 
-  // Whether a move from `before` to s.x leaves every plane at least `share` of the gap there was, and more than
+  // Whether a move from `before` to s.x leaves every plane at least `kept` of the gap there was, and more than
   // rounding in T. The barrier's potential means nothing elsewhere.
   template <class T, class R>
-  DIFFVBD_FN static bool admits(const VertexState<R>& s, const Vec3<R>& before, const R* data, int count, R share) {
+  DIFFVBD_FN static bool admits(const VertexState<R>& s, const Vec3<R>& before, const R* data, int count, R kept) {
     bool out = true;
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
       const R d = plane.gap(s.x);
-      out = out && plane.template guard<T>(s) < d && share * plane.gap(before) <= d;
+      out = out && plane.template guard<T>(s) < d && kept * plane.gap(before) <= d;
     }
     return out;
   }
@@ -243,7 +243,7 @@ struct FloorBarrier {
       if (!damps(plane.damping) || !any(before < plane.dhat)) continue;
       const R travel = dot(plane.n, s.x - s.x_prev), c = plane.damping * s.h;
       const auto nearer = travel < R(0);
-      const Share<R> acts = share(plane, before);
+      const DampingFraction<R> acts = damping_fraction(plane, before);
       const Vec3<R> pull = select(nearer, c * acts.value, R(0)) * n_p * plane.n;
       x_bar -= pull;
       x_prev_bar += pull - c * acts.slope * (select(nearer, travel, R(0)) + n_d) * n_p * plane.n;

@@ -1,6 +1,6 @@
-// How far a part of a step starts toward a floor: the wanted motion, less what would approach a plane too closely; with
-// its derivative (docs/method.md, section 6). Unlike the filter of updates it never enters a plane's dhat: a start does
-// not minimise the barrier, and what it closed in every step the sweeps would have to open again.
+// The start of a substep above a floor: the wanted motion, less what would approach a plane too closely, with its
+// derivative (docs/method.md, section 6). Unlike the filter of updates it never enters a plane's dhat: a start does not
+// minimise the barrier, and the sweeps would have to open again what it closes.
 #pragma once
 
 #include "../core/dual.h"
@@ -12,19 +12,19 @@ struct FloorStart {
   static constexpr int kMostPlanes = 8;
   static constexpr double kParallel = 1e-6;  // squared sine below which a plane counts as parallel to binding ones
 
-  // How far a motion may approach one plane: within dhat not at all, from outside by a part of the way to it.
+  // The allowed motion toward one plane: none within dhat, a fraction of the distance to it from outside.
   template <class R>
   struct Limit {
     Vec3<R> n;
-    R room;
+    R allowance;
     template <class T>
     DIFFVBD_FN Limit(const R* record, const VertexState<R>& s, const StepParameters<T>& q) {
       const FloorBarrier::Plane<R> plane(record, s);
       const R outside = plane.gap(s.x) - plane.dhat;
       n = plane.n;
-      room = select(R(0) < outside, R(q.filter_eta) * outside, R(0));
+      allowance = select(R(0) < outside, R(q.filter_eta) * outside, R(0));
     }
-    DIFFVBD_FN R excess(const Vec3<R>& step) const { return -dot(n, step) - room; }
+    DIFFVBD_FN R excess(const Vec3<R>& step) const { return -dot(n, step) - allowance; }
   };
 
   // The step shortened as a whole.
@@ -35,7 +35,7 @@ struct FloorStart {
     for (int k = 0; k < count; k += FloorBarrier::stride) {
       const Limit<R> plane(data + k, s, q);
       if (!(R(0) < plane.excess(step))) continue;
-      const R a = -(plane.room / dot(plane.n, step));
+      const R a = -(plane.allowance / dot(plane.n, step));
       alpha = select(a < alpha, a, alpha);
     }
     return alpha * step;
@@ -43,7 +43,7 @@ struct FloorStart {
 
   // Takes away what exceeds the limits, so that sliding stays. Planes bind one after the other, the one exceeded most
   // first, each along the part of its normal that leaves those before it as they are: with one or two planes that is
-  // the closest motion there is. Where more of them leave no such way, the whole step is shortened.
+  // the closest motion there is. Where more of them leave no such motion, the whole step is scaled.
   template <class R, class T>
   DIFFVBD_FN static Vec3<R> projected(const VertexState<R>& s, const R* data, int count, const Vec3<R>& step,
                                       const StepParameters<T>& q) {

@@ -104,12 +104,12 @@ struct StableNeoHookean {
     Vec3<R> u = b * stress(e, v) * p + along * v.d;
     if constexpr (!Exact) u += b * lam(e) * c6_n_p * d_raw;
     const R mu_h2 = minus_h2 * mu(e);
-    const Vec3<R> w = mu_h2 * p, cut = along * v.n;
+    const Vec3<R> w = mu_h2 * p, along_n = along * v.n;
 
     TetAdjoint<R> out;
     out.xk = k_ik(e) * w + cross(v.el, u);
     out.xl = k_il(e) * w + cross(u, v.ek);
-    out.xi = cut - (k_ij(e) + k_ik(e) + k_il(e)) * w;
+    out.xi = along_n - (k_ij(e) + k_ik(e) + k_il(e)) * w;
     // dE depends on differences of positions only: the four adjoints sum to zero.
     out.xj = -(out.xi + out.xk + out.xl);
     return out;

@@ -50,7 +50,7 @@ struct TetPair {
   }
 };
 
-// What one reversed update adds to the adjoints of a tet's corners, with the sign and h^2 already applied.
+// The adjoints of a tet's corners by one reversed update, with the sign and h^2 applied.
 template <class R>
 struct TetAdjoint {
   Vec3<R> xi, xj, xk, xl;
@@ -59,7 +59,7 @@ struct TetAdjoint {
 // Which adjoints beyond the state are wanted: those that a variant is compiled for, and of them those asked for.
 enum Wanted { kState = 0, kMaterial = 1, kRest = 2 };
 
-// What of them belongs to the tet itself, sent to its star.
+// The adjoints of material and rest shape, scattered to the star.
 template <class Law, int wanted, class R, class Star, class View>
 DIFFVBD_FN void reverse_shape(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
                               const Vec3<R>& p, const R& minus_h2) {
@@ -75,7 +75,7 @@ DIFFVBD_FN void reverse_shape(const Star& star, int e, const TetPair<R>& tet, co
   }
 }
 
-// The adjoints of one tet's inputs, sent to its star.
+// The adjoints of one tet's inputs, scattered to the star.
 template <class Law, int wanted, class R, class Star, class View>
 DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
                             const Vec3<R>& p, const R& minus_h2, Vec3<R>& own) {
@@ -85,14 +85,14 @@ DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, cons
   reverse_shape<Law, wanted>(star, e, tet, view, d_raw, p, minus_h2);
 }
 
-// What the tets of a star add to the block of its vertex, without h^2.
+// The sums of the tets of a star, without h^2.
 template <class R>
 struct TetSums {
   Vec3<R> g;
   R h_diagonal;
   Sym3<R> h_outer;
 };
-// What the two loops below read over and over they copy first: no store of theirs can then be to it.
+// The two loops below copy what they read often: no store of theirs can alias it.
 template <class Law, class R, class Star>
 DIFFVBD_FN TetSums<R> sum_tets(const Star& shared, const Vec3<R>& position) {
   decltype(auto) star = shared.local();
@@ -123,24 +123,24 @@ DIFFVBD_LOOP Vec3<R> reverse_tets(const Star& shared, const Reversed<R>& update)
 
 // w of a pair's neighbours, as TetPair has their positions.
 template <class R>
-struct PairWay {
+struct PairDisplacement {
   Vec3<R> wj, wk, wl;
 };
 // The adjoint of w . g, with g the gradient that the tets have at all vertices: the vertex's own rows of their Hessian
 // times w, gathered from w of its neighbours, and the adjoints of the tets' inputs as far as they come through the
-// vertex's own w. Nothing is sent to a neighbour. star.way(e) follows star.pair(e).
+// vertex's own w. Nothing is scattered to a neighbour. star.displacement(e) follows star.pair(e).
 template <class Law, int wanted, class R, class Star>
-DIFFVBD_LOOP Vec3<R> multiply_tets(const Star& shared, const Vec3<R>& position, const Vec3<R>& own_way,
+DIFFVBD_LOOP Vec3<R> multiply_tets(const Star& shared, const Vec3<R>& position, const Vec3<R>& own_displacement,
                                    const R& minus_h2) {
   decltype(auto) star = shared.local();
-  const Vec3<R> x = position, w = own_way, p = -w, none = zero3<R>();
+  const Vec3<R> x = position, w = own_displacement, p = -w, none = zero3<R>();
   const R scale = minus_h2;
   Vec3<R> sum = none;
   for (int e = 0; e < star.size(); ++e) {
     const TetPair<R> tet = star.pair(e);
-    const PairWay<R> way = star.way(e);
+    const PairDisplacement<R> displacement = star.displacement(e);
     const auto view = Law::view(tet, x, none, p);
-    sum += Law::product(tet, view, w, way.wj, way.wk, way.wl);
+    sum += Law::product(tet, view, w, displacement.wj, displacement.wk, displacement.wl);
     reverse_shape<Law, wanted>(star, e, tet, view, none, p, scale);
   }
   return -(scale * sum);

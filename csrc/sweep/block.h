@@ -2,13 +2,22 @@
 #pragma once
 
 #include "../core/frame.h"
+#include "../core/vec.h"
 #include "../core/views.h"
 #include "../energies/energies.h"
-#include "contact_term.h"
 
 namespace diffvbd {
 
-// Everything one block update reads besides its star.
+// The part that pairs add to the block, computed color by color before the color moves (contact/passes.h). Limits of
+// the motion come after the update (contact/limit.h).
+template <class R>
+struct ContactTerm {
+  Vec3<R> g;
+  Sym3<R> H;
+};
+constexpr int kContactScalars = 9;
+
+// The inputs of one block update besides its star.
 template <class R>
 struct Block {
   VertexState<R> state;
@@ -21,7 +30,7 @@ struct Block {
 
 // The axes in which a set's blocks are factored.
 template <class Set, class R>
-using Axes = std::conditional_t<Set::filters && !Set::usual, Frame<R>, NoFrame<R>>;
+using Axes = std::conditional_t<Set::filters && !Set::well_conditioned, Frame<R>, NoFrame<R>>;
 
 // g and H in these axes, and what no pivot of H lies below.
 template <class Set, class R>
@@ -44,7 +53,8 @@ DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
   Axes<Set, R> axes;
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    if constexpr (E::has_filter && !Set::usual) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
+    if constexpr (E::has_filter && !Set::well_conditioned)
+      axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
   });
   return axes;
 }
@@ -63,7 +73,7 @@ DIFFVBD_FN Shared<R> shared_entries(const Block<R>& b, const Axes<Set, R>& axes)
       using E = decltype(energy);
       if constexpr (E::has_filter) {
         E::leave_out(b.state, b.data[k], b.data_count[k], out.first, out.second);
-        if constexpr (!Set::usual) {
+        if constexpr (!Set::well_conditioned) {
           if (axes.turned) {  // where the nearest plane has the first axis
             const auto turns = R(0) < axes.tiny;
             out = {select(turns, R(0), out.first), select(turns, R(1), out.second)};
@@ -114,7 +124,7 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
   }
   if constexpr (Set::filters) {
     out.axes = axes_of<T, Set>(b);
-    if constexpr (!Set::usual) {
+    if constexpr (!Set::well_conditioned) {
       if (out.axes.turned) {  // which rounds every entry by the largest ones
         const R rounding = R(0.5) * out.axes.tiny * (out.H.xx + out.H.yy + out.H.zz);
         out.least = select(least < rounding, rounding, least);
@@ -124,7 +134,7 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
     out.H = out.axes.to(out.H);
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
-      if constexpr (E::has_filter && Set::usual) {
+      if constexpr (E::has_filter && Set::well_conditioned) {
         E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
       } else if constexpr (E::has_filter && all) {
         E::block(b.state, b.data[k], b.data_count[k], out.g, out.H, out.axes);

@@ -1,13 +1,64 @@
-// The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 7-12).
-// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex, and
-// where several threads share them, total() sums over the threads.
+// How much of an update is executed where a barrier acts. A barrier is no quadratic: a Newton step into it may raise
+// the potential many times over, which later updates then have to take back. The fraction comes from a finite set, is
+// recorded and counts as a constant.
 #pragma once
 
 #include "../core/safeguards.h"
-#include "descent.h"
-#include "uneven.h"
+#include "block.h"
+#include "refine.h"
 
 namespace diffvbd {
+
+// d . H d of a factored block
+template <class R>
+DIFFVBD_FN R square_in(const Factor<R>& H, const Vec3<R>& d) {
+  const R first = d.x + H.l21 * d.y + H.l31 * d.z, second = d.y + H.l32 * d.z;
+  return first * first / H.inv1 + second * second / H.inv2 + d.z * d.z / H.inv3;
+}
+
+// The largest of 1, 1/2, ... for which the vertex's own potential does not increase along the update, beyond rounding;
+// or 0. The update is t d with H d = -g. Apart from the barriers the potential is quadratic in one vertex: it changes
+// by -(t - t^2 / 2) d . H d, and by the deviation of the barriers from their part of g and H. d is in the axes of H. 1
+// with the paper's block, whose update is no Newton step of the potential.
+template <class Set, class R, class T>
+DIFFVBD_FN R descending_fraction(const Block<R>& b, const StepParameters<T>& q, const Factor<R>& H, const Vec3<R>& d,
+                                 const Update<R>& u) {
+  R out = R(1);
+  if constexpr (Set::filters && std::is_same_v<typename Set::Elastic, TetLaw>) {
+    const Vec3<R> step = u.alpha * u.step;
+    VertexState<R> end = b.state;
+    end.x += step;
+    R acts = R(0);
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) {
+        acts = acts + E::near(b.state, b.data[k], b.data_count[k]) + E::near(end, b.data[k], b.data_count[k]);
+      }
+    });
+    if (!any(R(0) < acts)) return out;
+    const R square = dot(d, d), ratio = dot(u.d_raw, step) / select(R(0) < square, square, R(1));
+    const R whole = square_in(H, d), own = whole - R(q.regularization) * square;  // which no energy has
+    out = R(0);
+    for (int trial = 0; trial < kFractions && any(out < R(fraction_of(kFractions))); ++trial) {
+      const R s = R(fraction_of(trial)), t = s * ratio, down = t * whole, up = R(0.5) * t * t * own;
+      R increase = up - down, terms = up + down;
+      Set::for_each([&](auto energy, int k) {
+        using E = decltype(energy);
+        if constexpr (E::has_filter) {
+          increase = increase + E::template change<true>(b.state, s * step, b.data[k], b.data_count[k], terms);
+        }
+      });
+      const R rounding = R(kRounding * std::numeric_limits<T>::epsilon()) * terms;
+      out = select(R(0) < out, out, select(rounding < increase, R(0), s));
+    }
+    out = select(R(0) < acts, out, R(1));
+  }
+  return out;
+}
+
+// The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 7-12).
+// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex, and
+// where several threads share them, total() sums over the threads.
 
 // The Newton step, in the axes of the block and in those of the mesh, and the factored block.
 template <class R>
@@ -21,17 +72,17 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   const System<Set, R> system = assemble<Set>(b, star, q);
   const Factor<R> H = factor<T>(system.H, system.least);
   Vec3<R> d = -solve(H, system.g);
-  if constexpr (!Set::usual) {
-    if (star.any(is_uneven<Set>(H, shared_entries<Set>(b, system.axes))))
-      d = step_uneven<Set>(b, star, q, system.axes, H, d);
+  if constexpr (!Set::well_conditioned) {
+    if (star.any(is_ill_conditioned<Set>(H, shared_entries<Set>(b, system.axes))))
+      d = refine_step<Set>(b, star, q, system.axes, H, d);
   }
   return {d, system.axes.from(d), H};
 }
 
-// Whether factors of the usual way are none to go on with: all threads that share a star must know.
+// Whether a block needs refinement: all threads that share a star must know.
 template <class Set, class R, class Star>
-DIFFVBD_FN bool is_rare(const Block<R>& b, const Star& star, const Factor<R>& H) {
-  return star.any(is_uneven<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
+DIFFVBD_FN bool needs_refinement(const Block<R>& b, const Star& star, const Factor<R>& H) {
+  return star.any(is_ill_conditioned<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
 }
 
 // Saturated, then relaxed.
@@ -141,13 +192,14 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   const Axes<Set, R> axes = axes_of<T, Set>(b);
   const Vec3<R> z_axes = axes.to(z);
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
-  bool uneven = false;
-  if constexpr (!Set::contact && !Set::usual) {  // what contact adds to a block is not on a full tape
-    uneven = star.any(is_uneven<Set>(r.H, shared_entries<Set>(b, axes)));
-    if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));
+  bool ill_conditioned = false;
+  if constexpr (!Set::contact && !Set::well_conditioned) {  // what contact adds to a block is not on a full tape
+    ill_conditioned = star.any(is_ill_conditioned<Set>(r.H, shared_entries<Set>(b, axes)));
+    if constexpr (Set::filters)
+      ill_conditioned = ill_conditioned || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));
   }
-  if constexpr (!Set::usual) {
-    if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
+  if constexpr (!Set::well_conditioned) {
+    if (ill_conditioned) out.x += reverse_refined<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
   }
   const Vec3<R> p = axes.from(p_axes);
   out.p = p;
@@ -175,7 +227,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
       reverse(p, u, NoFrame<R>{});
     }
   });
-  if (!uneven) {
+  if (!ill_conditioned) {
     Vec3<R> own = star.template reverse_tets<typename Set::Elastic, wanted>({b.state.x, u.d_raw, p, minus_h2});
     star.total(own);
     out.x += own;

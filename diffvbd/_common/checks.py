@@ -76,7 +76,8 @@ def check_tensor(name: str, value: Any, like: Tensor, what: str = "a number or a
                     raise
                 fail(name, HELD.format(like.dtype, owner), number)
         raise TypeError(f"{name}: expected {what}, got {kind_of(value)}")
-    check_dense(name, value)
+    if value.layout != torch.strided or value.is_nested:
+        check_dense(name, value)
     if value.dtype != like.dtype:
         raise TypeError(f"{name}: expected dtype {like.dtype} ({owner}), got {value.dtype}")
     if value.device != like.device:
@@ -204,8 +205,13 @@ def check_held(values: dict[str, Tensor], given: Any) -> dict[str, Tensor]:
 
 
 def check_time_step(value: Any, dtype: torch.dtype) -> float:
-    """h [s] > 0, with an h^2 that dtype can hold: with less, forces and masses would vanish from a step."""
-    h, limits = check_positive("time_step", value, "s"), torch.finfo(dtype)
+    """h [s] > 0, with an h^2 that dtype can hold."""
+    return check_square(check_positive("time_step", value, "s"), dtype)
+
+
+def check_square(h: float, dtype: torch.dtype) -> float:
+    """h [s], whose square dtype can hold: with less, forces and masses would vanish from a step."""
+    limits = torch.finfo(dtype)
     if not limits.tiny <= h * h <= limits.max:
         fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)
     return h

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 from os import PathLike
@@ -13,8 +14,6 @@ from numpy.typing import NDArray
 from diffvbd.mesh.arrays import FloatArray, IntArray, connected, count, float_array, int_array, positive, warn
 from diffvbd.mesh.io import Source, read_triangles
 from diffvbd.mesh.tet_mesh import TetMesh
-
-from .._common.messages import LOGGER
 
 # Rows: what becomes x, y, z. All are rotations, and each brings the axis of its name to y.
 _TO_Y = {
@@ -244,6 +243,7 @@ def _volume(corners: FloatArray, middle: bool = False) -> float:
     return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)
 
 
+LOG = logging.getLogger("diffvbd")  # as said.LOGGER, without torch
 UNLIKELY = 5.0  # [m]; of a surface whose unit nobody gave, millimetres or inches are likelier from here on
 
 
@@ -294,7 +294,7 @@ def tetrahedralize(
         raise ImportError("tetrahedralize needs pytetwild and pyvista: pip install diffvbd[mesh]") from None
     if limit is not None and len(triangles) > limit:
         points, triangles = _decimated(points, triangles, limit)
-    LOGGER.info("filling %d triangles with tets, wanted edge length %.4g m", len(triangles), edge)
+    LOG.info("filling %d triangles with tets, wanted edge length %.4g m", len(triangles), edge)
     # fTetWild leaves a file in the working directory, so it gets one of its own.
     home = os.getcwd()
     with tempfile.TemporaryDirectory() as scratch:
@@ -308,7 +308,7 @@ def tetrahedralize(
             os.chdir(home)
     if len(tets) == 0:
         raise ValueError("surface: fTetWild found no inside; is the surface closed?")
-    LOGGER.info("fTetWild made %d tets", len(tets))
+    LOG.info("fTetWild made %d tets", len(tets))
     used, compact = np.unique(tets, return_inverse=True)
     return TetMesh(vertices[used], compact.reshape(-1, 4), orient=True)
 

@@ -28,6 +28,8 @@ class System(Model):
         model: The Model.
         solver: A solver of this key; its time step, sweeps, integrator and tape play no part.
         rigid: Whether free bodies have a rigid correction.
+        corrects: Whether there is such a body.
+        starts_from: Start of the sweeps of bodies that are not corrected; "auto" only where there is a choice.
     """
 
     def __init__(self, model: Model, solver: VBD) -> None:
@@ -50,6 +52,14 @@ class System(Model):
             self._bodies, self._other_bodies = bodies.to(self.device), others.to(self.device)
         if self.coarse is not None or self.contact is not None:
             self._arrange_bodies()
+        self.corrects = self._bodies.number > 0
+        self.starts_from = self._start()
+
+    def _start(self) -> str:
+        if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
+            return "inertia" if self.start == "auto" else self.start
+        # with pairs a step decides it itself, by gravity alone
+        return "predictor" if self.contact is not None or not self._other_bodies.number else "auto"
 
     def _check(self) -> None:
         """Raises where a solver does not suit the Model."""
@@ -84,19 +94,6 @@ class System(Model):
     @property
     def surface_of_contact(self) -> ContactSurface | None:  # the Model may replace it, with room for more pairs
         return self.model.surface_of_contact
-
-    @property
-    def corrects(self) -> bool:
-        """Whether steps have a rigid correction, which takes that it is asked for and that some body is free."""
-        return self._bodies.number > 0
-
-    @property
-    def starts_from(self) -> str:
-        """Start of the sweeps of bodies that are not corrected; "auto" only where there is something to choose."""
-        if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
-            return "inertia" if self.start == "auto" else self.start
-        # with pairs a step decides it itself, of gravity's fall alone: step/unsupported.py
-        return "predictor" if self.contact is not None or not self._other_bodies.number else "auto"
 
     @property
     def rest_scalars(self) -> torch.Tensor:

@@ -18,7 +18,7 @@ from .. import ops
 from .._common.constants import VERTEX_ENERGIES
 from .._common.context import checking, recorders, replaced
 from ..adjoint.implicit import global_sweep
-from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep, check_adjoint
+from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep
 from ..adjoint.sweep import fused_step, is_out_of_memory, sweep
 from ..model.system import System
 from ..ops import regimes
@@ -34,6 +34,8 @@ from .coarse import lengths_of, with_corrections
 from .contact import run_contact
 from .predict import Begun, begin
 
+TAPED = TapedSweep()
+
 
 def advance(
     model: System,
@@ -44,13 +46,12 @@ def advance(
     force: Tensor | None,
     gravity: Sequence[float] | Tensor,
     prescribed: Tensor | None,
-    adjoint: Adjoint | None,
+    adjoint: Adjoint = TAPED,
     colliders: Tensor | None = None,
     colliders_before: Tensor | None = None,
     index: int = 0,
 ) -> tuple[Tensor, Tensor]:
     """One solve; ``index`` is the number of its step in a rollout, for debug_checks()."""
-    adjoint = check_adjoint(adjoint)
     gravity = acceleration_of(gravity, x)
     where = collider_state(model, x, colliders, colliders_before)
     if isinstance(adjoint, TapedSweep) and x.is_cuda and _fuses(model, force, gravity):
@@ -76,13 +77,13 @@ def swept(
     begun: Begun,
     prepared: Prepared,
     given: dict[str, Any],
-    adjoint: Adjoint | None = None,
+    adjoint: Adjoint = TAPED,
     index: int = 0,
     colliders: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
     ``colliders``: where they are at the start and at the end, of a Model with contact."""
-    fields, settings, adjoint = begun.fields(model, prepared), prepared.settings, check_adjoint(adjoint)
+    fields, settings = begun.fields(model, prepared), prepared.settings
     if prepared.coarse is not None and colliders is None:  # contact makes corrections of its own
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())

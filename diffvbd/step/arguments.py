@@ -17,8 +17,8 @@ from .._common.checks import (
     check_broadcast,
     check_kind,
     check_readable,
+    check_square,
     check_tensor,
-    check_time_step,
     fail,
     kind_of,
     name_value,
@@ -114,7 +114,7 @@ def material_of(**material: Any) -> Given:
 
 def step_settings(model: System, lead: tuple[int, ...], time_step: float, sweeps: int) -> ops.SweepSettings:
     """Settings of the kernels for scenes of shape ``lead``, the regime on CUDA included."""
-    return model.settings(check_time_step(time_step, model.dtype), sweeps, math.prod(lead))
+    return model.settings(check_square(time_step, model.dtype), sweeps, math.prod(lead))
 
 
 def prepare(
@@ -137,7 +137,10 @@ def prepare(
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
-    mu, lam = moduli_of(model, lead, mu, lam, young, poisson) if model.energy_mask & ELASTIC else (0.0, 0.0)
+    if not model.energy_mask & ELASTIC:
+        mu = lam = 0.0
+    elif mu is None or lam is None or young is not None or poisson is not None:
+        mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
     rest, corners, mass, given_density = None, None, model._mass[None], density
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)

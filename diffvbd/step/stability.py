@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._common.constants import EXACT_BLOCK
+from .._common.constants import ELASTIC, EXACT_BLOCK
 from .._common.context import looks_at, replaced, unheard
 from .._common.messages import is_silent, page, silence, warn
 from ..adjoint.potential import IncrementalPotential
@@ -88,9 +88,9 @@ def growth_message(model: System, prepared: Prepared, integrator: Integrator) ->
     h, sweeps = prepared.time_step_and_sweeps
     if not (0 < sweeps <= MOST_SWEEPS and model.num_tets and model.num_active):
         return ""
-    if not any(isinstance(e, StableNeoHookean) for e in model.energies):
+    if not model.energy_mask & ELASTIC:
         return ""
-    mu, lam = (m.detach().cpu() for m in (prepared.mu, prepared.lam))
+    mu, lam = prepared.mu.detach().cpu(), prepared.lam.detach().cpu()
     if not (mu.numel() and lam.numel()):
         return ""
     key = (type(integrator).__name__, h, sweeps, *_mark(mu), *_mark(lam))
@@ -101,11 +101,12 @@ def growth_message(model: System, prepared: Prepared, integrator: Integrator) ->
     return known[key]
 
 
-def _mark(modulus: Tensor) -> tuple[float, ...]:
+def _mark(values: Tensor) -> tuple[float, ...]:
     """A rough key of moduli."""
-    values = modulus.detach()
-    numbers = [values.item()] if values.numel() == 1 else [*torch.stack([*values.aminmax(), values.mean()]).tolist()]
-    return tuple(round(ALIKE * math.log2(abs(n))) if 0 < abs(n) < math.inf else 0.0 for n in numbers)
+    if values.numel() > 1:
+        return (*_mark(values.amin()), *_mark(values.amax()), *_mark(values.mean()))
+    number = abs(values.item())
+    return (round(ALIKE * math.log2(number)) if 0 < number < math.inf else 0.0,)
 
 
 def _message(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, integrator: Integrator) -> str:
@@ -208,7 +209,7 @@ def growth(model: System, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: 
     size = float((rest[0].amax(0) - rest[0].amin(0)).norm())
     x, v, history = rest + NOISE * size * free * noise, torch.zeros_like(rest), None
     total, logs = torch.zeros(lead, dtype=torch.float64, device="cpu"), [energy(x - rest, v).log()]
-    run = partial(advance, adjoint=None)
+    run = advance
     last = STEPS
     while len(logs) <= last:
         x, v, history, _ = take(integrator, model, x, v, history, prepared, nothing, run)
@@ -263,7 +264,7 @@ def notice_loss(model: System, prepared: Prepared, integrator: Integrator, v: Te
     """
     if end.is_cuda or not end.numel() or not looks_at(end) or is_silent():
         return
-    low, high = (t.item() for t in end.detach().aminmax())
+    low, high = map(float, end.detach().aminmax())
     if high - low <= FAR * size_of(model):
         return
     x = end.detach()
