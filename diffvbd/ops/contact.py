@@ -620,8 +620,8 @@ def _unsupported_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: S
 # What is left of lift [B, V, 3] [m] once forces have borne their part of each body's acceleration, of x, lift, force,
 # mass, planes, origin; held_bodies, body_order, body_ptr, time_step. Sums over a body make its own acceleration a and
 # that of the forces f. Contact takes the share s of f, between 0 and 1, that leaves least of a + s f, and none of a
-# body that is held. lift [1 | B, V, 3]: h^2 times the acceleration [m]; force [B, N, 3]: of pairs at corner points; planes
-# may be empty.
+# body that is held. lift [1 | B, V, 3]: h^2 times the acceleration [m]; force [B, N, 3]: of pairs at corner points;
+# planes may be empty.
 lift_left = Differentiable(
     lambda x, lift, force, mass, planes, origin, *rest: raw.contact_unsupported(x, origin, lift, force, mass, planes,
                                                                                 *rest),
