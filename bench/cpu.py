@@ -19,19 +19,17 @@ from bench.measure import Card, kept_bytes, least
 from bench.tables import Table, times
 
 
-def clamped_cube(
-    n: int, dtype: torch.dtype = torch.float64, energies: tuple = (), **options: Any
-) -> tuple[dv.Model, Tensor]:
+def clamped_cube(n: int, dtype: torch.dtype = torch.float64, energies: tuple = ()) -> tuple[dv.Model, Tensor]:
     """The peers' scene (docs/performance.md): unit cube, five tets a cell, one face pinned; slightly off rest."""
     mesh = dv.mesh.cube(n, split="five")
     model = dv.Model(mesh, pinned=torch.from_numpy(mesh.points[:, 1] < 1e-9), dtype=dtype,
-                     energies=(dv.StableNeoHookean(), *energies), **options)  # fmt: skip
+                     energies=(dv.StableNeoHookean(), *energies))  # fmt: skip
     noise = torch.randn(model.rest_points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return model, model.rest_points + (1e-3 * noise).to(dtype)
 
 
 def time_step(
-    model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...], tape: str = "full"
+    model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...], tape: str = "full", **options: Any
 ) -> tuple[float, float]:
     """Seconds of the forward and of the backward of one step."""
     leaf = {
@@ -43,7 +41,7 @@ def time_step(
     for group in wants:
         given.update({k: t.requires_grad_() for k, t in leaf[group].items()})
     start = time.perf_counter()
-    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), dv.VBD(5e-3, sweeps, tape=tape),
+    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), dv.VBD(5e-3, sweeps, tape=tape, **options),
                            **given)  # type: ignore[arg-type]  # fmt: skip
     middle = time.perf_counter()
     if wants:
@@ -141,17 +139,19 @@ def requirements(n: int, quick: bool) -> list[dict[str, Any]]:
         ("elastic + floor + anchors", (floor, dv.Anchor(10.0)), {}),
         ("elastic, saturated and relaxed", (), {"saturation": 0.1, "relaxation": 1.5}),
     ):
-        model, x = clamped_cube(n, energies=energies, **options)
+        model, x = clamped_cube(n, energies=energies)
         for wants in ((), ("state",), ("state", "material"), ("state", "material", "rest")):
-            forward = least(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)[0], repetitions)
-            backward = (
-                least(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)[1], repetitions) if wants else None
-            )
+
+            def once(m: Any = model, a: Any = x, w: Any = wants, o: Any = options) -> tuple[float, float]:
+                return time_step(m, a, sweeps, w, **o)
+
+            forward = least(lambda once=once: once()[0], repetitions)
+            backward = least(lambda once=once: once()[1], repetitions) if wants else None
             rows.append({
                 "name": f"{label}, gradients: {' + '.join(wants) or 'none'}",
                 "forward_ms": forward * 1e3,
                 "backward_ms": None if backward is None else backward * 1e3,
-                "kept_bytes": kept_bytes(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)),
+                "kept_bytes": kept_bytes(once),
             })  # fmt: skip
     return rows
 

@@ -1,7 +1,6 @@
 """Animations of what diffvbd does, rendered into docs/images/gallery: `python -m bench gallery [--only NAME,...]`.
 
-Those named after an inverse problem stand on its card in docs/gallery.md, the others below the cards. No measurement:
-small scenes at modest resolution, some minutes in all on one core. Needs the extra [viz].
+No measurement: small scenes at modest resolution, some minutes in all on one core. Needs the extra [viz].
 """
 
 from __future__ import annotations

@@ -11,17 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench import paper, tables, tasks, tradeoff
+from bench import paper, tradeoff
 from bench.common import RESULTS, ROOT, commit, is_ancestor
 
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
-# What stands between the markers of each page
-FILLED: dict[Path, Callable[[Path], str]] = {
-    ROOT / "docs" / "results.md": paper.beside,
-    ROOT / "docs" / "guides" / "choose-settings.md": lambda results: fronts(results),
-    ROOT / "docs" / "gallery.md": lambda results: tasks.gallery(results / "tasks"),
-}
-TASKS_PAGE = ROOT / "docs" / "tasks.md"
+RESULTS_PAGE = ROOT / "docs" / "results.md"  # between its markers
 
 
 def main() -> int:
@@ -29,13 +23,12 @@ def main() -> int:
     if wrong := refused(RESULTS):
         print("\n".join([*wrong, "nothing written: measure these again on a clean commit"]), file=sys.stderr)
         return 1
-    for page, text in FILLED.items():
-        page.write_text(filled(page.read_text(encoding="utf-8"), text(RESULTS)), encoding="utf-8")
-    TASKS_PAGE.write_text(tasks.page(RESULTS / "tasks", tasks.IMAGES, ROOT / "docs"), encoding="utf-8")
+    page = RESULTS_PAGE.read_text(encoding="utf-8")
+    RESULTS_PAGE.write_text(filled(page, paper.beside(RESULTS)), encoding="utf-8")
     for path in sorted(RESULTS.glob("tradeoff*.json")):
         results = json.loads(path.read_text(encoding="utf-8"))["results"]
         tradeoff.draw(results, ROOT / "docs" / "images" / f"results_{path.stem}.png")
-    print("\n".join(f"wrote {page.relative_to(ROOT)}" for page in (*FILLED, TASKS_PAGE)))
+    print(f"wrote {RESULTS_PAGE.relative_to(ROOT)}")
     return 0
 
 
@@ -45,16 +38,6 @@ def filled(page: str, text: str) -> str:
     if len(re.findall(pattern, page, re.DOTALL)) != 1:
         raise ValueError(f"page: expected one pair of markers {BEGIN} ... {END}")
     return re.sub(pattern, lambda _: f"{BEGIN}\n\n{text}\n{END}", page, flags=re.DOTALL)
-
-
-def fronts(results: Path) -> str:
-    """Machine and table of the fastest way to an error in each scene, on each device that was measured."""
-    parts = []
-    for path in sorted(results.glob("tradeoff*.json"), key=lambda path: len(path.stem)):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        about = tables.machine(content["environment"]) + tables.measured(content["results"])
-        parts.append(f"{about}\n\n{tradeoff.summary(content['results'])}")
-    return "\n".join(parts)
 
 
 def refused(results: Path, is_ancestor: Callable[[str], bool] = is_ancestor) -> list[str]:

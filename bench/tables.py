@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.common import RESULTS, cell, commit, place
+from bench.common import RESULTS, ROOT, cell, commit, place
 
 Row = Mapping[str, Any]
 Column = str | Callable[[Any], Any]
@@ -158,7 +158,9 @@ def pages(results: Path = RESULTS) -> dict[str, str]:
                              "again") from error  # fmt: skip
         out[name].append(f"## {stem}\n\n{machine(content['environment'])}{measured(content['results'])}\n")
         out[name].append(tables.replace("## ", "### ").replace("####", "###"))
-    return {name: "\n".join(parts).rstrip() + "\n" for name, parts in out.items()}
+    texts = {name: "\n".join(parts).rstrip() + "\n" for name, parts in out.items()}
+    tasks = importlib.import_module("bench.tasks")
+    return texts | {"tasks": tasks.page(results / "tasks", tasks.IMAGES, ROOT / "docs")}
 
 
 def measured(groups: Any) -> str:

@@ -1,8 +1,8 @@
 """`python -m bench tasks [--only NAME,...] [--device D] [--seeds 0,1,2] [--options bodies=10000]`.
 
 Runs inverse problems and keeps their logs, each with the machine it ran on, as results/tasks/NAME.json, with device,
-options and seed added where they are others; the picture of seed 0 goes to docs/images/tasks. `python -m bench
-report` makes docs/tasks.md of them and the cards of docs/gallery.md.
+options and seed added where they are others; the picture of seed 0 goes to docs/images/tasks. The site's build makes a
+page of them.
 """
 
 from __future__ import annotations
@@ -74,13 +74,10 @@ def picture_of(name: str, images: Path) -> Path:
 # --- docs/tasks.md ----------------------------------------------------------------------------------------------------
 
 INTRODUCTION = """\
-# Inverse problems
+# tasks
 
-`diffvbd run NAME` runs one (in a checkout `. .venv/bin/activate` first); its pictures need matplotlib, which the extra
-`[viz]` brings. Each is a short module in `diffvbd/tasks/` that uses only the public interface. Its docstring, repeated
-here, states the protocol. Figures in the tables come from the logs in `bench/results/tasks` of the repository, which
-`python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper are in
-`bench/paper.py`.
+The inverse problems of [tasks](../tasks.md), from their logs in `bench/results/tasks`, which `python -m bench tasks`
+writes; the figures of the paper are in `bench/paper.py`.
 
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
 numbers, bit by bit. Only parts that run for a given time, such as CMA-ES in learn-controller, depend on the speed of
@@ -119,37 +116,6 @@ def page(folder: Path, images: Path, root: Path) -> str:
     return "\n".join([INTRODUCTION, markdown_table(header, rows), *parts]).rstrip() + "\n"
 
 
-def gallery(folder: Path) -> str:
-    """A card for each task: animation or picture, what it does, the figures of its main run, and where its code is."""
-    cards = []
-    for name, paper in PAPER.items():
-        logs = {device: folder / f"{name}{suffix}.json" for device, suffix in (("CPU", ""), ("GPU", "-cuda"))}
-        runs = {d: json.loads(path.read_text(encoding="utf-8")) for d, path in logs.items() if path.exists()}
-        if not runs:
-            continue
-        times = ", ".join(f"{cell(seconds(run))} s on the {device}" for device, run in runs.items())
-        main_run = next(iter(runs.values()))
-        module = TASKS[name].build.__module__.replace(".", "/")
-        said = f" The paper: {paper.outcome}." if paper.outcome.strip("-") else ""
-        count = main_run["variables"]
-        summary = TASKS[name].summary
-        animation = (IMAGES.parent / "gallery" / picture_of(name, IMAGES).name).with_suffix(".webp")
-        shown = animation if animation.exists() else picture_of(name, IMAGES)
-        cards.append(f"""\
-:::{{grid-item-card}} {name}
-
-![{summary}]({shown.relative_to(IMAGES.parents[1]).as_posix()})
-
-{summary[0].upper()}{summary[1:]}.
-
-{count:,} unknown{"s" if count > 1 else ""}, {len(main_run["history"])} evaluations, {times}: {outcome(main_run)}.{said}
-
-[Figures](tasks.md#{name}) · [code](../{module}.py) · `diffvbd run {name}`
-:::
-""")
-    return "::::{grid} 1 1 2 2\n:gutter: 3\n\n" + "\n".join(cards) + "\n::::\n"
-
-
 def place_on_page(entry: tuple[str, dict[str, Any]]) -> tuple[str, int, int, str]:
     stem, log = entry
     return log["settings"]["device"], len(log.get("options", ())), log["settings"]["seed"], stem
@@ -162,7 +128,7 @@ def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: P
     if name in SHARED:
         text.append((SHARED[name].__doc__ or "").strip() + "\n")
     if (picture := picture_of(name, images)).exists():
-        text.append(f"![{TASKS[name].summary}]({picture.relative_to(root).as_posix()})\n")
+        text.append(f"![{TASKS[name].summary}](../{picture.relative_to(root).as_posix()})\n")
     rows = []
     for run in runs.values():
         e, last = run["environment"], run["history"][-1].get("stage", 0)

@@ -29,8 +29,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench import common
 from bench.advice import DHAT, FRAMES, Run, Runs, Scene, advised
-from bench.common import digits
-from bench.tables import Table, markdown_table
+from bench.tables import Table
 from diffvbd import mesh
 
 ELASTIC = dv.StableNeoHookean()
@@ -315,28 +314,6 @@ def front_of(rows: list[Row], by: str = "error", time: str = "ms") -> list[Row]:
         if not out or row[by] < out[-1][by]:
             out.append(row)
     return out
-
-
-def _said(row: Row | None, time: str = "ms") -> str:
-    return "-" if row is None else f"{row['way']}, K = {row['sweeps']}, {row['steps']} steps: {digits(row[time])} ms"
-
-
-def summary(results: dict[str, Any], error: float = 0.01) -> str:
-    """A line for each scene: the fastest way to an error of the motion, implicit Euler alone, what dv.advise says."""
-    table = []
-    for group in results.values():
-        own = [r for r in group["rows"] if "steps" in r and r["way"] not in ASIDE]
-        euler = [r for r in own if r["way"] == "implicit Euler" and isinstance(r["error"], float)]
-        least, fastest = min(r["error"] for r in euler), best(euler, error)
-        told = next(a for a in group["advised"] if a["asked"] == error)
-        table.append((group["scene"], f"{group['vertices']}, {group['duration']:.3g} s", _said(best(own, error)),
-                      f"not in the time allowed (least {least:.1g})" if fastest is None
-                      else f"{digits(fastest['ms'])} ms",
-                      f"{digits(told['ms'])} ms: {told['error']:.1g}" if told["reached"]
-                      else "cannot be had"))  # fmt: skip
-    header = ("scene", "vertices, duration", "the fastest way", "implicit Euler alone",
-              f"`dv.advise` for {100 * error:g} %: its true error")  # fmt: skip
-    return markdown_table(header, table)
 
 
 # --- other solvers of the same law ------------------------------------------------------------------------------------

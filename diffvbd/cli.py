@@ -94,9 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     run.formatter_class = raw
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
     run.add_argument(
-        "--quick",
-        action="store_true",
-        help="a small version that takes seconds and need not be as accurate",
+        "--quick", action="store_true", help="a small version that takes seconds and need not be as accurate"
     )
     _add_run_options(run, "runs/NAME, or runs/NAME-quick")
     for name, texts in sorted(_task_options().items()):
@@ -402,13 +400,13 @@ def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
     values = _given(options, mesh)
     for name in ("kappa", "dhat", "friction"):
         if name in values and "floor" not in values:
-            raise ValueError(f"--{name}: expected --floor beside it, got none")
+            raise ValueError(f"--{name}: expected --floor with it, got none")
     pinned = values.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
     return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **values)
 
 
 def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
-    """What was given of a Scene, the others have defaults; `pinned` [V] of --pin."""
+    """Fields of a Scene that were given; `pinned` [V] of --pin."""
     names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
              "integrator", "subspace")  # fmt: skip
     values = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
@@ -473,15 +471,15 @@ POOR = 0.1  # a mean ratio below which a tet is stiffer than its material
 
 
 def mesh_report(mesh: dv.mesh.TetMesh, enclosed: float, seconds: float) -> str:
-    """Size, volume beside that of the surface [m^3] and quality of tets, as rows of text."""
+    """Size, volume [m^3], also over that of the surface, and quality of tets, as rows of text."""
     quality, extent = mesh.quality, np.ptp(mesh.points, axis=0)
     volume = mesh.volume.sum()
-    beside = f" ({volume / enclosed - 1:+.2%} of the surface's)" if enclosed > 0 else ""
+    over = f" ({volume / enclosed - 1:+.2%} of the surface's)" if enclosed > 0 else ""
     shares = np.quantile(quality, [0.0, 0.05, 0.5])
     rows = {
         "mesh": f"{mesh.num_vertices} vertices, {mesh.num_tets} tets, in {seconds:.1f} s",
         "extent": " x ".join(f"{length:.4g}" for length in extent) + " m",
-        "volume": f"{volume:.6g} m^3{beside}",
+        "volume": f"{volume:.6g} m^3{over}",
         "quality": "mean ratio (1 is regular, 0 is flat): "
         + ", ".join(f"{name} {share:.3f}" for name, share in zip(("least", "5 %", "median"), shares, strict=True))
         + f"; {int((quality < POOR).sum())} tets below {POOR}",

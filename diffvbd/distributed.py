@@ -28,7 +28,7 @@ __all__ = ["backward", "gathered", "own", "share"]
 
 
 def share(count: int) -> slice:
-    """Which of ``count`` rows (scenes, bodies) belong to this rank: as many as to the others, or one more or less.
+    """Rows of ``count`` (scenes, bodies) that belong to this rank: as many as to the others, or one more or less.
 
     Raises:
         TypeError, ValueError: fewer rows than ranks; no integer.

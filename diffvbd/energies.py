@@ -104,7 +104,7 @@ class VertexEnergy:
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        """What it adds to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). Coarse corrections in
+        """Contribution to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). Coarse corrections in
         contact solve with these. Here they are the derivative of gradient()."""
         differentiated = torch.is_grad_enabled()
         with torch.enable_grad():
@@ -122,7 +122,7 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
 
 
 def damped_share(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
-    """What share of its damping a contact has, from 0 to 1, by its normal force at the start of the step [N]."""
+    """Fraction of its damping that a contact has, from 0 to 1, by its normal force at the start of the step [N]."""
     whole = force + FADE * kappa * dhat
     some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
     return torch.where(some, force / torch.where(some, whole, 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""Where constants are made: tensors that outlive the call, whatever modes of torch it is made in."""
+"""Constants: tensors that outlive the call, whatever modes of torch it is made in."""
 
 from __future__ import annotations
 

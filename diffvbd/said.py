@@ -1,8 +1,9 @@
-"""Warnings that point at the user's line, however many calls of the package lie between, and at pages to read."""
+"""Messages: warnings that point at the user's line and at pages to read, and the log."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import traceback
@@ -20,6 +21,17 @@ _INSIDE = (*(str(Path(module).parent) + os.sep for module in (__file__, torch.__
 _PACKAGE = Path(__file__).parent
 # Inside an installed package, beside the package in a checkout.
 PAGES = next((path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), _PACKAGE / "docs")
+
+
+LOGGER = logging.getLogger("diffvbd")
+
+
+def log_progress(message: str, *values: object) -> None:
+    """A line of the log, printed to stderr where the program has not set up logging."""
+    if not LOGGER.hasHandlers():
+        LOGGER.addHandler(logging.StreamHandler())
+        LOGGER.setLevel(logging.INFO)
+    LOGGER.info(message, *values)
 
 
 def page(name: str) -> str:

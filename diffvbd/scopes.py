@@ -1,4 +1,4 @@
-"""What holds inside a ``with``, for the thread or task that is in it: debug_checks(), contact.record() and refine().
+"""State inside a ``with``, for the thread or task that is in it: debug_checks(), contact.record() and refine().
 
 Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
 guards, and so sees what any thread is inside of.
@@ -23,7 +23,7 @@ _recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.
 
 
 class Finer(NamedTuple):
-    """How rollouts run inside dv.refine."""
+    """Refinement of rollouts inside dv.refine."""
 
     steps: int  # times as many, of a time step so much shorter
     sweeps: int  # times as many
@@ -171,7 +171,7 @@ def refined(finer: Finer | None) -> Iterator[None]:
 
 
 class Scope:
-    """What the code that makes one is inside of. A backward may run in another thread, as torch's own on CUDA does;
+    """Context of the code that makes one. A backward may run in another thread, as torch's own on CUDA does;
     inside ``resumed()`` what held in the forward holds there, too."""
 
     def __init__(self) -> None:

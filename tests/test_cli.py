@@ -123,7 +123,7 @@ def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str])
         (["simulate", "MESH", "--out", "a.pvd", "--device", "bogus"], "device: expected one of this machine"),
         (["simulate", "MESH", "--out", "a.pvd", "--steps", str(2**62)], "--steps: expected an integer from 0 to"),
         (["simulate", "MESH", "--out", "a.pvd", "--steps", "-1"], "--steps"),
-        (["simulate", "MESH", "--out", "a.pvd", "--friction", "0.5"], "--friction: expected --floor beside it"),
+        (["simulate", "MESH", "--out", "a.pvd", "--friction", "0.5"], "--friction: expected --floor with it"),
         (["simulate", "MESH", "--out", "a.pvd", "--relaxation", "2"], "relaxation"),
         (["simulate", "MESH", "--out", "there.pvd"], "there.pvd would be overwritten; give --force"),
         (["simulate", "MESH", "--out", "frames.pvd"], "frames_0003.vtu would be overwritten; give --force"),
@@ -327,8 +327,8 @@ def test_advise(beam_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--kappa", "100"], "--kappa: expected --floor beside it"),
-        (["--friction", "0.5"], "--friction: expected --floor beside it"),
+        (["--kappa", "100"], "--kappa: expected --floor with it"),
+        (["--friction", "0.5"], "--friction: expected --floor with it"),
         (["--floor", "nan"], "--floor: expected finite numbers, got nan"),
         (["--gravity", "0", "inf", "0"], "--gravity: expected finite numbers"),
     ],

@@ -5,6 +5,7 @@ import runpy
 import warnings
 
 import pytest
+from helpers.marks import quick_and_slow
 from helpers.paths import ROOT
 
 FOLDER = ROOT / "examples"
@@ -27,7 +28,10 @@ def run(name: str, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", EXPECTED)
+QUICK = ["first_gradient", "identify_material", "contact_drop", "custom_energy"]
+
+
+@pytest.mark.parametrize("name", quick_and_slow(QUICK, EXPECTED))
 def test_an_example_prints_the_right_numbers(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = run(name, capsys)
     numbers = [float(text) for text in NUMBER.findall(printed)]

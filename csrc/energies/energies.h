@@ -46,7 +46,7 @@ constexpr int free_mask(int n) { return 1 + n % kElasticVariants + (n / kElastic
 constexpr int elastic_index(int mask) { return (mask & kPaperBlock) != 0 ? 1 : 0; }
 constexpr int energy_index(int mask) { return elastic_index(mask) + mask / kContact * kElasticVariants; }
 constexpr int free_index(int mask) { return elastic_index(mask) + (mask >> kFirstVertexBit) * kElasticVariants; }
-// A quick build, for work on an energy (docs/extending.md), leaves out the paper's block.
+// A quick build, for work on an energy (docs/guides/extend.md), leaves out the paper's block.
 #ifdef DIFFVBD_QUICK
 constexpr bool is_compiled(int mask) { return (mask & kPaperBlock) == 0; }
 #else

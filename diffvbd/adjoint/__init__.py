@@ -1,1 +1,1 @@
-"""How a step is differentiated: the transposed sweeps as autograd functions, and other routes to compare with."""
+"""Derivatives of a step: the transposed sweeps as autograd functions, and other routes to compare with."""

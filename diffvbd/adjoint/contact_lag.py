@@ -1,4 +1,4 @@
-"""What sweeps with contact keep of the start of a step: forces, normals and weights of pairs, differentiable."""
+"""Lagged contact: what sweeps keep of the start of a step: forces, normals and weights of pairs, differentiable."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class ContactState(NamedTuple):
 
 
 class StepContact:
-    """What a step of a Model knows of contact before it moves anything.
+    """Contact of a step of a Model before anything moves.
 
     Args:
         data: The energies' data [1 | B, n].  parameters: Those of the energies, [1 | B, ...].

@@ -186,7 +186,7 @@ def _cycle(
     goal: Tensor,
     max_iterations: int,
 ) -> tuple[Tensor, int, Tensor]:
-    """What the recurrence from zero makes of A x = r: x, the most iterations of a scene, the lowest curvature met."""
+    """Solution of A x = r by the recurrence from zero: x, the most iterations of a scene, the lowest curvature met."""
     x, rr = torch.zeros_like(r), _dot(r, r)
     p = z = precondition(r)
     rz = _dot(r, z)
@@ -213,7 +213,7 @@ def _cycle(
 
 
 class _Structure(NamedTuple):
-    """Which blocks of the Hessian of one scene exist, pinned rows and columns left out, and what they sum."""
+    """Blocks of the Hessian of one scene that exist, without pinned rows and columns, and what they sum."""
 
     row_ptr: Tensor  # [V + 1]
     columns: Tensor  # [N]

@@ -1,4 +1,4 @@
-"""By how much the incremental potential of each body rises from one state to another, without gradients."""
+"""Increase of the incremental potential of each body from one state to another, without gradients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..ops.sweep import potential_rise
 
 
 class RiseParts(NamedTuple):
-    """What comparisons of the potential in one step have in common."""
+    """Common data of the comparisons of the potential in one step."""
 
     model: System
     fields: ops.SweepFields  # detached; where the sweeps start does not enter
@@ -34,7 +34,7 @@ class RiseParts(NamedTuple):
         return rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # False where it is not a number
 
     def raises(self, x: Tensor, to: Tensor) -> Tensor:
-        """Which vertices are of a body whose potential does not let it go from x to ``to``, bool [B, V]."""
+        """Vertices of bodies whose potential does not let them go from x to ``to``, bool [B, V]."""
         admitted, bodies = self.admits(x, to), self.bodies
         if bodies.number == 0:
             return admitted.new_zeros(x.shape[:2])
@@ -58,7 +58,7 @@ def rise_parts(model: System, fields: ops.SweepFields, time_step: float) -> Rise
 
 
 def rise_of_bodies(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:
-    """By how much the potential of each body rises, and the sizes of its terms, float64 [B, bodies, 2]; infinite where
+    """Increase of the potential of each body, and the sizes of its terms, float64 [B, bodies, 2]; infinite where
     a vertex comes too near a plane."""
     model, moving = parts.model, parts.model._moving
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)

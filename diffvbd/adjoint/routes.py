@@ -59,7 +59,7 @@ class Unrolled:
 
 @dataclass(frozen=True)
 class LinearSolve:
-    """How the linear solves of one step's backward ended; what GlobalAdjoint hands to its ``report``.
+    """Outcome of the linear solves of one step's backward, which GlobalAdjoint hands to its ``report``.
 
     Attributes:
         iterations: Of conjugate gradients, the most over all scenes.

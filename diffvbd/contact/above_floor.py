@@ -1,4 +1,4 @@
-"""What floors leave of the ways of bodies that move as wholes, differentiable."""
+"""Displacements of whole bodies as floors limit them, differentiable."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from ..ops.contact import ways_above_floor
 
 def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
                 ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """What a floor leaves of ways of bodies as wholes, less u [B, V, 3] [m], and which bodies it stops [B, bodies]:
-    they are shifted along its normals until no vertex closes more than a part of its gap, which leaves sliding and
-    turning as they are. Differentiable, evenly where several vertices decide. docs/method.md, section 12.
+    """Displacements of whole bodies as a floor limits them, less u [B, V, 3] [m], and which bodies it stops [B,
+    bodies]: they are shifted along its normals until no vertex closes more than a part of its gap, which leaves sliding
+    and turning as they are. Differentiable, evenly where several vertices decide. docs/method.md, section 12.
 
     Args:
         x, way: [B, V, 3] [m].  u: [B, bodies, 3] [m], part of the way, which the floor lets pass; or empty.

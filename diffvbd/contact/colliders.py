@@ -22,7 +22,7 @@ MOST_LENGTH = 1e9  # [m] of coordinates and radii: fourth powers of distances mu
 
 
 class Corners(NamedTuple):
-    """What a collider is made of; indices are into ``points``."""
+    """Geometry of a collider; indices are into ``points``."""
 
     points: NDArray[np.float64]  # [n, 3] [m]
     triangles: NDArray[np.int64]  # [F, 3]

@@ -125,7 +125,7 @@ def barrier_stiffness(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor
 
 
 class Lag(NamedTuple):
-    """What damping and friction of a step take from its start, for Q pairs that were near there."""
+    """Lagged values that damping and friction of a step take from its start, for Q pairs that were near there."""
 
     pairs: NearPairs
     start: Tensor  # corner points at the start [B, N, 3]

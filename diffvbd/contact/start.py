@@ -1,4 +1,4 @@
-"""Where a part of a step with contact starts: translations of islands, what the floor lets through, how far all may go
+"""Start of a substep with contact: translations of islands, what the floor lets through, how far all may go
 at once."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .surface import ContactSurface
 
 
 class PartStart(NamedTuple):
-    """Where the sweeps of a part start."""
+    """Start of the sweeps of a substep."""
 
     x: Tensor  # [B, V, 3] [m]
     center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start

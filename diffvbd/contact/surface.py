@@ -66,7 +66,7 @@ class ContactSurface:
         return scene, corners[0] + corners[1]
 
     def owners_of(self, first: int, second: int) -> str:
-        """What two corner points belong to, for messages."""
+        """Owners of two corner points, for messages."""
         bodies = [int(self.body[corner]) for corner in (first, second)]
         named = [f"body {b}" if b < self.bodies else f"collider {b - self.bodies}" for b in bodies]
         return " and ".join(dict.fromkeys(named))

@@ -1,1 +1,1 @@
-"""What a user asks about a result: is it right, how far off, what is in contact."""
+"""Questions about a result: is it right, how far off, what is in contact."""

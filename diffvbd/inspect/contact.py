@@ -1,4 +1,4 @@
-"""What contact has done, and contact between whole bodies: ``diffvbd.contact``."""
+"""State of contact, and contact between whole bodies: ``diffvbd.contact``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Status:
-    """How the latest step of a Model went.
+    """State of contact after the latest step of a Model.
 
     Attributes:
         pairs: The most pairs of one detection, of all scenes.
@@ -59,8 +59,8 @@ class Status:
 
 
 def status(model: Model) -> Status:
-    """How the latest step of ``model`` went, in a replayed CUDA graph that of the replay; a backward with checkpoints
-    runs steps again, and counts. Waits for the device.
+    """State of contact after the latest step of ``model``, in a replayed CUDA graph that of the replay; a backward with
+    checkpoints runs steps again, and counts. Waits for the device.
 
     Raises:
         ValueError: If the Model has taken no step with contact yet.

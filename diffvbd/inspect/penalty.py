@@ -47,7 +47,7 @@ class _Rows(NamedTuple):
 
 
 class Bodies:
-    """Which body each vertex belongs to, and the masses; made once, for many calls.
+    """Bodies of the vertices, and the masses; made once, for many calls.
 
     Args:
         body: Label of each vertex, shape [V], integers. The bodies are numbered by ascending label.

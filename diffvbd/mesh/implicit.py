@@ -107,7 +107,7 @@ def _lattice(origin: FloatArray, cells: IntArray, step: float) -> tuple[FloatArr
 
 
 def _cut(function: ImplicitFunction, inner: FloatArray, outer: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the surface crosses the segments from inner to outer points: fraction of the way, and the points."""
+    """Points at which the surface crosses the segments from inner to outer points, and their fractions of a segment."""
     low, high = np.zeros(len(inner)), np.ones(len(inner))
     for _ in range(_BISECTIONS if len(inner) else 0):
         middle = (low + high) / 2

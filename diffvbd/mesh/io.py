@@ -22,11 +22,7 @@ _BODY_DATA = ("body", "gmsh:physical", "medit:ref")
 
 @overload
 def load(
-    source: Source,
-    *,
-    orient: bool = True,
-    return_vertices: Literal[False] = False,
-    weld: float | None = None,
+    source: Source, *, orient: bool = True, return_vertices: Literal[False] = False, weld: float | None = None
 ) -> TetMesh: ...
 @overload
 def load(

@@ -39,7 +39,7 @@ def write_series(
 ) -> None:
     """Write a motion; the extension tells for whom.
 
-    * .pvd, for ParaView: the tets, as `path` and one file `<stem>_<k>.vtu` for each frame beside it.
+    * .pvd, for ParaView: the tets, as `path` and one file `<stem>_<k>.vtu` for each frame next to it.
     * .usdc, .usd (binary) and .usda (text): the surface of each body as a `Mesh` of its own with points that change in
       time. Needs the extra: `pip install diffvbd[exchange]`.
     * .glb (binary) and .gltf (text): the surface of each body with one morph target for each frame after the first, and
@@ -269,11 +269,7 @@ RATE = 24.0  # frames per second of a single frame
 
 
 def write_usd(
-    path: Path,
-    parts: Sequence[Part],
-    frames: FloatArray,
-    times: NDArray[Any],
-    point_data: Mapping[str, NDArray[Any]],
+    path: Path, parts: Sequence[Part], frames: FloatArray, times: NDArray[Any], point_data: Mapping[str, NDArray[Any]]
 ) -> None:
     """Write parts whose vertices move; frames [N, V, 3] m, times [N] s, increasing, point_data [N, V] or [N, V, C].
 

@@ -125,7 +125,7 @@ def _read_cells(path: Path) -> tuple[meshio.Mesh, list[str]]:
 
 
 def _kind(path: Path) -> str:
-    """What meshio calls the format."""
+    """Name of the format in meshio."""
     suffix = path.suffix.lower()
     if suffix == ".vtk":
         with path.open("rb") as file:
@@ -222,7 +222,7 @@ class _Bytes(io.BufferedReader):
 
 
 class Counts(NamedTuple):
-    """How many nodes and cells a file says that it has; None where it does not say."""
+    """Numbers of nodes and cells in the header of a file; None where it does not say."""
 
     nodes: int | None = None
     cells: int | None = None
@@ -244,7 +244,7 @@ def counts_named(path: Path, kind: str) -> Counts:
 
 
 def faces_named(path: Path) -> int | None:
-    """How many faces a surface file names, or has lines for."""
+    """Number of faces that a surface file names, or has lines for."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     if suffix == ".obj":
         return len(re.findall(rb"^[ \t]*f[ \t]+\S+[ \t]+\S+[ \t]+\S", data, re.M))

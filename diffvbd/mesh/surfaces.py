@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import tempfile
 from os import PathLike
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from diffvbd.mesh.arrays import FloatArray, IntArray, connected, count, float_array, int_array, positive, warn
 from diffvbd.mesh.io import Source, read_triangles
 from diffvbd.mesh.tet_mesh import TetMesh
+from diffvbd.said import LOGGER
 
 # Rows: what becomes x, y, z. All are rotations, and each brings the axis of its name to y.
 _TO_Y = {
@@ -67,10 +67,7 @@ class Repair(NamedTuple):
 
 
 def repair(
-    surface: Source | tuple[Any, Any],
-    size: float | None = None,
-    scale: float | None = None,
-    up: str = "y",
+    surface: Source | tuple[Any, Any], size: float | None = None, scale: float | None = None, up: str = "y"
 ) -> Repair:
     """Bring a triangle surface to metres and to y up, and repair it. Needs the extra: `pip install diffvbd[mesh]`.
 
@@ -102,7 +99,7 @@ def repair(
     if not isinstance(up, str) or up not in _TO_Y:
         raise ValueError(f"up: expected one of {', '.join(_TO_Y)}, got {up!r}")
     if size is not None and scale is not None:
-        raise ValueError(f"size: expected none beside scale = {scale!r}, got {size!r}")
+        raise ValueError(f"size: expected none with scale = {scale!r}, got {size!r}")
     points, triangles = surface_arrays(surface)
     factor = positive("scale", 1.0 if scale is None else scale)
     if size is None and scale is None:
@@ -149,7 +146,7 @@ def repair(
 
 
 def _even(triangles: IntArray) -> NDArray[np.bool_]:
-    """Whether a triangle counts its vertices in ascending order, up to where it begins, shape [F]."""
+    """Mask [F] of triangles that count their vertices in ascending order, up to where they begin."""
     a, b, c = triangles.T
     return (a < b) ^ (a < c) ^ (b < c)
 
@@ -166,7 +163,7 @@ def _turn_outwards(content: Any, graph: Any) -> tuple[int, NDArray[np.bool_]]:
     low, high = (np.array([edge(c, axis=(0, 1)) for c in corners]) for edge in (np.min, np.max))
 
     def within(k: int) -> NDArray[np.bool_]:
-        """Which pieces lie in piece k; one at a time, because noisy scans have thousands."""
+        """Mask of the pieces in piece k; one at a time, because noisy scans have thousands."""
         return np.asarray(np.all((low > low[k]) & (high < high[k]), axis=1))
 
     inner = np.zeros(len(groups), dtype=bool)
@@ -193,7 +190,7 @@ def _turn_outwards(content: Any, graph: Any) -> tuple[int, NDArray[np.bool_]]:
 
 
 def _meets_outside(points: FloatArray, faces: IntArray) -> NDArray[np.bool_]:
-    """Whether the front, and the back, of each triangle [F, 3] meets the outside, shape [2, F].
+    """Masks [2, F] of the triangles [F, 3] whose front, and whose back, meets the outside.
 
     Sides that face each other around an edge bound one chamber, and the chamber of negative volume is the outside.
     Interfaces between two chambers meet it with neither side. Only surfaces without open edges on which more than two
@@ -229,7 +226,7 @@ def _meets_outside(points: FloatArray, faces: IntArray) -> NDArray[np.bool_]:
 
 
 def _winding(corners: FloatArray, point: FloatArray) -> float:
-    """How often triangles [F, 3, 3] wind around a point [3]: 1 inside of a closed surface, 0 outside.
+    """Winding number of triangles [F, 3, 3] around a point [3]: 1 inside of a closed surface, 0 outside.
 
     Source: Van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng. 30, 1983.
     """
@@ -246,7 +243,6 @@ def _volume(corners: FloatArray, middle: bool = False) -> float:
     return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)
 
 
-LOG = logging.getLogger("diffvbd")
 UNLIKELY = 5.0  # [m]; of a surface whose unit nobody gave, millimetres or inches are likelier from here on
 
 
@@ -297,7 +293,7 @@ def tetrahedralize(
         raise ImportError("tetrahedralize needs pytetwild and pyvista: pip install diffvbd[mesh]") from None
     if limit is not None and len(triangles) > limit:
         points, triangles = _decimated(points, triangles, limit)
-    LOG.info("filling %d triangles with tets, wanted edge length %.4g m", len(triangles), edge)
+    LOGGER.info("filling %d triangles with tets, wanted edge length %.4g m", len(triangles), edge)
     # fTetWild leaves a file in the working directory, so it gets one of its own.
     home = os.getcwd()
     with tempfile.TemporaryDirectory() as scratch:
@@ -311,7 +307,7 @@ def tetrahedralize(
             os.chdir(home)
     if len(tets) == 0:
         raise ValueError("surface: fTetWild found no inside; is the surface closed?")
-    LOG.info("fTetWild made %d tets", len(tets))
+    LOGGER.info("fTetWild made %d tets", len(tets))
     used, compact = np.unique(tets, return_inverse=True)
     return TetMesh(vertices[used], compact.reshape(-1, 4), orient=True)
 

@@ -45,7 +45,7 @@ PREFERRED_FORMAT = {".msh": "gmsh"}
 _SURFACES = (".obj", ".ply", ".stl")  # which get the boundary
 # meshio would write these without a word, and without the tets.
 _NO_TETS = (".off", ".svg", ".wkt")
-# meshio writes another file beside these, whose name follows from theirs.
+# meshio writes another file with these, whose name follows from theirs.
 _OF_TWO_FILES = (".xdmf", ".xmf", ".node", ".ele")
 # What meshio writes values per vertex and per tet to. Into other formats it would write the mesh without them.
 _WITH_FIELDS = (".msh", ".vtk", ".vtu", ".xdmf")
@@ -80,7 +80,7 @@ def save(
         TypeError: no path or no TetMesh; values or positions that are no real numbers, values that have no names.
         ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values or
             positions of another shape or not finite, a name that is empty, not printable or none in this format (in
-            .vtk with spaces, in .msh with quotes), cell data `body` beside labels, or meshio fails.
+            .vtk with spaces, in .msh with quotes), cell data `body` with labels, or meshio fails.
         ImportError: the format needs a package that is not installed (h5py for .xdmf and .med).
         FileNotFoundError: the directory does not exist.
     """
@@ -146,7 +146,7 @@ def content_of(
     point_data: Mapping[str, NDArray[Any]] | None = None,
     cell_data: Mapping[str, NDArray[Any]] | None = None,
 ) -> meshio.Mesh:
-    """What meshio writes of a mesh whose vertices are at `points`, with values that `checked_fields` has seen."""
+    """Content for meshio: a mesh whose vertices are at `points`, with values that `checked_fields` has seen."""
     if mesh.num_tets == 0:
         raise ValueError("mesh: expected at least one tet to write, got none")
     of_tets: dict[str, Any] = {name: [values] for name, values in (cell_data or {}).items()}

@@ -1,4 +1,4 @@
-"""What a Model is given, checked and in the form that it keeps."""
+"""Arguments of a Model, checked and in the form that it keeps."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class CoarseSpace:
         object.__setattr__(self, "every", check_count("every", self.every, 1, maximum=MOST_OF_ANY))
 
     def corrections(self, sweeps: int) -> int:
-        """How many corrections a step of so many sweeps has."""
+        """Number of corrections of a step of so many sweeps."""
         return ops.corrections_of(sweeps, self.every)
 
 

@@ -31,7 +31,7 @@ def _copy(name: str, text: str) -> Any:
 
 
 class Model:
-    """What is simulated: a mesh with its masses, pins, energies and colliders, colored and laid out for the sweeps.
+    """A scene: a mesh with its masses, pins, energies and colliders, colored and laid out for the sweeps.
 
     A Model holds constants and refuses tensors that require grad; what is differentiated is an input of
     :func:`diffvbd.step`, the rest shape too. How it is stepped is said by a :class:`diffvbd.VBD`.
@@ -53,6 +53,8 @@ class Model:
     Raises:
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
+
+    _executed_by: Any  # (solver) -> System; system.py adds it
 
     rest_points: Tensor = _copy("_rest_points", "Rest positions [m], shape [V, 3].")
     density: Tensor = _copy("_density", "[kg/m^3], shape [T].")
@@ -167,19 +169,19 @@ class Model:
 
     @property
     def plane_points(self) -> Tensor:
-        """Which rows of collider_points span planes, bool [Vc]."""
+        """Rows of collider_points that span planes, bool [Vc]."""
         surface = self.surface_of_contact
         return self._pinned.new_zeros((0,)) if surface is None else surface.plane_points[self.num_vertices :].clone()
 
     @property
     def collider_radius(self) -> Tensor:
-        """How far the surface of a collider lies outside its corner points [m], shape [Vc]."""
+        """Distance of a collider's surface from its corner points [m], shape [Vc]."""
         surface = self.surface_of_contact
         return self._mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :].clone()
 
     @property
     def most_room(self) -> float:
-        """How far a vertex may at most go beside its island between two detections of the PairBarrier [m]."""
+        """Largest displacement of a vertex relative to its island between two detections of the PairBarrier [m]."""
         surface, barrier = self.surface_of_contact, self.contact
         if surface is None or barrier is None:
             fail("model", "a PairBarrier among its energies", "none")

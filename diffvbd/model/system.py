@@ -90,7 +90,7 @@ class System(Model):
 
     @property
     def starts_from(self) -> str:
-        """Where the sweeps of bodies that are not corrected start; "auto" only where there is something to choose."""
+        """Start of the sweeps of bodies that are not corrected; "auto" only where there is something to choose."""
         if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
             return "inertia" if self.start == "auto" else self.start
         # with pairs a step decides it itself, of gravity's fall alone: step/unsupported.py
@@ -112,7 +112,7 @@ class System(Model):
         return self.derived("on_cpu", lambda: self.to("cpu"))
 
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
-        """What the kernels execute besides tensors; ``scenes`` chooses the regime on CUDA."""
+        """Settings of the kernels; ``scenes`` chooses the regime on CUDA."""
         saturation = -1.0 if self.saturation is None else self.saturation
         # a lone over-relaxed sweep would leave the correction a shape that the next step starts wrong from
         last = min(self.relaxation, 1.0) if self.corrects or self.coarse is not None else self.relaxation
@@ -133,3 +133,6 @@ def system_of(model: Model, solver: VBD) -> System:
     check_kind("solver", solver, VBD)
     model = model.model if isinstance(model, System) else model
     return model.derived(solver.key, partial(System, model, solver))
+
+
+Model._executed_by = system_of  # for the reference, which imports nothing of the package

@@ -154,7 +154,7 @@ def _affine_maps(model: Model) -> list[tuple[Tensor, Tensor, Tensor]]:
 
 
 def _crossed(model: Model, mu: Tensor, lam: Tensor, time_step: float, height: float) -> float:
-    """How many tets of a height [m] a pressure wave crosses in a step."""
+    """Number of tets of a height [m] that a pressure wave crosses in a step."""
     modulus = float((lam.detach() + 2 * mu.detach()).median())
     return time_step * (max(0.0, modulus) / float(model._density.median())) ** 0.5 / height
 
@@ -184,7 +184,7 @@ def _shapes_of_tets(model: Model) -> tuple[np.ndarray, float, float]:
 
 
 def inside_out(tets: Tensor, x: Tensor) -> Tensor:
-    """Which tets [T, 4] of states [..., V, 3] have a volume of 0 or less, bool [..., T]."""
+    """Tets [T, 4] of states [..., V, 3] with a volume of 0 or less, bool [..., T]."""
     corners = x.detach()[..., tets, :]
     a, b, c = (corners[..., 1:, :] - corners[..., :1, :]).unbind(-2)
     return (torch.linalg.cross(a, b) * c).sum(-1) <= 0

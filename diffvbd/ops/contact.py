@@ -307,7 +307,8 @@ class Whole(NamedTuple):
 
 def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
                 ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """What a floor leaves of ways of bodies as wholes, less u [B, V, 3] [m], and which bodies it stops [B, bodies].
+    """Displacements of whole bodies as a floor limits them, less u [B, V, 3] [m], and which bodies it stops [B,
+    bodies].
 
     Args:
         x, way: [B, V, 3] [m].  u: [B, bodies, 3] [m], part of the way, which the floor lets pass; or empty.

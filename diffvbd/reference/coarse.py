@@ -132,7 +132,7 @@ class Coarse:
         return torch.where(lengths > 0, state + lengths * p, state), steps
 
     def _pressed(self, state: Tensor, x_prev: Tensor) -> Tensor:
-        """What the energies of vertices add to the matrix [..., 3F, 3F]: W^T H W of their blocks."""
+        """Addition of the energies of vertices to the matrix [..., 3F, 3F]: W^T H W of their blocks."""
         total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
         for k, color in enumerate(self.scene.layout.colors):
             for energy in self.of_vertices:

@@ -59,7 +59,7 @@ class Corrections:
         return self.coarse.correct(state, self.y, self.x_prev, matrix, lengths.to(state))[0]
 
     def _pressed(self, state: Tensor) -> Tensor:
-        """What pairs press back with against the functions [..., 3F, 3F]."""
+        """Stiffness of pairs against the functions [..., 3F, 3F]."""
         weight = self.coarse.weight
         out = weight.new_zeros((state.shape[:-2].numel(), weight.shape[1], 3, weight.shape[1], 3))
         for force in self.forces:

@@ -17,10 +17,7 @@ TO_POINT, TO_EDGE, TO_FACE, BETWEEN_EDGES, TO_PLANE = range(5)  # its closest fe
 PARALLEL = 1e-16  # squared sine below which two directions span no plane
 
 # A point and the ends of an edge, as local corners: what is left when the closest points are not inside both features.
-_BORDERS = {
-    POINT_TRIANGLE: ((0, 1, 2), (0, 2, 3), (0, 3, 1)),
-    EDGE_EDGE: ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1)),
-}
+_BORDERS = {POINT_TRIANGLE: ((0, 1, 2), (0, 2, 3), (0, 3, 1)), EDGE_EDGE: ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1))}
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -40,10 +37,7 @@ def closest_features(kind: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     """The closest features [Q] of pairs, and the local corners [Q, 4] in the order that the feature's formula takes."""
     feature = torch.full_like(kind, TO_PLANE)
     index = torch.arange(4, device=kind.device).expand(len(kind), 4).clone()
-    for this, inside_of, inner in (
-        (POINT_TRIANGLE, _inside_face, TO_FACE),
-        (EDGE_EDGE, _inside_edges, BETWEEN_EDGES),
-    ):
+    for this, inside_of, inner in ((POINT_TRIANGLE, _inside_face, TO_FACE), (EDGE_EDGE, _inside_edges, BETWEEN_EDGES)):
         rows = (kind == this).nonzero()[:, 0]
         inside = inside_of(*corners[rows].unbind(1))
         border, order = _closest_border(corners[rows], torch.tensor(_BORDERS[this], device=kind.device))
@@ -53,7 +47,7 @@ def closest_features(kind: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inside_face(p: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Whether p projects into the interior of a triangle: positive areas against each of its edges."""
+    """True if p projects into the interior of a triangle: positive areas against each of its edges."""
     ab, ac = b - a, c - a
     normal = _cross(ab, ac)
     areas = [_dot(_cross(s - p, t - p), normal) > 0 for s, t in ((a, b), (b, c), (c, a))]
@@ -61,7 +55,7 @@ def _inside_face(p: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _inside_edges(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Whether the lines through two edges are closest inside both."""
+    """True if the lines through two edges are closest inside both."""
     u, v, r = b - a, d - c, c - a
     normal = _cross(u, v)
     size = _dot(normal, normal)
@@ -228,7 +222,7 @@ class _Predicates:
         self.integers: np.ndarray | None = None
 
     def cross(self, ends: np.ndarray, corners: np.ndarray) -> np.ndarray:
-        """Whether edges [n, 2] cross triangles [n, 3], as `intersections` defines it."""
+        """Mask of edges [n, 2] that cross triangles [n, 3], as `intersections` defines it."""
         p, q = ends.T
         sides = [self.side(np.column_stack((corners, end))) for end in (p, q)]
         crossing = sides[0] * sides[1] < 0

@@ -188,7 +188,7 @@ class FloorBarrier:
         return torch.where(self._closes(x, fraction.unsqueeze(-2) * step), 0.0, fraction)
 
     def _closes(self, x: Tensor, step: Tensor) -> Tensor:
-        """Where rounding may still close a gap of few ulps, [..., n]; such a vertex stays where it is."""
+        """Mask [..., n] of vertices at which rounding may still close a gap of few ulps; they stay where they are."""
         with torch.no_grad():
             size = (self.normal * x.unsqueeze(-3)).abs().sum(-2) + self.height.abs()
             return (self.gap(x + step) <= GUARD * torch.finfo(x.dtype).eps * size).any(-2)
@@ -275,11 +275,7 @@ class Anchor:
         return each, torch.arange(x.shape[-1], device=x.device)
 
 
-ENERGIES: dict[str, type] = {
-    "stable_neo_hookean": StableNeoHookean,
-    "floor": FloorBarrier,
-    "anchor": Anchor,
-}
+ENERGIES: dict[str, type] = {"stable_neo_hookean": StableNeoHookean, "floor": FloorBarrier, "anchor": Anchor}
 
 
 def build_energies(scene: Scene, elsewhere: tuple[str, ...] = ()) -> list[Any]:

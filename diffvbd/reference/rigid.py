@@ -224,13 +224,13 @@ def turned(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> Tensor:
 
 
 def clear(energy: Any, x: Tensor) -> Tensor:
-    """Where a gap is more than rounding, [..., planes, n]."""
+    """Mask [..., planes, n] of gaps above rounding."""
     size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
     return energy.gap(x) > GUARD * torch.finfo(x.dtype).eps * size
 
 
 def admits(energies: list[Any], state: Tensor, before: Tensor, body: Tensor) -> Tensor:
-    """Whether all vertices of a body keep LEAST_SHARE of their gaps before, and more than rounding, [...]."""
+    """True [...] if all vertices of a body keep LEAST_SHARE of their gaps before, and more than rounding, [...]."""
     out = torch.ones_like(state[..., 0, 0], dtype=torch.bool)
     for energy in energies:
         if hasattr(energy, "gap"):

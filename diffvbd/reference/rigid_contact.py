@@ -84,7 +84,7 @@ class Correction:
         return g, matrix
 
     def _of_free(self, g: Tensor, matrix: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-        """What others have is zero, and their part of the matrix the identity."""
+        """Entries of others are zero, and their part of the matrix is the identity."""
         free = self.free.to(g.device)
         both = (free[:, None] & free)[..., None, None]
         at = torch.arange(self.count, device=g.device)
@@ -129,7 +129,7 @@ class Correction:
 
 
 def _least(system: Callable[[Tensor], tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
-    """Where the gradient vanishes: by Newton's method, of which the last step, of no length, carries the derivative."""
+    """Zero of the gradient: by Newton's method, of which the last step, of no length, carries the derivative."""
 
     def newton(motion: Tensor) -> tuple[Tensor, Tensor]:
         g, matrix = system(motion)

@@ -10,8 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import input_name
-
 
 @dataclass(frozen=True)
 class Color:
@@ -107,7 +105,7 @@ def solve6(matrix: Tensor, rhs: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Scene:
-    """What stays the same over the steps of one run. Component-major; leading dimensions are scenes."""
+    """Constants of the steps of one run. Component-major; leading dimensions are scenes."""
 
     model: Any
     layout: Layout
@@ -123,7 +121,8 @@ class Scene:
 
     def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
-        return self.tensor(self.parameters.get(input_name(energy, key), getattr(energy, key)))
+        name = energy.name if key == "coefficient" else f"{energy.name}_{key}"
+        return self.tensor(self.parameters.get(name, getattr(energy, key)))
 
     def tensor(self, value: Any) -> Tensor:
         return torch.as_tensor(value, dtype=self.like.dtype, device=self.like.device)

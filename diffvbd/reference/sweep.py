@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..model.model import Model
-from ..model.system import system_of
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
 from .energies import StableNeoHookean, build_energies, floor_friction
 from .rigid import Correction
@@ -26,7 +24,7 @@ class Trajectory(NamedTuple):
 
 def executed(model: Any, solver: Any) -> Any:
     """The model with the attributes that the solver decides; what is no Model has them already."""
-    return system_of(model, solver) if isinstance(model, Model) else model
+    return model._executed_by(solver) if hasattr(model, "_executed_by") else model
 
 
 def step(
@@ -286,7 +284,7 @@ def _rise(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor
 
 
 def started(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
-    """What the start of a step may take of a step [..., 3, n] from x [..., 3, n]."""
+    """Admissible part of a step [..., 3, n] from x [..., 3, n] at the start."""
     for energy in energies:
         if hasattr(energy, "start"):
             step = energy.start(x, step)

@@ -43,7 +43,7 @@ from ..tuples import replaced
 
 @dataclass(frozen=True)
 class Checks:
-    """What a rollout looks at and warns (UserWarning) of, each time, in one sentence that says what to do.
+    """Checks of a rollout. Each warns (UserWarning), every time, in one sentence that says what to do.
 
     A rollout that ends with what is not finite, or too far away, always warns.
 
@@ -170,7 +170,7 @@ class EndLook:
         self.kept, self.last, self.start = {}, None, ()
 
     def fault(self) -> str:
-        """What is at fault where the state that the latest step has left is lost."""
+        """Cause of a lost state after the latest step."""
         if self.last is None or not looks_at(self.last[1]):
             return "take a smaller time_step, more sweeps, or float64"
         return fault_of(self.model, self.last[0], self.integrator, *self.last[1:])
@@ -377,8 +377,8 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
 
 
 def _looked_at(asked: bool | None, model: System, steps: int) -> frozenset[int]:
-    """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
-    many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
+    """Steps that are looked at: all where one asks; where bodies may hit something, whose gain may be over in a step,
+    as many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
     meets = model.touches or model.floor is not None
     looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
     count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)

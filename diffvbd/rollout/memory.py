@@ -310,7 +310,7 @@ def _left(length: int, snapshots: int) -> int:
 
 
 def _repeats(length: int, snapshots: int) -> int:
-    """How often a step is run again at most."""
+    """Most repetitions of a step."""
     repeats = 1
     while math.comb(snapshots + repeats, repeats) < length:
         repeats += 1

@@ -144,8 +144,8 @@ class Refinement:
 
     @property
     def _helps(self) -> set[str]:
-        """What changes the loss, or its gradient; of the latter the mesh only where the finest run on the mesh of the
-        loss does not."""
+        """Causes that change the loss, or its gradient; of the latter the mesh only where the finest run on the mesh of
+        the loss does not."""
         off = {name for check in self.gradients for name, share in check.finer.items() if not share <= self.tolerance}
         off -= {"mesh"} if "both" in off else set()
         return {HELPS[name] for name in {*self._unstable, *off} if name in HELPS}
@@ -403,7 +403,7 @@ def _held(value: Any, parts: int) -> Any:
 
 
 def _moving(value: Any, parts: int, model: Model) -> Any:
-    """Where pinned vertices are at the end of each smaller step."""
+    """Positions of pinned vertices at the end of each smaller step."""
     if value is None:
         return None
     ends = _kept(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
@@ -426,7 +426,7 @@ def _moving(value: Any, parts: int, model: Model) -> Any:
 
 
 def _between(ends: Tensor, first: Tensor, parts: int) -> PerStep:
-    """Where colliders are at the end of each smaller step."""
+    """Positions of colliders at the end of each smaller step."""
     if len(ends) == 0:
         return PerStep(ends)
     begins = torch.cat([first.expand_as(ends[0])[None], ends[:-1]])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -17,7 +16,7 @@ from ..model.model import Model
 from ..model.solver import BDF2, VBD
 from ..model.system import System
 from ..ops import SweepSettings
-from ..said import warn
+from ..said import log_progress, warn
 from ..scopes import refuse_refinement, refuse_transforms
 from ..step.advance import advance, swept
 from ..step.arguments import (
@@ -36,8 +35,6 @@ from ..step.met import outcomes
 from ..step.predict import Begun, begin
 from ..step.residual import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
 from ..tuples import replaced
-
-LOGGER = logging.getLogger("diffvbd")
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,7 @@ def solve(
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
         adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
             the same sweeps again and differentiate them. With contact ReverseSweep(), and no other.
-        progress: Log each look at the residual (logger "diffvbd", level INFO).
+        progress: Print each look at the residual, by the logger "diffvbd".
 
     Returns:
         A :class:`diffvbd.results.Solution`.
@@ -223,7 +220,7 @@ class _Sweeping:
 
     @property
     def remedy(self) -> str:
-        """What else may help where the sweeps do not converge."""
+        """Advice where the sweeps do not converge."""
         if self.where is None and self.model.coarse is not None:
             return 'plain sweeps (subspace="rigid"), in case the corrections stall'
         if self.where is None:
@@ -279,4 +276,4 @@ class _Sweeping:
         shown = ratio if self.contact is None else torch.where(done & (ratio > self.tolerance), 0, ratio)
         self.residual, self.converged = float(torch.nan_to_num(shown, nan=torch.inf).max()), bool(done.all())
         if self.progress:
-            LOGGER.info("solve: residual %.3g after %d sweeps", self.residual, self.count)
+            log_progress("solve: residual %.3g after %d sweeps", self.residual, self.count)

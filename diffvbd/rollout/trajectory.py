@@ -1,4 +1,4 @@
-"""What goes into a rollout, and comes out of it, step by step."""
+"""Values that change from step to step, and the Trajectory of a rollout."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def repeated(name: str, value: Any) -> Any:
 
 
 def _mark_of(value: Any) -> Any:
-    """What tells values apart, and is small: of a tensor two sums. NaN is that of rows of ``prescribed`` that are not
+    """A small key of a value: of a tensor two sums. NaN is that of rows of ``prescribed`` that are not
     pinned."""
     if isinstance(value, (tuple, list)):
         return [_mark_of(part) for part in value]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from ..model.model import Model
 from ..model.solver import BDF2, SDIRK2, VBD, ImplicitEuler, Integrator
 from ..model.system import system_of
 from ..model.warnings import is_nearly_incompressible
-from ..said import percent, silence
+from ..said import log_progress, percent, silence
 from ..scopes import record_to, refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, check_state, given_of, material_of, prepare
 from ..step.integrators import SAME_TIME_STEP
@@ -61,7 +60,8 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What :func:`diffvbd.advise` says of the solver it returns; ``print(solver)`` shows a table with the runners-up.
+    """Prediction of :func:`diffvbd.advise` for the solver that it returns; ``print(solver)`` shows a table with the
+    runners-up.
 
     Attributes:
         asked: The error that was asked for [-].
@@ -142,7 +142,7 @@ MOST_SAMPLED = 64  # that are looked at, evenly spread
 
 
 def unseen(function: Callable[[float], Any], share: float, steps: int, duration: float, moves: bool) -> float:
-    """By how much the values of a function of time [s] differ from lines through those that steps see, root mean
+    """Difference of a function of time [s] from lines through the values that steps see, root mean
     square, over their size.
 
     Args:
@@ -173,7 +173,6 @@ def _value(function: Callable[[float], Any], time: float) -> Tensor:
 
 # --- trial runs -------------------------------------------------------------------------------------------------------
 
-LOGGER = logging.getLogger("diffvbd")
 SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
@@ -284,7 +283,7 @@ class TrialRuns:
         self.spent += seconds
         self.runs += 1
         if self.progress:
-            LOGGER.info("trial run %d: %s, %.2g s", self.runs, settings, seconds)
+            log_progress("trial run %d: %s, %.2g s", self.runs, settings, seconds)
         traj, value, gradient = out
         x, v = traj.x.detach(), traj.v.detach()
         if not bool(torch.isfinite(x[-1]).all()):
@@ -441,8 +440,8 @@ class TrialRuns:
         return stored - (load * x.double()).sum((-1, -2))
 
     def lost(self, run: TrialRun, seconds: float) -> float:
-        """How far the energy E that a run has lost would carry the scene in some seconds, sqrt(2 E / m) t, over its
-        motion. Zero where energy says nothing."""
+        """Distance that the energy E which a run has lost would carry the scene in some seconds, sqrt(2 E / m) t, over
+        its motion. Zero where energy says nothing."""
         if not self.conserves or run.x is None or run.v is None:
             return 0.0
         lost = (self.energy(run.x[0], run.v[0]) - self.energy(run.x[-1], run.v[-1])).clamp(min=0)
@@ -558,7 +557,7 @@ def found(trials: TrialRuns, error: float, time_budget: float) -> VBD:
 
 
 def start_of(trials: TrialRuns) -> VBD:
-    """What the refinement runs with: well converged and never far from the fastest."""
+    """Solver of the refinement: well converged and never far from the fastest."""
     model = trials.model
     if not takes_corrections(model, PLAIN):
         return VBD(1.0, 40, integrator=SDIRK2())
@@ -569,7 +568,7 @@ def start_of(trials: TrialRuns) -> VBD:
 
 
 def candidates_of(trials: TrialRuns) -> list[VBD]:
-    """What might be faster than the refinement's settings, the likeliest first."""
+    """Solvers that might be faster than the refinement's, the likeliest first."""
     model, sdirk, bdf, euler = trials.model, SDIRK2(), BDF2(), ImplicitEuler()
     touches, corrects = model.touches, takes_corrections(model, PLAIN)
     free = not touches and corrects and _may_over_relax(trials)
@@ -860,7 +859,7 @@ class _Search:
         return min((c.seconds for c in self.proven if c.error <= self.most), default=math.inf)
 
     def _allowed(self, seconds: float, more: bool) -> float:
-        """How long all runs may take [s] for settings that take ``seconds``."""
+        """Time that all runs may take [s] for a solver that takes ``seconds``."""
         return min(max(COSTS * seconds, FREE, MORE * self.climbed if more else 0.0), self.time_budget)
 
     def _prove(self) -> None:
@@ -926,7 +925,7 @@ def advise(
             each modulus and to a velocity that is added to all vertices. Without a quantity it is the mean squared way.
         device: Where the trials run; None: the Model's.
         time_budget: How long trials may run [s]; the search ends with the one that exceeds it.
-        progress: Log each trial run (logger "diffvbd", level INFO).
+        progress: Print each trial run, by the logger "diffvbd".
         inputs: As in rollout, constant or a function of the time [s]: loads at the middle of each step, all else at its
             end, and what is marked by :func:`diffvbd.step_average` over all of it. What swings within steps has these
             made shorter; a single push that is shorter than they are may go unseen unless it is averaged.
@@ -958,7 +957,7 @@ DETECTIONS = 8  # in each step of the run that is held up least
 
 @dataclass(frozen=True)
 class Share:
-    """What one cause contributes to an error.
+    """Contribution of one cause to an error.
 
     Attributes:
         cause: "sweeps", "time step", "precision", "contact", "mesh" or "all but mesh".

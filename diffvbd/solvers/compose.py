@@ -214,7 +214,7 @@ def _write(update: BlockUpdate, tensors: Sequence[Tensor], values: Sequence[Tens
 
 
 def _versions(tensors: Iterable[Tensor | None]) -> list[int]:
-    """What tells of a write in place. Inference tensors have no version, and then nothing can be said."""
+    """Versions, which tell of a write in place. Inference tensors have none."""
     return [t._version for t in tensors if t is not None and not t.is_inference()]
 
 
@@ -248,7 +248,7 @@ def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors, 
 
 
 def _shares(value: Tensor, state: Sequence[Tensor]) -> bool:
-    """Whether a value lies in the memory of a state tensor."""
+    """True if a value lies in the memory of a state tensor."""
     return any(value.untyped_storage().data_ptr() == t.untyped_storage().data_ptr() for t in state)
 
 
@@ -314,7 +314,7 @@ def _tensors(name: str, value: Any) -> Tensors:
 
 
 def _check_update(n: int, update: Any) -> None:
-    """What can be said of rows before there is a state."""
+    """Check of rows before there is a state."""
     if not isinstance(update, BlockUpdate):
         raise TypeError(f"updates[{n}]: expected a BlockUpdate, such as Update(...), got {type(update).__name__}")
     if update.dim not in (-1, -2):

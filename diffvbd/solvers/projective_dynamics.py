@@ -39,7 +39,7 @@ class Given(NamedTuple):
     values: Tensor
 
     def moved(self) -> bool:
-        """Whether it was changed in place since. Fused optimizers, ``.data`` and inference tensors leave the version
+        """True if it was changed in place since. Fused optimizers, ``.data`` and inference tensors leave the version
         as it was; values tell on the CPU, on CUDA a look at them would wait for the device."""
         if self.version is not None and self.tensor._version != self.version:
             return True

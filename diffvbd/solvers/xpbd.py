@@ -26,7 +26,7 @@ from .particles import (
 
 
 class Projection(NamedTuple):
-    """What an update of n constraints makes of the state; both of its directions start from it."""
+    """Intermediate results of an update of n constraints; both of its directions start from them."""
 
     direction: Tensor  # n [..., n, 3]
     inverse: Tensor  # 1 / |xa - xb| [1/m] [..., n, 1]

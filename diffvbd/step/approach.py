@@ -1,4 +1,4 @@
-"""Which bodies may touch something in a step that a scheme must not extrapolate: a floor, a collider, another body,
+"""Bodies that may touch something in a step, which a scheme must not extrapolate: a floor, a collider, another body,
 themselves."""
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _near_pairs(model: System, begun: Begun, prepared: Prepared, way: Tensor, be
 
 
 def _way_between(kind: Tensor, way: list[Tensor], at: list[Tensor]) -> Tensor:
-    """How far the sides of pairs move against each other [m]: of the ways of corners across them the longest; for a
+    """Relative displacement of the sides of pairs [m]: the longest of their corners' across them; for a
     plane, which may turn about points far away, the way of the vertex relative to the plane's point below it."""
     edges = kind == EDGE_EDGE
     square = way[0].new_zeros(len(kind))

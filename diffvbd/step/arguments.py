@@ -113,7 +113,7 @@ def material_of(**material: Any) -> Given:
 
 
 def step_settings(model: System, lead: tuple[int, ...], time_step: float, sweeps: int) -> ops.SweepSettings:
-    """What is executed for scenes of shape ``lead``, the regime on CUDA included."""
+    """Settings of the kernels for scenes of shape ``lead``, the regime on CUDA included."""
     return model.settings(check_time_step(time_step, model.dtype), sweeps, math.prod(lead))
 
 

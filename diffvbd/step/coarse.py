@@ -25,7 +25,7 @@ _FIELDS = len(ops.CoarseFields._fields)
 
 
 class CoarseParts(NamedTuple):
-    """What the matrices of all steps are made of."""
+    """Parts of the matrices of all steps."""
 
     stiffness: Tensor  # [1 | B, groups, 3, 3, width, width], at rest [N/m]
     mass: Tensor  # [1 | B, cells] [kg]
@@ -75,7 +75,7 @@ _matrix = ops.Differentiable(ops.direct.coarse_matrix, _reverse, arguments=_FIEL
 
 
 def with_corrections(model: System, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
-    """What the sweeps read, with the corrections between them."""
+    """Fields of the sweeps, with the corrections between them."""
     plan = model._coarse_plan
     matrix = matrix_of(model, parts, fields.x_prev, time_step, factored=not model.energy_mask & VERTEX_ENERGIES)
     return replaced(fields, coarse_factor=matrix, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,

@@ -3,7 +3,7 @@ whose matrix has, beside inertia and stiffness at rest, what pairs and floors pr
 
     (P'MP + h^2 sum of R_g K_g R_g' + P'(blocks of pairs, friction and vertex energies)P) a = P' dG,    x <- x - s P a
 
-Without those blocks stiff contact leaves lengths s next to nothing (docs/method.md, section 15).
+Without those blocks stiff contact leaves lengths s next to nothing (docs/method.md, section 16).
 """
 
 # pyright: reportIncompatibleMethodOverride=false
@@ -164,7 +164,7 @@ class Corrections:
 
 
 class _Press(NamedTuple):
-    """What presses back against motions sum_k w_k x_k of some vertices."""
+    """Stiffness against motions sum_k w_k x_k of some vertices."""
 
     rows: Tensor  # int64 [n, k], among the vertices of all scenes
     weights: Tensor  # [n, k]

@@ -1,4 +1,4 @@
-"""What the matrices of coarse corrections are made of: stiffness and mass in the functions of the bodies
+"""Parts of the matrices of coarse corrections: stiffness and mass in the functions of the bodies
 (docs/method.md, section 15).
 
 On the CPU by compiled loops (csrc/coarse/sums.h), on CUDA by products of torch (ops/coarse.py). Either sums in an

@@ -49,7 +49,7 @@ LOST = ("x: positions became non-finite {}: check that v, forces and materials a
 
 
 class ContactStep:
-    """What the parts of one step share."""
+    """Data that the substeps of one step share."""
 
     def __init__(self, model: System, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
         begun = replaced(begun, x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
@@ -240,15 +240,15 @@ class ContactStep:
 
     @functools.cached_property
     def potential_parts(self) -> RiseParts:
-        """What the step's comparisons of potentials have in common."""
+        """Common data of the step's comparisons of potentials."""
         return rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
 
     def _inverted(self, x: Tensor) -> Tensor:
-        """Which scenes have a tet that is inside out, bool [B]."""
+        """Scenes with an inverted tet, bool [B]."""
         return inside_out(self.model.tets, x if self.begun.origin is None else x.detach() + self.origin).any(-1)
 
     def _raises(self, x: Tensor, to: Tensor) -> Tensor:
-        """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""
+        """Vertices of bodies whose own potential is higher at ``to`` than at x [B, V], bool."""
         return self.potential_parts.raises(x.detach().contiguous(), to.detach())
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
@@ -374,7 +374,7 @@ class ContactStep:
             )
 
     def _refuse_what_is_not_finite(self) -> None:
-        """Which argument it was, finds arguments.named."""
+        """Refusal of values that are not finite; arguments.named finds the argument."""
         given = (self.x_prev, self.begun.y, self.colliders, self.before)
         if not all(bool(torch.isfinite(t).all()) for t in given):
             raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")

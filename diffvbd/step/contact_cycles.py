@@ -31,7 +31,7 @@ CUT = 0.01  # share of the vertices that pairs may hold up, beside whole bodies,
 
 
 class SweptPart(NamedTuple):
-    """What the sweeps of a part return."""
+    """Result of the sweeps of a substep."""
 
     x: Tensor  # [B, V, 3]
     limits: Tensor  # uint8 [B, K, V]
@@ -39,7 +39,7 @@ class SweptPart(NamedTuple):
 
 
 def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
-    """How K sweeps are spread over R parts: evenly, the first ones taking what is left."""
+    """Numbers of sweeps of R substeps: K spread evenly, the first ones taking the remainder."""
     return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
 
 
@@ -50,7 +50,7 @@ def sweeps_of_part(sweeps: int, planned: int, part: int) -> int:
 
 
 def parts_of(over: Tensor) -> int:
-    """How many parts a step takes that nobody has given a number: one, and one more each time that bodies want to go
+    """Number of substeps of a step without a given number: one, and one more each time that bodies want to go
     twice as far as the most room that they get. over: of RoomsOfBodies."""
     most = float(over.max()) if over.numel() else 0.0
     return min(MOST_PLANNED, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
@@ -106,7 +106,7 @@ def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) 
 
 
 def of_going(part: SweptPart, going: Tensor) -> SweptPart:
-    """What a part has done in the scenes that go on, bool [B, 1, 1]; in others it is thrown away."""
+    """Result of a substep in the scenes that go on, bool [B, 1, 1]; in others it is discarded."""
     return part if part.lengths is None else replaced(part, lengths=torch.where(going[:, 0], part.lengths, 0.0))
 
 

@@ -37,7 +37,7 @@ def corrected(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, li
 
 
 def touching(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
-    """What all potentials of bodies as wholes are made of, at x [B, V, 3]."""
+    """Parts of all potentials of whole bodies, at x [B, V, 3]."""
     lagged = of.lagged
     return ops.TouchingFields(
         x, of.x_prev, of.begun.y, of.fields.mass, of.begun.data, of.origin, *bodies_of(of.model), collider, of.before,

@@ -1,4 +1,4 @@
-"""Where the sweeps of a step start that has friction on a floor, and no pairs."""
+"""Start of the sweeps of a step with friction on a floor and no pairs."""
 
 from __future__ import annotations
 

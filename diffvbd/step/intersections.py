@@ -34,7 +34,7 @@ def check_start(model: System, x: Tensor, colliders: Any, colliders_before: Tens
 
 
 def advice_to_part(x: Tensor, origin: Tensor, dhat: float) -> str:
-    """What to do about surfaces that touch. x: [B, V, 3] [m], relative to origin [B, V, 3] or empty."""
+    """Advice about surfaces that touch. x: [B, V, 3] [m], relative to origin [B, V, 3] or empty."""
     far = max(float(t.abs().max()) for t in (x, origin) if t.numel())
     rounded = far * torch.finfo(x.dtype).eps
     if rounded > dhat / 2:

@@ -1,4 +1,4 @@
-"""What the parts of a step with contact have met: the pairs of each search, what was decided, what was cut."""
+"""Records of a step with contact: the pairs of each search, what was decided, which vertices were truncated."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Detection(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What the latest step of a Model has met, on its device; read by diffvbd.contact.status."""
+    """Record of the latest step of a Model, on its device; read by diffvbd.contact.status."""
 
     counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
     capacity: int  # pairs of all scenes
@@ -80,7 +80,7 @@ class TooManyPairs(RuntimeError):
 
 
 class Met:
-    """What the parts of a step meet one after another."""
+    """Records of the substeps, one after another."""
 
     def __init__(self) -> None:
         self.found: list[Detection] = []

@@ -1,4 +1,4 @@
-"""Where bodies want to go: what of it is a rigid motion of each, and how far their vertices go beside that."""
+"""Intended motion of bodies: the rigid part of each, and how far their vertices deviate from it."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Motion(NamedTuple):
 
     @property
     def stretched(self) -> Tensor:
-        """How far the straight ways of a turn, or of a share of it, bring a vertex of each body from the turned body
-        [B, bodies] [m]."""
+        """Distance by which the straight paths of a rotation, or of a fraction of it, take a vertex of each body from
+        the rotated body [B, bodies] [m]."""
         return self.ways.longest[WAYS.index("stretched")]
 
 

@@ -1,4 +1,4 @@
-"""How a step begins and ends: from arguments to what the sweeps start from, and from where they ended to the state."""
+"""Start and end of a step: from inputs to the start of the sweeps, and from their end to the state."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Ten
 
 
 class Begun(NamedTuple):
-    """What the sweeps of a step start from; positions [B, V, 3], relative to ``origin`` where there is one."""
+    """Start of the sweeps of a step; positions [B, V, 3], relative to ``origin`` where there is one."""
 
     x_start: Tensor  # as far as planes let it go
     x_prev: Tensor  # the state before the step
@@ -51,7 +51,7 @@ class Begun(NamedTuple):
                      self.lift.detach())  # fmt: skip
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
-        """What the sweeps read, without contact."""
+        """Fields of the sweeps, without contact."""
         fields = ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
                                  prepared.rest, self.data, self.origin)  # fmt: skip
         if not ops.TET_READS_X_PREV:

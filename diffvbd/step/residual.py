@@ -1,4 +1,4 @@
-"""What a step leaves unbalanced: the residual of the potential that it executed, contact included."""
+"""Residual of a step: the forces that it leaves unbalanced, contact included."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def of_bodies(model: System) -> Norm:
 
 
 def left_over(at: IncrementalPotential, norm: Norm) -> tuple[Tensor, Tensor]:
-    """What is not balanced, |M (x - y) + h^2 dE/dx|, and what it is a part of, |M (x - y)| + |h^2 dE/dx| [kg m], over
+    """Left-over force, |M (x - y) + h^2 dE/dx|, and its scale, |M (x - y)| + |h^2 dE/dx| [kg m], over
     the vertices that are not pinned; both [B, groups]."""
     inertia, forces = at.free * at.inertia(), at.free * at.forces()
     return norm(inertia + forces), norm(inertia) + norm(forces)
@@ -101,7 +101,7 @@ def left_of_solve(model: System, before: tuple[Tensor, Tensor], end: Tensor, pre
 
 
 def rounding(at: IncrementalPotential, norm: Norm, eps: float | None = None) -> Tensor:
-    """What rounding alone may leave of it [kg m], [B, groups]: a block times what rounds a position."""
+    """Share of it that rounding alone may leave [kg m], [B, groups]: a block times what rounds a position."""
     eps = torch.finfo(at.x.dtype).eps if eps is None else eps
     largest = at.x.abs().amax((-2, -1)) if at.x.shape[-2] else at.x.new_zeros(len(at.x))
     return ROUNDINGS * eps * largest[:, None] * norm(at.free * at.stiffness())
@@ -113,7 +113,7 @@ def share(part: Tensor, whole: Tensor) -> Tensor:
 
 
 def friction_left_over(at: IncrementalPotential) -> Tensor:
-    """What the step left unbalanced along the contact of each body, over the most that friction can bear there [-],
+    """Friction that the step left unbalanced along the contact of each body, over the most that it can bear there [-],
     [B, bodies]; 0 where it can bear nothing.
 
     Of forces summed over the vertices on which friction acts: what they leave to one another moves no body.
@@ -283,7 +283,7 @@ def cut_share(model: System) -> Tensor:
 
 
 def what_helps(model: System) -> str:
-    """What keeps pairs from holding up motion, for a warning."""
+    """Advice for a warning of motion that pairs truncated."""
     numbered = model.contact is not None and model.contact.detections is not None
     remedy = ", or leave out its number of detections" if numbered else ""
     return f"take a smaller time_step or a larger reach of the PairBarrier{remedy}; " + page("contact.md")
@@ -296,8 +296,8 @@ COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights"
 
 
 class ErrorEstimate(NamedTuple):
-    """How far from converged steps end, of each connected body with a vertex to move, in the order of the bodies' first
-    vertices. Detached; NaN where a step has too few sweeps to tell.
+    """Estimated distance of steps from convergence, of each connected body with a vertex to move, in the order of the
+    bodies' first vertices. Detached; NaN where a step has too few sweeps to tell.
 
     An iterate of a step is a coarse correction with its sweeps, after the first sweep; without coarse corrections one
     sweep; each with the rigid correction that would end the step there. Norms are root mean squares over the vertices

@@ -27,7 +27,7 @@ _FIELDS = len(ops.TouchingFields._fields)
 
 
 class Corrected(NamedTuple):
-    """Where corrections led; all but x is index data."""
+    """State after corrections; all but x is index data."""
 
     x: Tensor  # [B, V, 3]
     shares: list[Tensor]  # of its motion that each body took of each [B, bodies]
@@ -35,7 +35,7 @@ class Corrected(NamedTuple):
 
 
 class Which(NamedTuple):
-    """Which bodies a correction is to move, as of ops.contact.rigid_system."""
+    """Bodies that a correction is to move, as of ops.contact.rigid_system."""
 
     moving: Tensor | None = None  # bool [B, bodies]; None: all
     alone: bool = False

@@ -1,4 +1,4 @@
-"""What coarse corrections of bodies that touch are made of, differentiable: gradient and blocks of inertia, energies of
+"""Parts of coarse corrections of bodies that touch, differentiable: gradient and blocks of inertia, energies of
 single vertices, friction on a floor, and barriers, friction and damping of pairs. Twin of csrc/contact/rigid.h."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..ops.fields import RESTING_MOTION
 
 
 class Scenes(NamedTuple):
-    """What the correction reads."""
+    """Fields of the correction."""
 
     model: Any
     fields: ops.TouchingFields
@@ -35,8 +35,8 @@ class Scenes(NamedTuple):
 
 
 class PairTerms(NamedTuple):
-    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and weights
-    [n, 4]."""
+    """Contribution of pairs: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and
+    weights [n, 4]."""
 
     listed: Pairs
     force: Tensor

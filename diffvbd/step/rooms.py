@@ -1,4 +1,4 @@
-"""How far the bodies of a scene may go until pairs are found again, and how far the sweeps may carry each vertex."""
+"""Trust regions: how far bodies may move until pairs are found again, and how far sweeps may move each vertex."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compre
 @torch.no_grad()
 def rooms(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
           was: Tensor, now: Tensor, floor: Tensor | None, any_direction: bool) -> RoomsOfBodies:  # fmt: skip
-    """How far bodies may go until pairs are found again. Index data.
+    """Trust-region radii of bodies until pairs are found again. Index data.
 
     Args:
         motion: Where each vertex wants to go.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
@@ -38,7 +38,7 @@ def rooms(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tens
 @torch.no_grad()
 def rooms_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor,
                     begin: Tensor) -> Tensor:  # fmt: skip
-    """How far the sweeps may carry a vertex from where they find it [B, V] [m]: as far as a barrier pushes, weight
+    """Largest displacement of a vertex by the sweeps [B, V] [m]: as far as a barrier pushes, weight
     pulls, elasticity takes back what bodies deform by on the way and, of what pairs have held up, all; the most of a
     scene, since bodies push one another. Index data.
 

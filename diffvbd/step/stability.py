@@ -62,7 +62,7 @@ def proven() -> Iterator[None]:
 
 
 class _Part(NamedTuple):
-    """What is measured of a Model: another one, elastic and on the CPU in float64, and which tets it has."""
+    """System that is measured in place of a Model's own, elastic and on the CPU in float64, and which tets it has."""
 
     model: System
     tets: np.ndarray | None  # rows of the Model's; None: all
@@ -85,7 +85,7 @@ def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) ->
 
 
 def growth_message(model: System, prepared: Prepared, integrator: Integrator) -> str:
-    """What there is to say of steps that amplify vibrations; measured once for such arguments. Moduli are read."""
+    """Message about steps that amplify vibrations, or ""; measured once for such arguments. Moduli are read."""
     h, sweeps = prepared.time_step_and_sweeps
     if not (0 < sweeps <= MOST_SWEEPS and model.num_tets and model.num_active):
         return ""
@@ -103,7 +103,7 @@ def growth_message(model: System, prepared: Prepared, integrator: Integrator) ->
 
 
 def _mark(modulus: Tensor) -> tuple[float, ...]:
-    """What tells moduli apart, roughly."""
+    """A rough key of moduli."""
     values = modulus.detach()
     numbers = [values.item()] if values.numel() == 1 else [*torch.stack([*values.aminmax(), values.mean()]).tolist()]
     return tuple(round(ALIKE * math.log2(abs(n))) if 0 < abs(n) < math.inf else 0.0 for n in numbers)
@@ -144,7 +144,7 @@ def _message(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, inte
 
 
 def _crossed(model: System, mu: Tensor, lam: Tensor, h: float) -> Tensor:
-    """How many of each tet a pressure wave crosses in a step, where most [T]."""
+    """Number of each tet that a pressure wave crosses in a step, the largest over scenes [T]."""
     speed = ((lam + 2 * mu).amax(0) / model._density.double().cpu()).clamp(min=0).sqrt()
     return h * speed / torch.from_numpy(height_of_tets(model))
 
@@ -181,7 +181,7 @@ def _elastic(model: System, mesh: TetMesh, pinned: Tensor, rows: np.ndarray | No
 
 def growth(model: System, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, integrator: Integrator,
            relaxation: float | None = None) -> float:  # fmt: skip
-    """How many times noise about the rest shape has grown in a step, after some steps [-], the worst of scenes; 0:
+    """Factor by which noise about the rest shape has grown in a step, after some steps [-], the worst of scenes; 0:
     nothing is left of it.
 
     model: Elastic, in float64 on the CPU.  mu, lam: [1 | B, 1 | T].
@@ -245,7 +245,7 @@ def size_of(model: System) -> float:
 
 
 def reach_of(model: System, start: tuple[Tensor, ...], x: Tensor, gravity: Any, duration: float) -> Tensor:
-    """How far the farthest vertex is from where it began, over the Model's size, beside what its velocity, gravity and
+    """Distance of the farthest vertex from its start, over the Model's size, less what its velocity, gravity and
     its pins may have given it [-]."""
     x0, v0 = (t.detach() for t in start)
     moved = (x.detach() - x0).abs()
@@ -276,7 +276,7 @@ def notice_loss(model: System, prepared: Prepared, integrator: Integrator, v: Te
 
 
 def fault_of(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any) -> str:
-    """What made a step lose its bounds, and what to do. v: Before it."""
+    """Cause of a lost step, and the remedy. v: Before it."""
     with torch.no_grad():
         if isinstance(force, Tensor):
             mass = prepared.mass[..., None].clamp(min=torch.finfo(v.dtype).tiny)

@@ -1,4 +1,4 @@
-"""Where a step begins: the predictor y = x + h v + h^2 a, and where its sweeps start.
+"""Start of a step: the predictor y = x + h v + h^2 a, and where its sweeps start.
 
 A body that is corrected coasts: all of its vertices go one share of h v less what in h v is a turn (on straight lines
 it would stretch the body), as far as planes let it, and the body is corrected there (rigid.py). Where planes hold it
@@ -76,7 +76,7 @@ def begin(
     others: OtherBodies, data_count: tuple[int, ...], time_step: float, chord: float, *, start: str, filters: bool,
     parts: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Where the sweeps start and the predictor [m], both [B, V, 3]; differentiable in the first six tensors.
+    """Start of the sweeps and predictor [m], both [B, V, 3]; differentiable in the first six tensors.
 
     Args:
         x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].

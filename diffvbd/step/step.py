@@ -81,7 +81,7 @@ def step(
 
 @dataclass(frozen=True)
 class Tape:
-    """What :func:`diffvbd.step_backward` needs of one step; opaque.
+    """Record of one step that :func:`diffvbd.step_backward` needs; opaque.
 
     Holds the arguments of ``wrt`` and the step's x', v' [m, m/s], shape [..., V, 3], with their graph. A graph cannot
     be copied or stored, so a tape cannot: keep the states, and run step_forward again.

@@ -39,7 +39,7 @@ class Sets(NamedTuple):
 
 
 class Trials:
-    """What all trials in one part of a step have in common.
+    """Common data of all trials in one substep.
 
     Args:
         scenes: The part; its pairs are those that sweeps can reach, its rooms those of the sweeps.
@@ -103,8 +103,8 @@ class Trials:
 
     @torch.no_grad()
     def lengths(self, x: Tensor, way: Tensor, slope: Tensor) -> Tensor:
-        """What of a way [B, V, 3] each set goes: the first of 1, 1/2, ..., 1/128 that lowers its potential by enough of
-        what the slope [sets] promises, else 0; [1, sets]."""
+        """Fraction of a displacement [B, V, 3] that each set takes: the first of 1, 1/2, ..., 1/128 that lowers its
+        potential by enough of what the slope [sets] promises, else 0; [1, sets]."""
         found = torch.zeros_like(slope, dtype=x.dtype)
         for trial in range(FRACTIONS):
             share = 0.5**trial
@@ -128,7 +128,7 @@ class Trials:
         return values[0][self.bodies.of_body[:, :-1]]
 
     def rise(self, x: Tensor, to: Tensor) -> Tensor:
-        """By how much the potential of each set rises from x to ``to`` [B, V, 3], and the sizes of its terms
+        """Increase of the potential of each set from x to ``to`` [B, V, 3], and the sizes of its terms
         [sets + 1, 2], last of what does not move."""
         rows = self.bodies.number + 1
         own = rise_of_bodies(self.parts, x, to)

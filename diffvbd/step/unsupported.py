@@ -1,4 +1,4 @@
-"""What contact at the start of a step leaves of the acceleration of each body."""
+"""Residual acceleration of each body: what contact at the start of a step does not bear."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..ops.contact import lift_left
 
 def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
                 floor_data: Tensor | None, time_step: float) -> Tensor:  # fmt: skip
-    """What is left of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
+    """Residual of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
     part of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
 
     Without it every step would push a supported body into its support, and the sweeps would have to take it back.
@@ -31,7 +31,7 @@ def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Te
 
 
 def rests(model: System, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
-    """Which vertices are of bodies that are held somewhere and whose potential ``lift`` would raise, bool [B, V]; None
+    """Vertices of partly pinned bodies whose potential ``lift`` would increase, bool [B, V]; None
     without such bodies. Elasticity bears the weight of a body at rest, and its potential is convex about there: it
     rises by any fall. Few sweeps do not take the fall back, and what stands on such a body would follow it.
 

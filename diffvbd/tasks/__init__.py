@@ -26,7 +26,7 @@ from diffvbd.tasks.runner import solve
 
 @dataclass(frozen=True)
 class Option:
-    """What a task takes besides Settings: `--name VALUE` on the command line, a keyword of its `problem`."""
+    """Option of a task besides Settings: `--name VALUE` on the command line, a keyword of its `problem`."""
 
     kind: Callable[[str], Any]
     help: str

@@ -6,7 +6,7 @@ w = (2.5, 0, 1.5) m/s^2: along the cape and through it. Adam moves the three com
 
 What w means: the paper adds it to the velocities of the free vertices in each step and calls it a velocity increment in
 m/s, but its chain rule from velocity to w has a factor h. So the increment is h w, and w an acceleration: the force of
-this wind on a vertex is m w, and w stands beside gravity. (2.5 m/s at every step of 1/60 s would be 15 g.)
+this wind on a vertex is m w, and w is added to gravity. (2.5 m/s at every step of 1/60 s would be 15 g.)
 
 Choices the paper leaves open: the cape is 0.6 m wide and 0.8 m long, with layers of 18 x 24 vertices 1 cm apart, of 200
 kg/m^3 and mu = lam = 5 kPa; h = 1/60 s, as the paper's figure suggests; K = 8 with coarse corrections and relaxation

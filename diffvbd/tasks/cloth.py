@@ -1,4 +1,4 @@
-"""What several tasks with cloth share: a sheet that hangs, the rings of a dress, means over vertices."""
+"""Parts that several tasks with cloth share: a sheet that hangs, the rings of a dress, means over vertices."""
 
 import warnings
 from collections.abc import Iterator
@@ -23,11 +23,11 @@ def hanging(nx: int, ny: int, width: float, length: float, thickness: float) -> 
 
 @contextmanager
 def few_sweeps() -> Iterator[None]:
-    """No warning that sweeps are too few, by tets or by energy, nor that pairs hold it up: a quick version's cloth is
-    coarse, and thick as the full one. Target and fit take the same steps, so that the fit has an exact solution all the
-    same."""
+    """No warning that sweeps are too few, by tets or by energy, nor that pairs truncate the motion: a quick version's
+    cloth is coarse, and thick as the full one. Target and fit take the same steps, so the fit still has an exact
+    solution."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "pair_barrier: pairs held up", UserWarning)
+        warnings.filterwarnings("ignore", "(contact|pair_barrier): pairs", UserWarning)
         warnings.filterwarnings("ignore", "sweeps: .* (too few for tets|has gained|may be off by)", UserWarning)
         warnings.filterwarnings("ignore", "mesh: tets .* bend", UserWarning)
         yield

@@ -55,7 +55,7 @@ SHORTER = 4  # times: steps by which the result is judged, too, with as many tim
 
 
 class Version(NamedTuple):
-    """What the quick version has other values of."""
+    """Numbers that the quick version changes."""
 
     rings: int
     height: float  # release of the lowest disk above the floor [m]

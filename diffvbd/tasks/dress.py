@@ -61,7 +61,7 @@ SOFTNESS = 0.01  # [m]
 
 
 class Version(NamedTuple):
-    """What the quick version has other values of."""
+    """Numbers that the quick version changes."""
 
     segments: int
     rings: int

@@ -58,7 +58,7 @@ SURFACES = (".obj", ".off", ".ply", ".stl")
 
 
 class Version(NamedTuple):
-    """What the quick version has other values of."""
+    """Numbers that the quick version changes."""
 
     grips: int
     steps: int
@@ -87,9 +87,7 @@ def problem(
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
         version = version._replace(counts=(version.counts[0], *(iterations for _ in version.counts[1:])))
     if edge_length is not None and (mesh is None or mesh.suffix.lower() not in SURFACES):
-        raise ValueError(
-            f"edge_length: expected it beside a mesh that is a surface ({', '.join(SURFACES)}), got {mesh}"
-        )
+        raise ValueError(f"edge_length: expected it with a mesh that is a surface ({', '.join(SURFACES)}), got {mesh}")
     body = scaled(read(mesh, edge_length) if mesh else dv.mesh.bunny(version.bunny), HEIGHT)
     pulled = Pulled(body, settings, version)
     fit = Fit(pulled, version)

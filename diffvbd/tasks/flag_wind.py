@@ -14,7 +14,7 @@ largest is 53 times the smallest, twelve of 24 count as effective, and `allowed`
 about 12 effective degrees of freedom, and a deviation of 15.3. Here the deviation is 6.4 when the loss passes 5e-3 m^2,
 and 0.6 at the end.
 
-Choices the paper leaves open: a unit of wind is a force of 1 N on each kg, so the wind stands beside gravity. The
+Choices the paper leaves open: a unit of wind is a force of 1 N on each kg, so the wind is added to gravity. The
 reference wind turns and reaches 16 units, which brings the first loss to the paper's. The flag is 1.2 m wide and 0.9 m
 long, its layers 17 x 13 vertices 2 cm apart, of 200 kg/m^3 and mu = lam = 5 kPa; h = 1/120 s. With the paper's K = 10,
 and relaxation 1.7, it stays within 7 cm of converged steps; thinner flags do not. It may pass through itself. The

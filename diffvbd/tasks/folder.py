@@ -100,7 +100,7 @@ def put_aside(state: Path) -> Path:
 
 
 def is_first() -> bool:
-    """Whether this process keeps files: alone, or the first of its group."""
+    """True for the process that keeps files: alone, or the first of its group."""
     return not dist.is_initialized() or dist.get_rank() == 0
 
 

@@ -94,7 +94,7 @@ class Arm:
         return mean(x, part) @ self.ground.T
 
     def driven(self, policy: Policy, targets: Tensor) -> Callable[[int, Tensor, Tensor], Tensor]:
-        """Where the foot is after a step: what the network decides, carried out by the cart."""
+        """Position of the foot after a step: the decision of the network, carried out by the cart."""
 
         def drive(step: int, x: Tensor, v: Tensor) -> Tensor:
             speed = self.along_ground(v, self.foot)
@@ -181,7 +181,7 @@ class Training:
 
     @torch.no_grad()
     def shown(self, policy: Policy) -> Tensor:
-        """Motion of a few scenes beside each other, shape [frames, SHOWN V, 3]."""
+        """Motion of a few scenes side by side, shape [frames, SHOWN V, 3]."""
         targets, swings = self.test
         motion = self.arm.simulate(policy, (targets[:SHOWN], swings[:SHOWN]), save="all").x
         return (motion + self.stands[:, None]).flatten(1, 2)

@@ -16,7 +16,7 @@ bodies that fly side by side and touch drift apart exponentially, at 0.1 N/m the
 The first guess is 3 m/s upwards for all. After t = 0.6 s bodies fly on without contact, which does not change the loss;
 the paper rolls these steps out, so it is the default (option `steps`). The center of mass of a free body does not
 depend on its material, except through what K = 5 sweeps leave unsolved: the gradient of mu is that of the executed
-solver, and tiny beside that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does
+solver, and tiny against that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does
 not identify it. The rigid correction is off (`subspace=None`) and the sweeps start from the predictor, as in the paper.
 float32, because a million bodies fill tens of GB; the quick version uses float64.
 
@@ -64,7 +64,7 @@ ITERATIONS, RATES = (40, 40), (0.5, 0.005)  # of the stages
 
 
 class Version(NamedTuple):
-    """What options change, and what the quick version has other values of."""
+    """Numbers that options and the quick version change."""
 
     bodies: int = BODIES
     steps: int = STEPS
@@ -119,7 +119,7 @@ def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int |
     """The version that these options make; None: its own value."""
     version, most = (QUICK, QUICK_BODIES) if quick else (Version(), math.inf)
     if quick and steps is not None:
-        raise ValueError(f"steps: expected none beside --quick, which has its own, got {steps}")
+        raise ValueError(f"steps: expected none with --quick, which has its own, got {steps}")
     bodies = version.bodies if bodies is None else bodies
     if not 1 <= bodies <= most:
         raise ValueError(f"bodies: expected at least 1{f' and at most {most}' if quick else ''}, got {bodies}")
@@ -273,7 +273,7 @@ class Cubes:
 
 
 def is_near(points: Tensor, others: Tensor) -> Tensor:
-    """Whether others [M, 3] may be closer to one of the points than RADIUS, bool [M].
+    """Mask [M] of others [M, 3] that may be closer to one of the points than RADIUS.
 
     All, where a number is not finite: then the search for pairs raises on every rank, as it does on one.
     """

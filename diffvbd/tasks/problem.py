@@ -1,4 +1,4 @@
-"""What an inverse problem is: parameters, stages with a loss each, what to report."""
+"""Inverse problems: parameters, stages with a loss each, and reports."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -17,7 +17,7 @@ OWN_KEYS = ("iteration", "stage", "loss", "gradient_norm", "seconds")  # of a ro
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user chooses about a run.
+    """Choices of the user about a run.
 
     Attributes:
         out: Directory for log.json, picture.png, animation.gif, motion.npz (which `diffvbd view` shows), parameters.pt
@@ -116,7 +116,7 @@ class Problem:
 
 @dataclass
 class Result:
-    """What `solve` found: the best row of the last stage, and every row; their "iteration" counts from 0.
+    """Result of `solve`: the best row of the last stage, and every row; their "iteration" counts from 0.
 
     `converged` and `stalled` are about the last stage: it met a tolerance; its optimiser moved no parameter any more.
     `refined`: what dv.refine says of the result, or why it was not asked.
@@ -164,7 +164,7 @@ def check(problem: Problem) -> None:
         if not isinstance(stage.rough, bool):
             raise TypeError(f"{where}.rough: expected a bool, got {stage.rough!r}")
         if stage.rough and stage.optimizer is not None:
-            raise ValueError(f"{where}.rough: expected False beside an optimizer of its own, got {stage.rough!r}")
+            raise ValueError(f"{where}.rough: expected False with an optimizer of its own, got {stage.rough!r}")
         for key in ("learning_rate", "clip"):
             value = getattr(stage, key)
             if not (_is_number(value) and value > 0 or (value is None and key == "clip")):

@@ -1,5 +1,6 @@
 """Reports of a run: progress while it goes on, a table at its end, and the versions that it depended on."""
 
+import logging
 import platform
 import shutil
 import sys
@@ -18,6 +19,8 @@ from diffvbd import viz
 from diffvbd.results import Refinement
 from diffvbd.tasks.problem import Problem, Result, Row, Settings, estimates_of
 
+LOG = logging.getLogger("diffvbd")
+
 
 class Progress:
     """A bar that redraws itself on a terminal, and about ten plain lines elsewhere (a log file, a pipe)."""
@@ -35,6 +38,7 @@ class Progress:
         self.printed = self.terminal or self.done == 1 or self.done % max(1, self.total // 10) == 0
         if self.printed:
             self._print()
+        LOG.info("%s %d/%d  %s", self.name, self.done, self.total, summary(row))
         if self.watch is not None:
             self.watch(row)
 
@@ -119,7 +123,7 @@ def summary(row: Row) -> str:
 
 
 def survival(problem: Problem, settings: Settings, first: float) -> Refinement | str:
-    """Whether the result survives more sweeps and smaller steps, or why that is not known."""
+    """Refinement of the result by more sweeps and smaller steps, or the reason why it is not known."""
     stage = problem.stages[-1]
     if settings.quick:
         return "not refined: a quick run"

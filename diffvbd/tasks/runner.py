@@ -202,7 +202,7 @@ class _Run:
             self.best_parameters = {name: p.detach().clone() for name, p in self.problem.parameters.items()}
 
     def notice(self, before: list[Tensor], rows: int) -> None:
-        """Whether the optimiser stalls, after its step from the parameters `before` and as many rows of the history."""
+        """Record of whether the optimiser stalls, after its step from `before` and as many rows of the history."""
         moved = any(not torch.equal(p, old) for p, old in zip(self.moved.values(), before, strict=True))
         losses = [row["loss"] for row in self.history[rows:]]
         self.stalled = not self.converged and not moved and losses == self.still
@@ -280,7 +280,7 @@ class _Run:
             raise ValueError("its history is not whole")
 
     def _fingerprint(self) -> str:
-        """What must be the same for a run to be continued, besides the first loss."""
+        """Text that must be the same for a run to be continued, besides the first loss."""
         kept = ("name", "iterations", "moves", "tolerance", "gradient_tolerance", "criterion", "clip", "rough")
         stages = []
         for stage in self.problem.stages:
@@ -335,7 +335,7 @@ class _Run:
         return result
 
     def _memory(self) -> dict[str, float]:
-        """What the run has reserved of a CUDA device at most."""
+        """Most memory that the run has reserved of a CUDA device."""
         return {"peak_memory_gb": torch.cuda.max_memory_reserved(self.settings.device) / 1e9} if self.cuda else {}
 
     def _draw(self, result: Result) -> None:
@@ -384,7 +384,7 @@ def _moved(problem: Problem, stage: Stage) -> dict[str, Tensor]:
 
 def captured(run: Callable[[], Tensor], warm: int = 2) -> Callable[[], Tensor]:
     """`run` as a CUDA graph: the same work on the same memory, results and gradients included. The optimiser stays
-    outside: its few launches cost nothing beside a rollout, and so any optimiser will do.
+    outside: its few launches cost nothing against a rollout, and so any optimiser will do.
 
     A graph cannot make its lists of pairs longer: a step with more pairs than when it was captured returns NaN. Then
     `run` works once outside of it, where lists grow or the step says what is wrong, and is captured anew.

@@ -46,7 +46,7 @@ EFFORT = 1e-7  # weight of the squared acceleration of the ends [s^4]
 
 
 class Version(NamedTuple):
-    """What the quick version has other values of."""
+    """Numbers that the quick version changes."""
 
     nx: int  # vertices of the sheet along its sides
     ny: int
@@ -110,7 +110,7 @@ class Throw:
         self.motions: dict[str, Tensor] = {}  # of the findings, for pictures
 
     def model_of(self, *others: Any, **more: Any) -> dv.Model:
-        """Sheet and ball, with other energies and arguments of the Model beside their own."""
+        """Sheet and ball, with other energies and arguments of the Model besides their own."""
         energies = (dv.StableNeoHookean(), *others, self.barrier)
         model = dv.Model(self.mesh, energies=energies, density=DENSITY, pinned=self.pinned, **more)
         return model.to(self.device)
@@ -170,7 +170,7 @@ def with_ball(sheet: dv.TetMesh) -> dv.TetMesh:
 
 
 def lifts(sheet: dv.TetMesh, pinned: np.ndarray) -> Tensor:
-    """How much each end lifts a vertex of the bars along y, shape [4, V, 3]; `pinned`: these vertices, bool [V]."""
+    """Motion of the vertices of the bars for a unit of each end, shape [4, V, 3]; `pinned`: these vertices [V]."""
     along, across = (torch.from_numpy(sheet.points[:, k] / SIZE[k // 2]) for k in (0, 2))
     ends = [(1 - along) * (1 - across), (1 - along) * across, along * (1 - across), along * across]
     out = torch.zeros((4, len(pinned), 3), dtype=torch.float64)
@@ -189,6 +189,6 @@ def spline(times: Tensor, controls: int, knot: float) -> Tensor:
 
 
 def inside(points: Tensor, box: tuple[tuple[float, ...], tuple[float, ...]]) -> bool:
-    """Whether all points [V, 3] are between two corners [m]."""
+    """True if all points [V, 3] are between two corners [m]."""
     low, high = torch.tensor(box, dtype=points.dtype, device=points.device)
     return bool(((points > low) & (points < high)).all())

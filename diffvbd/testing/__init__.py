@@ -1,4 +1,4 @@
-"""What tests and benchmarks share: scenes, evaluation against the reference, and one table of tolerances."""
+"""Shared parts of tests and benchmarks: scenes, evaluation against the reference, and one table of tolerances."""
 
 from ..ops.regimes import regime
 from .scenes import (

@@ -188,7 +188,7 @@ class Scene:
         return tuple(built)
 
     def model(self, device: str = "cpu", **options: Any) -> Any:
-        """A `diffvbd.Model` of the scene, float64; options of it beside."""
+        """A `diffvbd.Model` of the scene, float64; options of it in addition."""
         from diffvbd.mesh import TetMesh
         from diffvbd.model.model import Model
 
@@ -318,7 +318,7 @@ def reference_result(
 
 
 def _turned(model: Any, solver: Any) -> Any:
-    """What the reference reads of a model, each tet listed from another corner (an even permutation)."""
+    """Attributes of a model that the reference reads, each tet listed from another corner (an even permutation)."""
     names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
     names += ("saturation", "regularization", "relaxation", "block", "rigid", "starts_from")
     names += ("coarse", "coarse_geometry")
@@ -334,7 +334,7 @@ def spread(
     expected: dict[str, Tensor] | None = None,
     coarse_steps: Any = None,
 ) -> dict[str, float]:
-    """How far two references with permuted tets disagree, per entry of `evaluate`: what rounding alone does here.
+    """Disagreement of two references with permuted tets, per entry of `evaluate`: the effect of rounding alone.
 
     The order of the tets changes the sums over a star and over a body, that of a tet's corners the rounding inside it.
     `expected`: the unpermuted `reference_result`, when it is at hand.
@@ -354,7 +354,7 @@ def sensitivity(
     expected: dict[str, Tensor] | None = None,
     coarse_steps: Any = None,
 ) -> dict[str, float]:
-    """How far the reference moves, per entry of `evaluate`, when every input moves by an ulp (the worst of three random
+    """Change of the reference, per entry of `evaluate`, when every input moves by an ulp (the worst of three random
     moves): no algorithm can be asked for less. A barrier feels it in a small gap, which the order of the tets hides."""
     if expected is None:
         expected = reference_result(model, inputs, solver, steps, coarse_steps=coarse_steps)

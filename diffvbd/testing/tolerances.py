@@ -9,16 +9,10 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "stiff_direction": (10.0, "error of a gradient over what an ulp in the inputs does to it, against 120 digits"),
     "headline_spread": (1e-13, "scenes better conditioned than this enter the headline table"),
     "headline": (5e-15, "what the headline table aims at: a few ulps per pair, averaged over a star"),
-    "headline_median": (
-        2e-14,
-        "measured 1.1e-14: material gradients lose 1 / strain (1e-2) to cancellation",
-    ),
+    "headline_median": (2e-14, "measured 1.1e-14: material gradients lose 1 / strain (1e-2) to cancellation"),
     "headline_worst": (1e-12, "measured 4e-13; slivers and gaps amplify a rounding that permuted tets do not show"),
     "dual": (1e-14, "hand-written adjoint of one energy block against forward-mode scalars: no sweep amplifies it"),
-    "dual_rounded": (
-        1e-11,
-        "the same adjoint in double: J - 1 and a gap lose what the state has lost",
-    ),
+    "dual_rounded": (1e-11, "the same adjoint in double: J - 1 and a gap lose what the state has lost"),
     "damped_share": (
         1e-8,
         "the same where damping of a floor begins or is whole: differences of 1e-7, also in dual numbers",
@@ -123,10 +117,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
         "three steps with contact by implicit Euler, over all of a step and scaled to a share of it: measured 2e-14; "
         "7e-3 with another chord, 1e-8 with a share in single precision",
     ),
-    "schedules": (
-        1e-12,
-        "gradients of a rollout: schedules of checkpoints add up the steps in another order",
-    ),
+    "schedules": (1e-12, "gradients of a rollout: schedules of checkpoints add up the steps in another order"),
     "travel": (1e-10, "v h = x1 - x0, the way of a step, is a thousandth of the positions that it is a difference of"),
     "through_a_bounce": (1e-9, "gradients of a motion alone and in a batch: a bounce amplifies each rounding"),
     "long_sum": (1e-12, "sums of up to 5,000 standard normal numbers, absolute: terms of 1, in any order"),
@@ -143,10 +134,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     # iterations that end
     "linear_residual": (1e-13, "relative residual to which linear systems and sweeps can be solved in float64"),
     "two_linear_solvers": (1e-6, "solutions to a residual of 1e-10, times the condition of a preconditioned Hessian"),
-    "reported_residual": (
-        1e-2,
-        "a residual is a small difference of forces: two digits of it stay",
-    ),
+    "reported_residual": (1e-2, "a residual is a small difference of forces: two digits of it stay"),
     "thirty_sweeps": (1e-6, "what 30 sweeps leave of the error of a gradient that supposes converged ones"),
     "twenty_sweeps": (1e-8, "what 20 sweeps leave of it in the paper's scenes"),
     "rigid_links": (1e-12, "stretch of a chain without compliance after 1000 sweeps"),
@@ -156,10 +144,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     # differences
     "gradcheck": (1e-5, "torch's gradcheck of one step: steps of 1e-6, over which the curvature shows"),
     "gradcheck_near_zero": (1e-7, "the same where a derivative vanishes, in units where all quantities are near 1"),
-    "gradcheck_of_a_distance": (
-        1e-6,
-        "the same of distances of random pairs, some near a change of feature",
-    ),
+    "gradcheck_of_a_distance": (1e-6, "the same of distances of random pairs, some near a change of feature"),
     "best_difference": (1e-8, "the best of three central differences in each of all arguments: half of the digits"),
     "difference_noise": (1e-9, "central differences over 2e-7 of sums near 1: rounding over the step, absolute"),
     "long_difference": (1e-5, "central differences of a loss over hundreds of steps, smooth or with few contacts"),

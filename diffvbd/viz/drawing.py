@@ -1,4 +1,4 @@
-"""What every picture is made of."""
+"""Bodies, scenery, axes and colors: the parts of every picture."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -120,6 +120,12 @@ def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = 
     return Scenery(points, triangles, color)
 
 
+def tidy(axes: Any) -> None:
+    """A faint grid, and no frame at the top and on the right."""
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
 def course(figure: Any, history: Sequence[Mapping[str, float]], truth: Mapping[str, float]) -> None:
     """Charts of the loss and of relative errors over iterations."""
     iterations = np.arange(len(history))
@@ -133,8 +139,7 @@ def course(figure: Any, history: Sequence[Mapping[str, float]], truth: Mapping[s
         charts[1].set_ylabel("relative error")
         charts[1].legend(frameon=False)
     for axes in charts:
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     figure.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)
 
 

@@ -94,7 +94,7 @@ def live(
     if isinstance(mesh, Model):
         things += scenery_of(mesh, *_bounds(motions), colliders)
     elif colliders is not None:
-        fail("mesh", "a dv.Model with colliders beside colliders", type(mesh).__name__)
+        fail("mesh", "a dv.Model with colliders", type(mesh).__name__)
     viewer = Viewer(motions, body if mesh is None else mesh, values, color=color, time_step=time_step, scenery=things,
                     sliders=ranges, simulate=simulate, host=host, port=port)  # fmt: skip
     if course is not None:

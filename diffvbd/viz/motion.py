@@ -95,7 +95,7 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
         return motions_of(body.points, source, time_step)
     body, step = mesh_of(mesh), None if time_step is None else check_positive("time_step", time_step, "s")
     if body is None:
-        raise TypeError(f"mesh: expected a dv.Model or a dv.TetMesh beside {type(source).__name__}, got None")
+        raise TypeError(f"mesh: expected a dv.Model or a dv.TetMesh with {type(source).__name__}, got None")
     x, v, steps = source, None, None
     if isinstance(source, Trajectory):
         x, v, steps = source.x, as_array(source.v), np.asarray(source.steps)
@@ -264,10 +264,7 @@ REACH = 2.5  # planes are shown so far around a scene, in its radii
 
 
 def scenery_of(
-    model: Model,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    colliders: Any = None,
+    model: Model, low: NDArray[np.float64], high: NDArray[np.float64], colliders: Any = None
 ) -> tuple[Scenery, ...]:
     """Floors and colliders around a scene between two corners [m].
 

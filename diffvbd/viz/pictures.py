@@ -27,6 +27,7 @@ from diffvbd.viz.drawing import (
     motions_as_arrays,
     new_figure,
     save_motion,
+    tidy,
 )
 from diffvbd.viz.motion import save_motions
 
@@ -42,7 +43,7 @@ def animation(
     view: tuple[float, float] = VIEW,
     color: Any = None,
 ) -> None:
-    """Save motions beside each other as a .gif that runs in real time, or slower where it would last less than 2 s; or
+    """Save motions side by side as a .gif that runs in real time, or slower where it would last less than 2 s; or
     as an .npz, which :func:`live` shows.
 
     Args:
@@ -93,7 +94,7 @@ def comparison(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save a grid of shapes, one row per motion and one column per time, beside the course of an optimisation.
+    """Save a grid of shapes, one row per motion and one column per time, with the course of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -144,7 +145,7 @@ def learning(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save shapes, one row per motion and one column per time, beside losses over the seconds that they took.
+    """Save shapes, one row per motion and one column per time, with losses over the seconds that they took.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -176,8 +177,7 @@ def learning(
         axes.semilogy(seconds, np.minimum.accumulate(losses), label=name, color=color)
     axes.set(xlabel="seconds", ylabel="lowest loss so far")
     axes.legend(frameon=False)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+    tidy(axes)
     chart.subplots_adjust(left=0.2, right=0.96, bottom=0.12, top=0.95)
     figure.savefig(path)
 
@@ -241,8 +241,7 @@ def paths(
     chart.semilogy([row["distance"] for row in history], color=INK)
     chart.set(xlabel="iteration", ylabel="distance from the target [m]")
     for panel in (side, top, chart):
-        panel.grid(alpha=0.3)
-        panel.spines[["top", "right"]].set_visible(False)
+        tidy(panel)
     below.subplots_adjust(left=0.06, right=0.98, bottom=0.17, top=0.9, wspace=0.28)
     figure.savefig(path)
 
@@ -295,8 +294,7 @@ def landing(
     for axes, key, scale, label in zip(charts, ("loss", "uncovered"), (1, 100), ("loss", "uncovered [%]"), strict=True):
         axes.plot([scale * row[key] for row in history], color=INK)
         axes.set_ylabel(label)
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     charts[0].set_yscale("log")
     charts[0].tick_params(which="minor", labelleft=False)
     charts[1].set_xlabel("iteration")
@@ -330,7 +328,7 @@ def field(
     truth: Mapping[str, float] | None = None,
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save maps of fields beside each other, on the surface and on a cut, with one colorbar of logarithmic scale.
+    """Save maps of fields side by side, on the surface and on a cut, with one colorbar of logarithmic scale.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -407,7 +405,7 @@ SHOWN = 20_000  # points; of more, so many of them
 def cloud(
     path: str | Path, frames: Any, time_step: float, history: Sequence[Mapping[str, float]], estimate: str
 ) -> None:
-    """Save points at several times beside the course of an optimisation.
+    """Save points at several times with the course of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -432,8 +430,7 @@ def cloud(
     for axes, key in zip(charts, ("loss", estimate), strict=True):
         axes.semilogy([row[key] for row in history], color=INK)
         axes.set_ylabel(key.replace("_", " ") + (" [m]" if key != "loss" else ""))
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     charts[1].set_xlabel("iteration")
     right.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)
     figure.savefig(path)

@@ -210,7 +210,7 @@ class _Stage:
                                   lighting=False, reset_camera=False, render=False)  # fmt: skip
 
     def picture(self) -> NDArray[np.uint8]:
-        """What the camera sees, shape [2 height, 2 width, 3]."""
+        """Image of the camera, shape [2 height, 2 width, 3]."""
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(None, return_img=True))
 

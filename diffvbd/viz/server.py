@@ -94,7 +94,7 @@ def refusal(headers: Any, host: str) -> str:
 
 
 def _is_own(asked: str, host: str) -> bool:
-    """Whether a Host header names this server by an address, which no other site can claim, or by its own name."""
+    """True if a Host header names this server by an address, which no other site can claim, or by its own name."""
     try:
         name = urlsplit(f"//{asked}").hostname or ""
     except ValueError:

@@ -1,4 +1,4 @@
-"""What triangles are colored by: values of each frame, with their units, as levels of a palette."""
+"""Colors of triangles: values of each frame, with their units, as levels of a palette."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def palette() -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Colors:
-    """How the triangles of a motion are colored.
+    """Colors of the triangles of a motion.
 
     Attributes:
         palette: Colors, shape [K, 3].

@@ -155,7 +155,7 @@ class Stage:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing has been drawn."""
+        """True until something has been drawn."""
         return self._shown is None
 
     def look_at(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
@@ -168,7 +168,7 @@ class Stage:
             camera.position, camera.look_at = tuple(eye), tuple(middle)
 
     def set_scenery(self, things: tuple[Scenery, ...]) -> None:
-        """What else is there."""
+        """Scenery around the bodies."""
         for handle in self._scenery:
             handle.remove()
         self._scenery, self._things = [], []
@@ -335,7 +335,7 @@ class Panel:
         self._moved(dict(self._values))
 
     def say_state(self, text: str) -> None:
-        """How the simulation behind the sliders stands."""
+        """State of the simulation behind the sliders."""
         if self.state is not None:
             self.state.content = text
 
@@ -489,7 +489,7 @@ class Viewer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser shows the page."""
+        """True while a browser shows the page."""
         return bool(self._server.get_clients())
 
     def play(self) -> None:

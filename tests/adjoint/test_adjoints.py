@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.marks import slow
+from helpers.results import saved_bytes
 from helpers.spreads import beyond
 from torch import Tensor
 
@@ -23,9 +24,10 @@ TIGHT = tolerance("linear_residual")
 GLOBAL = [dv.GlobalAdjoint(tolerance=TIGHT), dv.GlobalAdjoint(False, tolerance=TIGHT)]
 
 
-def of_step(model: dv.Model, inputs: dict, sweeps: int, adjoint: Any) -> dict[str, Tensor]:
-    # TODO62: the solver of this call
-    return evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, sweeps=sweeps), inputs)
+def of_step(scene: testing.Scene, device: str, sweeps: int, adjoint: Any) -> dict[str, Tensor]:
+    model, solver = scene.model(device), scene.solver(sweeps)
+    run = lambda **given: dv.step(model, solver=solver, adjoint=adjoint, **given)  # noqa: E731
+    return evaluate(run, scene.inputs(device=device), solver.time_step)
 
 
 def gradients(result: dict[str, Tensor]) -> list[str]:
@@ -35,34 +37,31 @@ def gradients(result: dict[str, Tensor]) -> list[str]:
     return names
 
 
-def scene_on(device: str, case: str, kind: str = "structured") -> tuple[dv.Model, dict[str, Any]]:
+def scene_on(device: str, case: str, sweeps: int, kind: str = "structured") -> tuple[dv.Model, dict[str, Any]]:
+    """A Model, and the inputs and the solver of its step."""
     scene = build_scene(case, kind)
-    return scene.model(device), scene.inputs(device=device)
+    return scene.model(device), scene.inputs(device=device) | {"solver": scene.solver(sweeps)}
 
 
 @pytest.mark.parametrize("sweeps", (0, 1, slow(5)))
 @pytest.mark.parametrize(("case", "kind"), SCENES)
 def test_unrolled_is_the_reverse_sweep(device: str, case: str, kind: str, sweeps: int) -> None:
-    model, inputs = scene_on(device, case, kind)
-    ours, unrolled = (of_step(model, inputs, sweeps, a) for a in (dv.ReverseSweep(), dv.Unrolled()))
-    # v is a difference of positions over h: it is held to their scale
-    scale = max(1.0, float(ours["x"].abs().max() / ours["v"].abs().max()) / inputs["time_step"])
-    errors = {n: relative_error(unrolled[n], ours[n]) / (scale if n == "v" else 1.0) for n in ours}
     scene = build_scene(case, kind)
-    failures = beyond(
-        errors,
-        dict.fromkeys(errors, tolerance("adjoint")),
-        [lambda: testing.spread(scene.model(), scene.inputs(), sweeps)],
-    )
+    ours, unrolled = (of_step(scene, device, sweeps, a) for a in (dv.ReverseSweep(), dv.Unrolled()))
+    # v is a difference of positions over h: it is held to their scale
+    scale = max(1.0, float(ours["x"].abs().max() / ours["v"].abs().max()) / scene.case.time_step)
+    errors = {n: relative_error(unrolled[n], ours[n]) / (scale if n == "v" else 1.0) for n in ours}
+    sample = lambda: testing.spread(scene.model(), scene.inputs(), scene.solver(sweeps))  # noqa: E731
+    failures = beyond(errors, dict.fromkeys(errors, tolerance("adjoint")), [sample])
     assert not failures, failures
     assert bool(unrolled["grad_x"].any())
 
 
 @pytest.mark.parametrize(("case", "kind"), SCENES)
 def test_global_adjoint_is_the_derivative_of_a_converged_step(device: str, case: str, kind: str) -> None:
-    model, inputs = scene_on(device, case, kind)
-    expected = of_step(model, inputs, CONVERGED, dv.ReverseSweep())
-    assembled, free = (of_step(model, inputs, CONVERGED, adjoint) for adjoint in GLOBAL)
+    scene = build_scene(case, kind)
+    expected = of_step(scene, device, CONVERGED, dv.ReverseSweep())
+    assembled, free = (of_step(scene, device, CONVERGED, adjoint) for adjoint in GLOBAL)
     for name in gradients(expected):
         assert relative_error(free[name], assembled[name]) <= tolerance("global_routes"), name
         assert relative_error(assembled[name], expected[name]) <= tolerance("global_converged"), name
@@ -75,10 +74,9 @@ def test_global_adjoint_is_the_derivative_of_a_converged_step(device: str, case:
 
 @pytest.mark.parametrize("adjoint", GLOBAL, ids=("assembled", "matrix-free"))
 def test_global_adjoint_is_wrong_before_and_right_after_convergence(device: str, adjoint: dv.GlobalAdjoint) -> None:
-    model, inputs = scene_on(device, "plain", "delaunay")
-    errors = []
+    scene, errors = build_scene("plain", "delaunay"), []
     for sweeps in (1, 3, 10, 30):
-        ours, theirs = (of_step(model, inputs, sweeps, a) for a in (dv.ReverseSweep(), adjoint))
+        ours, theirs = (of_step(scene, device, sweeps, a) for a in (dv.ReverseSweep(), adjoint))
         errors.append(max(relative_error(theirs[k], ours[k]) for k in ("grad_x", "grad_v")))
     assert errors[0] > 0.1
     assert all(later < earlier for earlier, later in itertools.pairwise(errors))
@@ -87,25 +85,18 @@ def test_global_adjoint_is_wrong_before_and_right_after_convergence(device: str,
 
 def test_both_forms_agree_where_nothing_has_converged(device: str) -> None:
     """They solve one system, wherever the sweeps have ended."""
-    model, inputs = scene_on(device, "floor_corner", "delaunay")
-    assembled, free = (of_step(model, inputs, 1, adjoint) for adjoint in GLOBAL)
+    scene = build_scene("floor_corner", "delaunay")
+    assembled, free = (of_step(scene, device, 1, adjoint) for adjoint in GLOBAL)
     for name in gradients(assembled):
         assert relative_error(free[name], assembled[name]) <= tolerance("global_routes"), name
 
 
 def test_what_a_step_keeps_does_not_grow_with_the_sweeps(device: str) -> None:
-    model, inputs = scene_on(device, "plain", "delaunay")
-    inputs["mu"].requires_grad_()
     kept = []
     for sweeps in (1, 50):
-        sizes: dict[int, int] = {}
-        with torch.autograd.graph.saved_tensors_hooks(
-            lambda t, sizes=sizes: (sizes.update({t.untyped_storage().data_ptr(): t.untyped_storage().nbytes()}), t)[1],
-            lambda t: t,
-        ):
-            # TODO62: the solver of this call
-            dv.step(model, adjoint=dv.GlobalAdjoint(), **inputs, sweeps=sweeps)
-        kept.append(sum(sizes.values()))
+        model, given = scene_on(device, "plain", sweeps, "delaunay")
+        given["mu"].requires_grad_()
+        kept.append(saved_bytes(lambda model=model, given=given: dv.step(model, adjoint=dv.GlobalAdjoint(), **given)))
     assert kept[0] == kept[1] > 0
 
 
@@ -113,21 +104,18 @@ def test_what_a_step_keeps_does_not_grow_with_the_sweeps(device: str) -> None:
     ("adjoint", "schedule"), [(dv.Unrolled(), 2), (GLOBAL[0], dv.BinomialCheckpoints(1)), (GLOBAL[1], None)]
 )
 def test_a_rollout_is_its_steps_under_every_schedule(device: str, adjoint: Any, schedule: Any) -> None:
-    model, inputs = scene_on(device, "batch")
+    model, inputs = scene_on(device, "batch", 4)
 
-    def by_steps(**options: Any) -> tuple[Tensor, Tensor]:
-        state = options.pop("x"), options.pop("v")
+    def by_steps(x: Tensor, v: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
         for _ in range(3):
-            # TODO62: the solver of this call
-            state = dv.step(model, *state, adjoint=adjoint, **options, sweeps=4)
-        return state
+            x, v = dv.step(model, x, v, adjoint=adjoint, **options)
+        return x, v
 
     def by_rollout(**options: Any) -> tuple[Tensor, Tensor]:
-        # TODO62: the solver of this call
-        end = dv.rollout(model, steps=3, adjoint=adjoint, checkpoint_every=schedule, save="last", **options, sweeps=4)
+        end = dv.rollout(model, steps=3, adjoint=adjoint, checkpoint_every=schedule, save="last", **options)
         return end.x[-1], end.v[-1]
 
-    steps, rollout = evaluate(by_steps, inputs), evaluate(by_rollout, inputs)
+    steps, rollout = (evaluate(run, inputs, inputs["solver"].time_step) for run in (by_steps, by_rollout))
     assert bool(steps["grad_mu"].any())
     for name in steps:
         assert relative_error(rollout[name], steps[name]) <= tolerance("property_subset"), name
@@ -137,13 +125,12 @@ def test_a_rollout_is_its_steps_under_every_schedule(device: str, adjoint: Any, 
 
 
 def test_report_tells_of_each_backward_step(device: str) -> None:
-    model, inputs = scene_on(device, "batch")
+    model, inputs = scene_on(device, "batch", 4)
     solves: list[dv.LinearSolve] = []
     goal = 1e-9
     adjoint = dv.GlobalAdjoint(tolerance=goal, report=solves.append)
     x = inputs.pop("x").requires_grad_()
-    # TODO62: the solver of this call
-    end = dv.rollout(model, x, steps=3, adjoint=adjoint, save="last", **inputs, sweeps=4)
+    end = dv.rollout(model, x, steps=3, adjoint=adjoint, save="last", **inputs)
     assert not solves
     end.x.sum().backward()
     assert len(solves) == 3
@@ -153,22 +140,21 @@ def test_report_tells_of_each_backward_step(device: str) -> None:
 
 @pytest.mark.parametrize("assembled", (True, False))
 def test_a_solve_that_fails_is_never_silent(device: str, assembled: bool) -> None:
-    model, inputs = scene_on(device, "batch")
+    scene = build_scene("batch")
     solves: list[dv.LinearSolve] = []
     options: dict[str, Any] = {"max_iterations": 2, "report": solves.append}
     message = r"relative residual of 1e-10, got .* in scene \d after 2 iterations"
     with pytest.raises(RuntimeError, match=message):
-        of_step(model, inputs, 3, dv.GlobalAdjoint(assembled, **options))
+        of_step(scene, device, 3, dv.GlobalAdjoint(assembled, **options))
     with pytest.warns(RuntimeWarning, match=message):
-        result = of_step(model, inputs, 3, dv.GlobalAdjoint(assembled, on_failure="warn", **options))
+        result = of_step(scene, device, 3, dv.GlobalAdjoint(assembled, on_failure="warn", **options))
     assert not solves[-1].converged and solves[-1].residual > 1e-10 and bool(result["grad_x"].any())
 
 
 def test_a_nan_in_the_adjoint_fails_too(device: str) -> None:
-    model, inputs = scene_on(device, "plain")
+    model, inputs = scene_on(device, "plain", 2)
     inputs["x"].requires_grad_()
-    # TODO62: the solver of this call
-    x, _ = dv.step(model, adjoint=dv.GlobalAdjoint(max_iterations=5), **inputs, sweeps=2)
+    x, _ = dv.step(model, adjoint=dv.GlobalAdjoint(max_iterations=5), **inputs)
     with pytest.raises(RuntimeError, match="expected finite adjoints of the positions, got nan in scene 0"):
         torch.autograd.grad(x.sum(), inputs["x"], torch.tensor(torch.nan, dtype=x.dtype, device=device))
 
@@ -186,8 +172,8 @@ def test_the_residual_that_counts_is_the_true_one(device: str, assembled: bool) 
     for dtype in (torch.float64, torch.float32):
         model, x = loose_cube(dtype, device)
         mu = torch.tensor(1e6, dtype=dtype, device=device, requires_grad=True)
-        options: dict[str, Any] = {"lam": 1e6, "gravity": (0.0, 0.0, 0.0), "solver": dv.VBD(0.1, 200)}
-        end, _ = dv.step(model, x, 0 * x, mu=mu, adjoint=dv.GlobalAdjoint(assembled), **options)
+        end, _ = dv.step(model, x, 0 * x, dv.VBD(0.1, 200), mu=mu, lam=1e6, gravity=(0.0, 0.0, 0.0),
+                         adjoint=dv.GlobalAdjoint(assembled))  # fmt: skip
         if dtype == torch.float32:
             with pytest.raises(RuntimeError, match="relative residual of 1e-05, got"):
                 end[:, 0].square().sum().backward()
@@ -200,12 +186,11 @@ def test_the_residual_that_counts_is_the_true_one(device: str, assembled: bool) 
 
 
 def test_function_transforms_raise(device: str) -> None:
-    model, inputs = scene_on(device, "plain")
+    model, inputs = scene_on(device, "plain", 2)
     x = inputs.pop("x")
 
     def end(x: torch.Tensor) -> torch.Tensor:
-        # TODO62: the solver of this call
-        return dv.step(model, x, adjoint=dv.GlobalAdjoint(), **inputs, sweeps=2)[0]
+        return dv.step(model, x, adjoint=dv.GlobalAdjoint(), **inputs)[0]
 
     for run in (torch.func.grad(lambda x: end(x).sum()), lambda x: torch.func.vmap(end)(x[None])):
         with pytest.raises(NotImplementedError, match=r"^adjoint: expected ReverseSweep inside torch\.func transforms"):
@@ -236,20 +221,18 @@ def test_bad_options_are_named(options: dict, error: type, message: str) -> None
 @pytest.mark.usefixtures("value_checks")
 @pytest.mark.parametrize("adjoint", [dv.Unrolled(), dv.GlobalAdjoint()], ids=("unrolled", "global"))
 def test_bad_values_are_named(device: str, adjoint: Any) -> None:
-    model, inputs = scene_on(device, "plain")
+    model, inputs = scene_on(device, "plain", 2)
     for name, value in (("mu", -1e4), ("lam", float("nan")), ("density", -1.0)):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
-            # TODO62: the solver of this call
-            dv.step(model, adjoint=adjoint, **{**inputs, name: value}, sweeps=2)
+            dv.step(model, adjoint=adjoint, **inputs | {name: value})
 
 
 @pytest.mark.parametrize("adjoint", [dv.Unrolled(), dv.GlobalAdjoint()], ids=("unrolled", "global"))
 def test_debug_checks_reach_every_route(device: str, adjoint: Any) -> None:
-    model, inputs = scene_on(device, "plain")
+    model, inputs = scene_on(device, "plain", 2)
     inputs["x"][-1, 0] = torch.nan
     with dv.debug_checks(), pytest.raises((RuntimeError, ValueError), match="^x: expected finite values|step 0, sweep"):
-        # TODO62: the solver of this call
-        dv.step(model, adjoint=adjoint, **inputs, sweeps=2)
+        dv.step(model, adjoint=adjoint, **inputs)
 
 
 @pytest.mark.parametrize("adjoint", [dv.Unrolled(), *GLOBAL], ids=("unrolled", "assembled", "matrix-free"))
@@ -270,22 +253,22 @@ def test_scenes_without_anything_to_solve(device: str, adjoint: Any) -> None:
 @pytest.mark.parametrize("adjoint", [dv.Unrolled(), dv.GlobalAdjoint(tolerance=1e-6)], ids=("unrolled", "global"))
 def test_float32(device: str, adjoint: Any) -> None:
     scene = build_scene("anchored", "delaunay")
-    sweeps = 60
-    double = of_step(scene.model(), scene.inputs(), sweeps, dv.ReverseSweep())
-    single = of_step(scene.model(device).to(dtype=torch.float32), scene.inputs(torch.float32, device), sweeps, adjoint)
+    model, solver = scene.model(device, dtype=torch.float32), scene.solver(60)
+    double = of_step(scene, "cpu", 60, dv.ReverseSweep())
+    single = evaluate(lambda **given: dv.step(model, solver=solver, adjoint=adjoint, **given),
+                      scene.inputs(torch.float32, device), solver.time_step)  # fmt: skip
     assert single["x"].dtype == torch.float32
-    for name in ("grad_x", "grad_mu", "grad_rest_points", "grad_floor_barrier.kappa"):
+    for name in ("grad_x", "grad_mu", "grad_rest_points", "grad_floor_kappa"):
         assert relative_error(single[name], double[name]) <= tolerance("float32_gradient"), name
 
 
 @pytest.mark.cuda
 def test_a_capture_is_told_to_take_another_route() -> None:
-    model, inputs = scene_on("cuda", "plain")
+    model, inputs = scene_on("cuda", "plain", 2)
     inputs["x"].requires_grad_()
 
     def work() -> None:
-        # TODO62: the solver of this call
-        x, _ = dv.step(model, adjoint=dv.GlobalAdjoint(), **inputs, sweeps=2)
+        x, _ = dv.step(model, adjoint=dv.GlobalAdjoint(), **inputs)
         torch.autograd.grad(x.sum(), inputs["x"])
 
     work()

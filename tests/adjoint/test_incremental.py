@@ -2,8 +2,6 @@
 
 The oracle is double backward through diffvbd.reference's potential, which is written with deformation gradients."""
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
@@ -12,8 +10,9 @@ import diffvbd as dv
 from diffvbd import reference
 from diffvbd.adjoint.implicit import Assembled, conjugate_gradients
 from diffvbd.adjoint.potential import IncrementalPotential
+from diffvbd.model.system import system_of
 from diffvbd.step.advance import begin
-from diffvbd.step.arguments import acceleration_of, prepare
+from diffvbd.step.arguments import acceleration_of, given_of, prepare
 from diffvbd.testing import build_scene, relative_error, tolerance
 
 CASES = ("plain", "paper", "inverted", "contrast", "no_shear", "floor_damped", "floor_corner", "anchored", "batch")
@@ -22,13 +21,13 @@ CASES = ("plain", "paper", "inverted", "contrast", "no_shear", "floor_damped", "
 def at_a_state(device: str, case: str, kind: str) -> tuple[IncrementalPotential, Tensor, Tensor]:
     """Potential after two sweeps, and gradient and Hessian product with a random w from the reference."""
     scene = build_scene(case, kind)
-    model, inputs = scene.model(device), scene.inputs(device=device)
-    loads = {name: inputs[name] for name in ("force", "gravity", "prescribed")}
-    x, v, h, mu, lam = (inputs[name] for name in ("x", "v", "time_step", "mu", "lam"))
-    options: dict[str, Any] = {"mu": mu, "lam": lam, "solver": dv.VBD(h, 2)}
-    prepared = prepare(model, tuple(x.shape[:-2]), rest_points=None, density=None, parameters=None, **options)
-    begun = begin(model, x, v, prepared, loads["force"], acceleration_of(loads["gravity"], x), loads["prescribed"])
-    end = dv.step(model, x, v, **options, **loads)[0].reshape(begun.y.shape)
+    solver, inputs = scene.solver(2), scene.inputs(device=device)
+    model, h = system_of(scene.model(device), solver), solver.time_step
+    given = {name: inputs[name] for name in ("mu", "lam", "force", "gravity", "prescribed")}
+    x, v = inputs["x"], inputs["v"]
+    prepared = prepare(model, tuple(x.shape[:-2]), given_of(model, given), time_step=h, sweeps=2)
+    begun = begin(model, x, v, prepared, given["force"], acceleration_of(given["gravity"], x), given["prescribed"])
+    end = dv.step(model.model, x, v, solver, **given)[0].reshape(begun.y.shape)
     potential = IncrementalPotential(model, end, begun.fields(model, prepared), h)
     w = torch.randn(end.shape, dtype=end.dtype, generator=torch.Generator().manual_seed(1)).to(device) * potential.free
 

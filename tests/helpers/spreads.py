@@ -41,16 +41,16 @@ def assert_near_contact(result: dict[str, Tensor], expected: dict[str, Tensor], 
     assert not failures, failures
 
 
-def assert_near_reference(model: Any, inputs: dict, sweeps: int, steps: int, result: dict[str, Tensor],
+def assert_near_reference(model: Any, inputs: dict, solver: Any, steps: int, result: dict[str, Tensor],
                           *decisions: Any) -> dict[str, Tensor]:  # fmt: skip
     """Every entry of `result` within what rounding makes of the reference; returns the reference's. decisions: lengths
     of the corrections, and what was combined, as testing.reference_result takes them."""
-    expected = testing.reference_result(model, inputs, sweeps, steps, None, *decisions)
+    expected = testing.reference_result(model, inputs, solver, steps, None, *decisions)
     floors = {name: tolerance("adjoint") for name in expected}
     floors |= {"x": tolerance("coarse_forward"), "v": tolerance("cancelling")}
     # one permutation is one sample: the second asks what an ulp in the inputs does to this scene
     samples = [
-        lambda sample=sample: sample(model, inputs, sweeps, steps, expected, *decisions)
+        lambda sample=sample: sample(model, inputs, solver, steps, expected, *decisions)
         for sample in (testing.spread, testing.sensitivity)
     ]
     failures = beyond(errors_between(result, expected), floors, samples)

@@ -89,22 +89,19 @@ def test_printed_they_say_who_presses_whom() -> None:
 
 
 def run(scene: contact_scenes.Scene, sweeps: int, model: dv.Model | None = None) -> tuple[dv.Model, dict[str, Any]]:
-    """A Model and a step of it, as `dv.contact.forces` takes it; beside it the velocity after the step."""
+    """A Model and a step of it, as `dv.contact.forces` takes it."""
     model = scene.model if model is None else model
-    given = {k: v.to(model.device, model.dtype) for k, v in {**scene.inputs, "x": scene.x, "v": scene.v}.items()}
-    parameters = {k: v.to(model.device, model.dtype) for k, v in scene.parameters.items()}
+    given = {**scene.inputs, **scene.parameters, "x": scene.x, "v": scene.v}
+    given = {k: v.to(model.device, model.dtype) for k, v in given.items()}
     x, v = given.pop("x"), given.pop("v")
-    end, speed = dv.step(model, x, v, dv.VBD(scene.time_step, sweeps), gravity=contact_scenes.GRAVITY, **parameters,
-                         **given)  # fmt: skip
-    places = {k: given[k] for k in ("colliders", "colliders_before") if k in given}
-    return model, {"x": end, "speed": speed, "previous": (x, v), "time_step": scene.time_step,
-                   "parameters": parameters, **places}  # fmt: skip
+    end, _ = dv.step(model, x, v, scene.solver(sweeps), gravity=contact_scenes.GRAVITY, **given)
+    read = {k: given[k] for k in ("colliders", "colliders_before", *scene.parameters) if k in given}
+    return model, {"x": end, "solver": scene.solver(sweeps), "previous": (x, v), **read}
 
 
 @pytest.mark.parametrize("name", contact_scenes.SCENES)
 def test_sums_over_bodies_colliders_and_planes_are_those_over_vertices(name: str) -> None:
     model, options = run(contact_scenes.SCENES[name](), 5)
-    options.pop("speed")
     found = dv.contact.forces(model, **options)
     for part in range(2):
         on_bodies = per_body(model, found.vertices[part])
@@ -122,15 +119,17 @@ def test_sums_over_bodies_colliders_and_planes_are_those_over_vertices(name: str
 def test_a_converged_step_is_newtons_second_law(device: str, scene: str) -> None:
     """Contact, weight and the change of momentum of each body, with friction and damping of a sliding stack."""
     model = stack(scene, dv.Friction(0.3, 0.05), device=device)
-    x, h = model.rest_points, 0.005
+    x = model.rest_points
     v = torch.zeros_like(x)
     v[:8, 0], v[8:, 2] = 0.2, 0.1
-    parameters = {"pair_damping": torch.tensor(5.0, dtype=x.dtype, device=device)}
-    done = dv.solve(model, x, v, dv.VBD(h, 1), tolerance=1e-12, **parameters, **SOFT)
+    solver = dv.VBD(0.005, 1)
+    done = dv.solve(model, x, v, solver, tolerance=1e-12, pair_damping=5.0, **SOFT)
     assert dv.contact.status(model).cut == [0]
-    found = dv.contact.forces(model, done.x, previous=(x, v), time_step=h, parameters=parameters)
+    found = dv.contact.forces(model, done.x, solver, previous=(x, v), pair_damping=5.0)
     mass = model.mass[:, None]
-    gained = per_body(model, mass * (done.v - v)) / h + per_body(model, mass) * mass.new_tensor([0.0, GRAVITY, 0.0])
+    gained = per_body(model, mass * (done.v - v)) / solver.time_step + per_body(model, mass) * mass.new_tensor(
+        [0.0, GRAVITY, 0.0]
+    )
     on_bodies = per_body(model, found.vertices.total)
     assert relative_error(on_bodies, gained) <= tolerance("closed_form")
     ground = (found.floors if scene == "floor" else found.colliders).tangential[0, 0]
@@ -142,16 +141,12 @@ def test_a_converged_step_is_newtons_second_law(device: str, scene: str) -> None
 def test_gradients_agree_with_differences(name: str) -> None:
     scene = contact_scenes.SCENES[name]()
     model, options = run(scene, 6)
-    options.pop("speed")
-    x, (before, v), parameters = options.pop("x"), options.pop("previous"), options.pop("parameters")
-    h = options.pop("time_step")
-    known = [k for k in parameters if k != "floor_height"]
-    arguments = {"x": x, "before": before, **options, **{k: parameters[k] for k in known}}
+    x, (before, v), solver = options.pop("x"), options.pop("previous"), options.pop("solver")
+    options.pop("floor_height", None)  # without a derivative here
+    arguments = {"x": x, "before": before, **options}
 
-    def loss(**given: Any) -> Tensor:
-        named = {k: given.pop(k) for k in known}
-        at, start = given.pop("x"), given.pop("before")
-        found = dv.contact.forces(model, at, previous=(start, v), time_step=h, parameters=named, **given)
+    def loss(x: Tensor, before: Tensor, **given: Tensor) -> Tensor:
+        found = dv.contact.forces(model, x, solver, previous=(before, v), **given)
         out = x.new_zeros(())
         for part in (found.vertices, found.between, found.colliders, found.floors):
             for number, values in enumerate(part):
@@ -169,22 +164,21 @@ def test_gradients_agree_with_differences(name: str) -> None:
 def test_scenes_of_a_batch_are_as_if_alone(device: str) -> None:
     scene = contact_scenes.batched()
     model, options = run(scene, 5, scene.model.to(device))
-    options.pop("speed")
     found = dv.contact.forces(model, **options)
     for k in range(3):
-        own_parameters = {n: p[k] if p.shape[:1] == (3,) else p for n, p in options["parameters"].items()}
-        alone = {
-            "x": options["x"][k],
-            "previous": tuple(t[k] for t in options["previous"]),
-            "parameters": own_parameters,
-        }
-        own = dv.contact.forces(model, time_step=scene.time_step, **alone)
+        previous = tuple(t[k] for t in options["previous"])
+        parameters = {n: options[n][k] if options[n].shape[:1] == (3,) else options[n] for n in scene.parameters}
+        own = dv.contact.forces(model, options["x"][k], options["solver"], previous=previous, **parameters)
         assert own.body_pairs.tolist() == found.body_pairs.tolist() == [[0, 1]]
         for name in ("vertices", "between", "colliders", "floors"):
             for a, b in zip(getattr(found, name), getattr(own, name), strict=True):
                 assert relative_error(a[k], b) <= tolerance("formula"), name
     empty = dv.contact.forces(model, options["x"][:0])
     assert empty.vertices.normal.shape == (0, 16, 3) and empty.floors.normal.shape == (0, 2, 1, 3)
+
+
+STEP = dv.VBD(0.1, 1)
+BELOW, LOST = torch.full((16, 3), -9.0).double(), torch.full((16, 3), torch.nan).double()
 
 
 @pytest.mark.parametrize(
@@ -194,20 +188,20 @@ def test_scenes_of_a_batch_are_as_if_alone(device: str) -> None:
         ({"x": torch.zeros(16, 3)}, "x: expected dtype torch.float64"),
         ({"previous": torch.zeros(16, 3).double()}, "previous: expected positions and velocities"),
         ({"previous": (torch.zeros(3).double(), torch.zeros(3).double())}, "previous: x: expected shape"),
-        ({"previous": (torch.zeros(2, 16, 3).double(),) * 2, "time_step": 0.1}, "previous: expected x's shape"),
-        ({"previous": (torch.zeros(16, 3).double(),) * 2}, "time_step: expected a number in .s. where previous"),
-        ({"time_step": -1.0}, "time_step: expected"),
+        ({"previous": (torch.zeros(2, 16, 3).double(),) * 2, "solver": STEP}, "previous: expected x's shape"),
+        ({"previous": (torch.zeros(16, 3).double(),) * 2}, "solver: expected"),
+        ({"solver": -1.0}, "solver: expected"),
         ({"colliders": torch.zeros(1, 3).double()}, "colliders: expected a Model with colliders"),
-        ({"parameters": {"pair_kapa": 1.0}}, "parameters: expected names among"),
-        ({"parameters": {"pair_kappa": torch.tensor(-1.0).double()}}, "pair_barrier.kappa: expected finite"),
-        ({"x": torch.full((16, 3), torch.nan).double()}, "x: expected finite values, got nan"),
-        ({"previous": (torch.full((16, 3), torch.nan).double(),) * 2, "time_step": 0.1}, "previous: x: .* finite"),
+        ({"pair_kapa": 1.0}, "pair_kapa: expected an input of this Model .*: is 'pair_kappa' meant"),
+        ({"pair_kappa": torch.tensor(-1.0).double()}, "pair_kappa: expected finite"),
+        ({"x": LOST}, "x: expected finite values, got nan"),
         (
-            {"x": torch.full((16, 3), -9.0).double()},
-            "x: expected every unpinned vertex above the floor, got vertex 0",
+            {"previous": (LOST, LOST), "solver": STEP},
+            "previous: x: .* finite",
         ),
+        ({"x": BELOW}, "x: expected every unpinned vertex above the floor, got vertex 0"),
         (
-            {"previous": (torch.full((16, 3), -9.0).double(),) * 2, "time_step": 0.1},
+            {"previous": (BELOW, BELOW), "solver": STEP},
             "previous: x: expected every",
         ),
         ({"x": torch.zeros(16, 3).double()}, "x: expected surfaces that do not touch, got .* pairs without a gap"),

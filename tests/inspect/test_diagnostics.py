@@ -1,5 +1,6 @@
 """`diagnose` names each limit that a state, a step or a Model crosses, and nothing else."""
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -28,7 +29,7 @@ def test_rest_state_is_clean() -> None:
     model = cube()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        result = diagnose(model, model.rest_points, time_step=1 / 60, **MATERIAL)
+        result = diagnose(model, model.rest_points, dv.VBD(1 / 60, 1), **MATERIAL)
     assert result.ok
     assert result.smallest_volume_ratio == pytest.approx(1)
     assert result.largest_strain < tolerance("geometry")
@@ -67,20 +68,19 @@ def test_strain_and_nonfinite_positions() -> None:
 
 
 def test_settings_that_do_not_promise_descent() -> None:
-    def messages(lam: float = 1.5e5, **options) -> list[str]:
-        model = cube(**options)
-        return diagnose(model, model.rest_points, mu=1e5, lam=lam, warn=False).messages
+    model = cube()
 
-    # TODO62: block="paper" of the solver
-    paper = (dv.StableNeoHookean(),)
-    only(messages(lam=5e4, energies=paper), "lam < mu")
-    only(messages(energies=paper, relaxation=1.6), "relaxation")
+    def messages(lam: float = 1.5e5, **options) -> list[str]:
+        solver = dv.VBD(1 / 60, 1, **options)
+        return diagnose(model, model.rest_points, solver, mu=1e5, lam=lam, warn=False).messages
+
+    only(messages(lam=5e4, block="paper"), "lam < mu")
+    only(messages(block="paper", relaxation=1.6), "relaxation")
     only(messages(relaxation=1.9), "relaxation")
     assert any("bulk modulus" in m for m in messages(lam=-8e4))
     assert messages(lam=5e4) == []
 
 
-# TODO62: give the solver of over: relaxation=1.6
 def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
     mesh = dv.mesh.cube(3, split="kuhn")
     floor = dv.FloorBarrier(height=-0.01, kappa=1e4)
@@ -90,17 +90,18 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
     options = {"force": force, **MATERIAL}
     left = []
     for sweeps in (1, 10, 1000):
-        end, _ = dv.step(model, x, v, dv.VBD(1 / 60, sweeps), **options)
-        left.append(diagnose(model, end, previous=(x, v), warn=False, **options).unbalanced)
+        solver = dv.VBD(1 / 60, sweeps)
+        end, _ = dv.step(model, x, v, solver, **options)
+        left.append(diagnose(model, end, solver, previous=(x, v), warn=False, **options).unbalanced)
     assert left[0] > left[1] > left[2]
     assert left[2] < tolerance("closed_form")
     stiff = {"mu": 1e8, "lam": 1e8}
-    end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 1), **stiff)
+    solver = dv.VBD(1 / 60, 1)
+    end, _ = dv.step(model, x, v, solver, **stiff)
     with pytest.warns(UserWarning, match="sweeps or a smaller time step, or relaxation between"):
-        diagnose(model, end, previous=(x, v), **stiff)
-    over = dv.Model(mesh, energies=model.energies)
+        diagnose(model, end, solver, previous=(x, v), **stiff)
     with pytest.warns(UserWarning, match="sweeps or a smaller time step$"):
-        diagnose(over, end, previous=(x, v), **stiff)
+        diagnose(model, end, dataclasses.replace(solver, relaxation=1.6), previous=(x, v), **stiff)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -119,14 +120,15 @@ def test_pinned_reactions_are_no_residual() -> None:
     model = cube()
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     prescribed = torch.where(model.pinned[:, None], x + 0.01, torch.nan)
-    end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 2000), prescribed=prescribed, **MATERIAL)
-    result = diagnose(model, end, time_step=1 / 60, previous=(x, v), prescribed=prescribed, warn=False, **MATERIAL)
+    solver = dv.VBD(1 / 60, 2000)
+    end, _ = dv.step(model, x, v, solver, prescribed=prescribed, **MATERIAL)
+    result = diagnose(model, end, solver, previous=(x, v), prescribed=prescribed, warn=False, **MATERIAL)
     assert result.unbalanced is not None and result.unbalanced < tolerance("closed_form")
 
 
 def test_courant_number_counts_elements_per_step() -> None:
     model = cube()
-    result = diagnose(model, model.rest_points, time_step=0.1, **MATERIAL, warn=False)
+    result = diagnose(model, model.rest_points, dv.VBD(0.1, 1), **MATERIAL, warn=False)
     # the shortest height of a Kuhn tet with legs a is a / sqrt(2)
     assert result.courant == pytest.approx(0.1 * (3.5e5 / 1000) ** 0.5 / (0.5 / 2**0.5))
     assert diagnose(model, model.rest_points, warn=False, **MATERIAL).courant is None
@@ -135,7 +137,7 @@ def test_courant_number_counts_elements_per_step() -> None:
 def test_bad_arguments() -> None:
     model = cube()
     x = model.rest_points
-    with pytest.raises(ValueError, match="time_step"):
+    with pytest.raises(ValueError, match="solver"):
         diagnose(model, x, previous=(x, x), **MATERIAL)
     with pytest.raises(ValueError, match="x: expected shape"):
         diagnose(model, x[:-1], **MATERIAL)
@@ -147,23 +149,19 @@ def test_bad_arguments() -> None:
 # --- `diagnose(previous=)` tells, body by body, what a step with contact left unbalanced, and of friction apart ---
 
 
-# TODO62: part of a solver in these options
-SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.005}
+SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4}
 
 
 def test_more_sweeps_leave_less(device: str) -> None:
     scene = contact_scenes.batched()
     model = scene.model.to(device)
-    given = {k: v.to(device) for k, v in scene.inputs.items()}
-    density = given.pop("density")
-    parameters = {k: v.to(device) for k, v in scene.parameters.items()}
+    given = {k: v.to(device) for k, v in {**scene.inputs, **scene.parameters}.items()}
+    given["gravity"] = contact_scenes.GRAVITY
     x, v = scene.x.to(device), scene.v.to(device)
-    options: dict[str, Any] = {**given, "gravity": contact_scenes.GRAVITY, "parameters": parameters}
-    assert density.shape == (3, model.num_tets)
     found = []
     for sweeps in (2, 20, 500):
-        end, _ = dv.step(model, x, v, dv.VBD(0.01, sweeps), **options)
-        found.append(dv.diagnose(model, end, dv.VBD(0.01, 1), previous=(x, v), warn=False, **options))
+        end, _ = dv.step(model, x, v, scene.solver(sweeps), **given)
+        found.append(dv.diagnose(model, end, scene.solver(sweeps), previous=(x, v), warn=False, **given))
     for less, more in zip(found[:-1], found[1:], strict=True):
         assert (more.residuals < less.residuals).all() and more.unbalanced < less.unbalanced
         assert (more.friction_residuals < less.friction_residuals).all()
@@ -173,22 +171,22 @@ def test_more_sweeps_leave_less(device: str) -> None:
     assert float(found[-1].friction_residuals[0].max()) <= tolerance("closed_form")
 
 
-def grip() -> tuple[dv.Model, dict[str, Any], torch.Tensor, torch.Tensor]:
+def grip() -> dv.Model:
     """A block between two pinned ones that press on it, and a body far away in free fall; sticks by friction."""
     blocks = [box(2, 0.1), *(box(2, 0.08).translate((at, 0.01, 0.01)) for at in (-0.085, 0.105)),
               box(2, 0.1).translate((1.0, 0.0, 0.0))]  # fmt: skip
     energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01, self_contact=False), dv.Friction(0.6, 0.01))
-    model = dv.Model(join(blocks), density=100.0, pinned=list(range(8, 24)), energies=energies)
-    x = model.rest_points
-    return model, {"mu": 2e4, "lam": 4e4, "time_step": 1 / 240}, x, torch.zeros_like(x)
+    return dv.Model(join(blocks), density=100.0, pinned=list(range(8, 24)), energies=energies)
 
 
 def test_friction_that_has_not_converged_is_named() -> None:
-    model, options, x, v = grip()
-    few, _ = dv.step(model, x, v, **options, solver=scene.solver(1))
+    model, solver = grip(), dv.VBD(1 / 240, 1)
+    x = model.rest_points
+    v = torch.zeros_like(x)
+    few, _ = dv.step(model, x, v, solver, **SOFT)
     few[:8, 1] -= 1e-3  # it slips
     with pytest.warns(UserWarning) as warned:
-        bad = dv.diagnose(model, few, previous=(x, v), **options)
+        bad = dv.diagnose(model, few, solver, previous=(x, v), **SOFT)
     texts = [str(w.message) for w in warned]
     assert any("of the forces of body 0 unbalanced" in t for t in texts), texts
     assert any("friction has not converged" in t and "body 0" in t for t in texts), texts
@@ -197,9 +195,8 @@ def test_friction_that_has_not_converged_is_named() -> None:
     assert "left-over share of friction" in str(bad)
 
     goal = tolerance("closed_form")
-    # TODO62: the solver of this call
-    done = dv.solve(model, x, v, tolerance=goal, **options)
-    good = dv.diagnose(model, done.x, previous=(x, v), **options)
+    done = dv.solve(model, x, v, solver, tolerance=goal, **SOFT)
+    good = dv.diagnose(model, done.x, solver, previous=(x, v), **SOFT)
     assert float(good.residuals.max()) <= goal and not any("unbalanced" in m or "friction" in m for m in good.messages)
     assert float(good.friction_residuals.max()) <= tolerance("minimum")
 
@@ -207,8 +204,9 @@ def test_friction_that_has_not_converged_is_named() -> None:
 def test_bodies_without_contact_have_residuals_too() -> None:
     model = dv.Model(join([box(2, 0.2), box(2, 0.2).translate((1.0, 0, 0))]), pinned=[0, 1, 8, 9])
     x = model.rest_points
-    end, _ = dv.step(model, x, 0 * x, **SOFT, solver=scene.solver(2))
-    told = dv.diagnose(model, end, previous=(x, 0 * x), warn=False, **SOFT)
+    solver = dv.VBD(0.005, 2)
+    end, _ = dv.step(model, x, 0 * x, solver, **SOFT)
+    told = dv.diagnose(model, end, solver, previous=(x, 0 * x), warn=False, **SOFT)
     assert told.residuals.shape == (2,) and (told.residuals > 0).all() and told.friction_residuals is None
 
 
@@ -218,13 +216,13 @@ def test_loads_that_are_not_finite_are_named(name: str) -> None:
     x = model.rest_points
     load = torch.full((3,), torch.nan, dtype=x.dtype)
     with pytest.raises(ValueError, match=f"{name}: expected finite values, got nan"):
-        dv.diagnose(model, x, previous=(x, 0 * x), **{name: load}, **SOFT)
+        dv.diagnose(model, x, dv.VBD(0.005, 1), previous=(x, 0 * x), **{name: load}, **SOFT)
 
 
-def test_the_estimate_of_an_error_raises_with_contact() -> None:
-    model = two_boxes()
+def test_no_error_is_estimated_with_contact() -> None:
+    model, solver = two_boxes(), dv.VBD(0.005, 5)
     x = model.rest_points
-    with pytest.raises(NotImplementedError, match="sweeps: the error of a step with contact"):
-        dv.diagnose(model, x, previous=(x, 0 * x), warn=False, **SOFT, solver=scene.solver(5))
+    told = dv.diagnose(model, x, solver, previous=(x, 0 * x), warn=False, **SOFT)
+    assert told.errors is None and told.relative_error is None
     with pytest.raises(ValueError, match="colliders: expected a Model with colliders"):
-        dv.diagnose(model, x, previous=(x, 0 * x), colliders=x[:1], warn=False, **SOFT)
+        dv.diagnose(model, x, solver, previous=(x, 0 * x), colliders=x[:1], warn=False, **SOFT)

@@ -46,9 +46,8 @@ def test_reactions_of_a_step_are_newtons_second_law(device: str) -> None:
     v = torch.zeros_like(x)
     v[:8, 0] = 0.2
     moved = torch.where(model.pinned[:, None], x + 1e-4, torch.nan)
-    options: dict[str, Any] = {**SOFT}
-    done = dv.solve(model, x, v, dv.VBD(h, 1), prescribed=moved, tolerance=1e-12, **options)
-    held = dv.reactions(model, done.x, dv.VBD(h, 1), previous=(x, v), **options)
+    done = dv.solve(model, x, v, dv.VBD(h, 1), prescribed=moved, tolerance=1e-12, **SOFT)
+    held = dv.reactions(model, done.x, dv.VBD(h, 1), previous=(x, v), **SOFT)
     mass = model.mass[:, None]
     gained = (mass * (done.v - v)).sum(0) / h + x.new_tensor([0.0, GRAVITY, 0.0]) * mass.sum()
     assert relative_error(held.sum(0), gained) <= tolerance("closed_form")
@@ -156,7 +155,7 @@ def test_batches_and_float32(device: str, what: str) -> None:
     [
         (lambda m, x: dv.reactions(m, x), "mu: expected"),
         (lambda m, x: dv.reactions(m, x[:3], **SOFT), r"x: expected shape \[..., 27, 3\]"),
-        (lambda m, x: dv.reactions(m, x, previous=(x, 0 * x), **SOFT), "time_step: expected"),
+        (lambda m, x: dv.reactions(m, x, previous=(x, 0 * x), **SOFT), "solver: expected"),
         (lambda m, x: dv.reactions(m, x, dv.VBD(0.1, 1), previous=(x, x / 0), **SOFT), "previous: v: expected finite"),
         (lambda m, x: dv.reactions(m, x, force=x[:3], **SOFT), "force: expected"),
         (lambda m, x: dv.reactions(m, x, gravity=(1.0, 2.0), **SOFT), "gravity: expected 3 numbers"),

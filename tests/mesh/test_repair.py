@@ -112,7 +112,7 @@ def test_holes_and_crowded_edges_are_counted() -> None:
     [
         ({"up": "w"}, "up: expected one of y, -y, z, -z, x, -x, got 'w'"),
         ({"up": []}, r"up: expected one of y, -y, z, -z, x, -x, got \[\]"),
-        ({"size": 1.0, "scale": 2.0}, "size: expected none beside scale = 2.0, got 1.0"),
+        ({"size": 1.0, "scale": 2.0}, "size: expected none with scale = 2.0, got 1.0"),
         ({"size": 0.0}, "size: expected a positive length, got 0"),
         ({"scale": -1.0}, "scale: expected a positive length, got -1"),
         ({"surface": (dm.cube().points, dm.cube().surface[:0])}, "surface: expected triangles, got none"),

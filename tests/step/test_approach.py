@@ -32,7 +32,8 @@ def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list
     at = model.collider_points
     with dv.record("integrator") as euler:
         motion = dv.rollout(model, model.rest_points, v, dv.VBD(TIME_STEP, 200, integrator=integrator), steps=len(ways),
-                            mu=1e5, lam=1e5, gravity=GRAVITY, colliders=dv.per_step(at + ways), colliders_before=at)  # fmt: skip
+                            mu=1e5, lam=1e5, gravity=GRAVITY, colliders=dv.per_step(at + ways),
+                            colliders_before=at)  # fmt: skip
     return list(euler), motion
 
 
@@ -80,13 +81,13 @@ def test_colliders_go_on_from_where_the_first_solve_has_left_them(
         assert (moved - found[0]).abs().max() <= tolerance("property_subset")
 
 
-@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize("integrator", (dv.ImplicitEuler(), dv.SDIRK2()), ids=str)
 def test_colliders_end_at_those_of_the_model_unless_they_are_given(integrator: Any, device: str) -> None:
     model = model_above("plane", 0.011, device)
     x, at = model.rest_points, model.collider_points
-    given = {"mu": 1e5, "lam": 1e5, "colliders_before": at - 1e-3, "solver": dv.VBD(TIME_STEP, 5,
-                                                                                    integrator=integrator)}  # fmt: skip
-    own, same = (dv.step(model, x, torch.zeros_like(x), **given, **more)[0] for more in ({}, {"colliders": at}))
+    solver = dv.VBD(TIME_STEP, 5, integrator=integrator)
+    given = {"mu": 1e5, "lam": 1e5, "colliders_before": at - 1e-3}
+    own, same = (dv.step(model, x, 0 * x, solver, **given, **more)[0] for more in ({}, {"colliders": at}))
     assert torch.equal(own, same) and (own - x).abs().max() > 0
 
 

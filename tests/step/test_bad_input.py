@@ -114,7 +114,8 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
 
 SOLVERS: list[tuple[str, Any, str]] = [
     *(("time_step", value, got) for value, got in
-      ((0, "0"), (-0.1, "-0.1"), (NAN, "nan"), (INF, "inf"), (10**400, "1329 bits"), (True, "bool"), ("fast", "str"), (None, "None"))),
+      ((0, "0"), (-0.1, "-0.1"), (NAN, "nan"), (INF, "inf"), (10**400, "1329 bits"), (True, "bool"), ("fast", "str"),
+       (None, "None"))),
     *(("sweeps", value, got) for value, got in
       ((-1, "-1"), (1.5, "1.5"), (2.0, "2.0"), (10**400, "10000"), (True, "bool"), ("3", "'3'"), (None, "None"))),
 ]  # fmt: skip
@@ -129,7 +130,6 @@ def test_bad_argument_of_a_solver(name: str, value: Any, got: str) -> None:
 @pytest.mark.parametrize("time_step", (1e-310, 1e-160, 1e160))
 def test_a_time_step_whose_square_no_float_holds(device: str, time_step: float) -> None:
     raises(lambda: step_with(model_of(device), "solver", dv.VBD(time_step, 1)), "time_step", re.escape(str(time_step)))
-
 
 
 def step_with(model: dv.Model, name: str, value: Any, lead: tuple[int, ...] = (), **options: Any) -> Any:

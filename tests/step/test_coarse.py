@@ -12,37 +12,39 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference, testing
+from diffvbd.model.system import system_of
 from diffvbd.testing import CASES, build_scene, evaluate, relative_error, tolerance
 
+MODULI = {"mu": 1e7, "lam": 1e7}
 
-def cantilever(**options: Any) -> tuple[dv.Model, dict[str, Any]]:
+
+def cantilever() -> dv.Model:
     mesh = dv.mesh.box((13, 4, 4), (1.0, 0.2, 0.2))
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, **options)
-    return model, {"mu": 1e7, "lam": 1e7, "time_step": 1 / 60}
+    return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
 
 
-def end(model: dv.Model, given: dict[str, Any], sweeps: int, steps: int = 10) -> Tensor:
+def solver_of(sweeps: int, subspace: Any = "coarse") -> dv.VBD:
+    return dv.VBD(1 / 60, sweeps, relaxation=1.5, subspace=subspace)
+
+
+def end(model: dv.Model, solver: dv.VBD) -> Tensor:
     x = model.rest_points
-    # TODO62: the solver of this call
-    return dv.rollout(model, x, torch.zeros_like(x), steps=steps, save="last", **given, sweeps=sweeps).x[-1]
+    return dv.rollout(model, x, torch.zeros_like(x), solver, steps=10, save="last", **MODULI).x[-1]
 
 
 def test_a_stiff_cantilever_in_four_sweeps() -> None:
-    model, given = cantilever(coarse="auto", relaxation=1.5)
-    goal = end(model, given, 60)
+    model = cantilever()
+    goal = end(model, solver_of(60))
     motion = (goal - model.rest_points).abs().max()
     x, v = goal, torch.zeros_like(goal)
-    # TODO62: the solver of this call
-    after, _ = dv.step(model, x, v, **given, sweeps=60)
-    # TODO62: the solver of this call
-    solved = dv.solve(model, x, v, tolerance=1e-10, **given)  # which looks at the forces that are left
+    after, _ = dv.step(model, x, v, solver_of(60), **MODULI)
+    solved = dv.solve(model, x, v, solver_of(0), tolerance=1e-10, **MODULI)  # which looks at the forces that are left
     assert relative_error(after - x, solved.x - x) <= tolerance("closed_form")
-    # TODO62: the solver of this call
-    swept = dv.solve(model, x, v, tolerance=1e-10, **given)
+    swept = dv.solve(model, x, v, solver_of(0), tolerance=1e-10, adjoint=dv.ReverseSweep(), **MODULI)
     assert swept.converged
     assert relative_error(swept.x - x, solved.x - x) <= tolerance("closed_form")
-    error = {k: float((end(model, given, k) - goal).abs().max() / motion) for k in (4, 10)}
-    plain = float((end(cantilever(relaxation=1.5)[0], given, 20) - goal).abs().max() / motion)
+    error = {k: float((end(model, solver_of(k)) - goal).abs().max() / motion) for k in (4, 10)}
+    plain = float((end(model, solver_of(20, "rigid")) - goal).abs().max() / motion)
     assert error[4] < 0.01 and error[10] < error[4] / 100 and plain > 0.1, (error, plain)
 
 
@@ -50,23 +52,22 @@ def test_a_stiff_cantilever_in_four_sweeps() -> None:
 @pytest.mark.parametrize("sweeps", (0, 5))
 def test_no_step_ends_above_its_start(case: str, sweeps: int) -> None:
     scene = build_scene(case, "structured", "small")
-    model, inputs = scene.model(coarse="auto", rigid=False), scene.inputs()
+    model, inputs = scene.model(), scene.inputs()
     with torch.no_grad():
-        model_of_start = scene.model(start="inertia", rigid=False)
-        begun, _ = dv.step(model_of_start, solver=scene.solver(0), **inputs)
-        ended, _ = dv.step(model, solver=scene.solver(sweeps), **inputs)
-        potential = [_potential(model, at, inputs) for at in (begun, ended)]
+        begun, _ = dv.step(model, solver=scene.solver(0, start="inertia"), **inputs)
+        ended, _ = dv.step(model, solver=scene.solver(sweeps, subspace="coarse"), **inputs)
+        potential = [_potential(model, at, inputs, scene.case.time_step) for at in (begun, ended)]
     assert not torch.equal(begun, ended) or case == "huge_strain"
     assert potential[1] <= potential[0] * (1 + tolerance("energy_gain")), potential
 
 
-def _potential(model: dv.Model, x: Tensor, inputs: dict[str, Any]) -> float:
-    names = ("mu", "lam", "time_step", "rest_points", "density", "parameters")
-    given = {name: inputs[name] for name in names if name in inputs}
+def _potential(model: dv.Model, x: Tensor, inputs: dict[str, Any], h: float) -> float:
+    given = {name: inputs[name] for name in ("mu", "lam", "rest_points", "density")}
+    parameters = {name: value for name, value in inputs.items() if name.startswith(("floor_", "anchor_"))}
     load = inputs["gravity"] + inputs["force"] / model.mass[:, None]
-    h, held = inputs["time_step"], model.pinned[:, None]
-    y = torch.where(held, inputs["prescribed"], inputs["x"] + h * inputs["v"] + h * h * load)
-    return float(reference.incremental_potential(model, x, y, x_prev=inputs["x"], **given))
+    y = torch.where(model.pinned[:, None], inputs["prescribed"], inputs["x"] + h * inputs["v"] + h * h * load)
+    return float(reference.incremental_potential(model, x, y, x_prev=inputs["x"], time_step=h, parameters=parameters,
+                                                 **given))  # fmt: skip
 
 
 def test_momentum_of_a_free_body() -> None:
@@ -74,9 +75,7 @@ def test_momentum_of_a_free_body() -> None:
     model = dv.Model(mesh)
     wave = torch.sin(40 * model.rest_points.flip(-1))
     x, v = model.rest_points + 0.01 * wave, torch.cos(30 * model.rest_points)
-    x_end, v_end = dv.step(
-        model, x, v, dv.VBD(1 / 60, 4, relaxation=1.5, subspace="coarse"), mu=1e6, lam=1e6, gravity=(0.0, 0.0, 0.0)
-    )
+    x_end, v_end = dv.step(model, x, v, solver_of(4), mu=1e6, lam=1e6, gravity=(0.0, 0.0, 0.0))
     mass = model.mass[:, None]
     before, after = (mass * v).sum(0), (mass * v_end).sum(0)
     assert relative_error(after, before) <= tolerance("sum")
@@ -97,9 +96,7 @@ def test_same_bits_on_one_thread_and_on_two() -> None:
     try:
         for n in (1, 2):
             torch.set_num_threads(n)
-            x_end, v_end = dv.step(
-                model, x, torch.zeros_like(x), dv.VBD(1 / 60, 8, relaxation=1.5, subspace="coarse"), mu=1e6, lam=1e6
-            )
+            x_end, v_end = dv.step(model, x, torch.zeros_like(x), solver_of(8), mu=1e6, lam=1e6)
             (bar,) = torch.autograd.grad(x_end.square().sum() + v_end.square().sum(), x)
             found.append((x_end.detach(), bar))
     finally:
@@ -111,9 +108,8 @@ def test_scenes_and_bodies_do_not_mix() -> None:
     """A batch is its scenes one by one, and two bodies far apart are what each is alone."""
     one = dv.mesh.box((4, 4, 4), (0.2, 0.2, 0.2))
     two = dv.mesh.join([one, dv.mesh.box((5, 3, 3), (0.4, 0.1, 0.1)).translate((3.0, 0.0, 0.0))])
-    options = {"coarse": dv.CoarseSpace(functions=10), "relaxation": 1.5}
-    given = {"mu": 1e6, "lam": 1e6, "solver": dv.VBD(1 / 60, 5)}
-    model, alone = dv.Model(two, **options), dv.Model(one, **options)
+    given: dict[str, Any] = {"mu": 1e6, "lam": 1e6, "solver": solver_of(5, dv.CoarseSpace(functions=10))}
+    model, alone = dv.Model(two), dv.Model(one)
     x = torch.stack([model.rest_points, model.rest_points * 1.05])
     ends, _ = dv.step(model, x, torch.zeros_like(x), **given)
     for scene in range(2):
@@ -125,25 +121,29 @@ def test_scenes_and_bodies_do_not_mix() -> None:
 
 
 def test_float32_is_near_float64() -> None:
-    model, given = cantilever(coarse="auto", relaxation=1.5)
-    single = end(model.to(dtype=torch.float32), given, 5)
+    model = cantilever()
+    single = end(model.to(dtype=torch.float32), solver_of(5))
     assert single.dtype == torch.float32
-    assert relative_error(single, end(model, given, 5)) <= tolerance("float32_forward")
+    assert relative_error(single, end(model, solver_of(5))) <= tolerance("float32_forward")
 
 
-# TODO62: block="paper" of the solver
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"coarse": "yes"}, 'coarse: expected a diffvbd.CoarseSpace, "auto" or None'),
-        ({"coarse": "auto", "saturation": 0.1}, "coarse: expected None with saturation"),
-        ({"coarse": "auto", "energies": dv.StableNeoHookean()}, "its exact block"),
-        ({"coarse": "auto", "energies": ()}, "None without StableNeoHookean"),
+        ({"subspace": "yes"}, 'subspace: expected "rigid", "coarse", a diffvbd.CoarseSpace or None'),
+        ({"saturation": 0.1}, "subspace: expected no coarse space with saturation"),
+        ({"block": "paper"}, 'subspace: expected no coarse space with block="paper"'),
     ],
 )
 def test_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
-        dv.Model(dv.mesh.cube(3), **options)
+        dv.VBD(**{"time_step": 0.01, "sweeps": 1, "subspace": "coarse", **options})
+
+
+def test_refused_without_an_elastic_law() -> None:
+    model = dv.Model(dv.mesh.cube(3), energies=())
+    with pytest.raises(ValueError, match="subspace: expected no coarse space without StableNeoHookean"):
+        dv.step(model, model.rest_points, 0 * model.rest_points, solver_of(1))
 
 
 @pytest.mark.parametrize("options", [{"functions": 0}, {"degree": 4}, {"every": 0}, {"groups": "many"}])
@@ -154,21 +154,20 @@ def test_bad_spaces(options: dict[str, Any]) -> None:
 
 
 def test_transforms_are_refused() -> None:
-    model, given = cantilever(coarse="auto")
+    model = cantilever()
     x = model.rest_points
     with pytest.raises(NotImplementedError, match="coarse corrections"):
-        # TODO62: the solver of this call
-        torch.func.vmap(lambda y: dv.step(model, y, torch.zeros_like(y), **given, sweeps=2)[0])(torch.stack([x, x]))
+        torch.func.vmap(lambda y: dv.step(model, y, 0 * y, solver_of(2), **MODULI)[0])(torch.stack([x, x]))
 
 
-# TODO62: give the solver of model: subspace=dv.CoarseSpace(functions=functions, degree=degree)
 def test_no_more_functions_than_asked_for() -> None:
     thin, thick = dv.mesh.box((6, 6, 2), (1.0, 1.0, 0.01)), dv.mesh.box((5, 5, 5), (1.0, 1.0, 1.0))
     for mesh in (thin, thick):
         for functions in (1, 5, 10, 40):
             for degree in (1, 2, 3):
-                model = dv.Model(mesh)
-                assert 0 < int((~model.coarse_geometry.filling).sum()) <= functions
+                solver = solver_of(1, dv.CoarseSpace(functions=functions, degree=degree))
+                geometry = system_of(dv.Model(mesh), solver).coarse_geometry
+                assert 0 < int((~geometry.filling).sum()) <= functions
 
 
 def test_a_refused_correction_leaves_no_trace() -> None:
@@ -182,14 +181,8 @@ def test_a_refused_correction_leaves_no_trace() -> None:
     mu = torch.where(stiff, 1e13, 1e5).requires_grad_()
     x = (model.rest_points + wave).requires_grad_()
     with dv.record("subspace") as lengths:
-        x_end, v_end = dv.step(
-            model,
-            x,
-            torch.zeros_like(x),
-            dv.VBD(1 / 60, 4, subspace=dv.CoarseSpace(functions=20)),
-            mu=mu,
-            lam=mu.detach(),
-        )
+        solver = dv.VBD(1 / 60, 4, subspace=dv.CoarseSpace(functions=20))
+        x_end, v_end = dv.step(model, x, torch.zeros_like(x), solver, mu=mu, lam=mu.detach())
     assert (lengths[0][..., 0] == 0).any() and (lengths[0][..., 1] > 0).all(), lengths
     bars = torch.autograd.grad(x_end.sum() + v_end.square().sum(), (x, mu))
     assert all(torch.isfinite(t).all() for t in (x_end, v_end, *bars)) and bars[0].abs().max() > 0
@@ -203,17 +196,16 @@ SPACES = (dv.CoarseSpace(functions=10, groups=3), dv.CoarseSpace(functions=4, gr
 SWEEPS = (0, 1, 3, 5, 20)
 
 
-def compiled(model: Any, inputs: dict, sweeps: int, steps: int, tape: str) -> tuple[dict[str, Tensor], list[Tensor]]:
-    adjoint, lengths = dv.ReverseSweep(tape=tape), []
+def compiled(model: Any, inputs: dict, solver: dv.VBD, steps: int) -> tuple[dict[str, Tensor], list[Tensor]]:
+    lengths = []
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
         nonlocal lengths
         with dv.record("subspace") as lengths:
-            # TODO62: the solver of this call
-            end = dv.rollout(model, steps=steps, adjoint=adjoint, save="last", **options, sweeps=sweeps)
+            end = dv.rollout(model, solver=solver, steps=steps, save="last", **options)
         return end.x[-1], end.v[-1]
 
-    return evaluate(run, inputs), lengths
+    return evaluate(run, inputs, solver.time_step), lengths
 
 
 def recorded(model: Any, inputs: dict, lengths: list[Tensor]) -> list[Tensor]:
@@ -225,11 +217,12 @@ def recorded(model: Any, inputs: dict, lengths: list[Tensor]) -> list[Tensor]:
 def check(device: str, case: str, kind: str, space: dv.CoarseSpace, sweeps: int, steps: int, tape: str
           ) -> list[Tensor]:  # fmt: skip
     scene = build_scene(case, kind, "small")
-    model, inputs = scene.model(device, coarse=space), scene.inputs(device=device)
-    result, lengths = compiled(model, inputs, sweeps, steps, tape)
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    solver = scene.solver(sweeps, subspace=space, tape=tape)
+    result, lengths = compiled(model, inputs, solver, steps)
     assert len(lengths) == steps and all(t.shape[1] == space.corrections(sweeps) for t in lengths)
     given = recorded(model, inputs, lengths)
-    expected = assert_near_reference(model, inputs, sweeps, steps, result, given)
+    expected = assert_near_reference(model, inputs, solver, steps, result, given)
     for name, value in expected.items():
         if name in ("grad_x", "grad_v") or (name in ("grad_mu", "grad_density") and (sweeps or lengths[0].any())):
             assert value.abs().max() > 0, name

@@ -7,6 +7,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.model.material import shape_gradients
+from diffvbd.model.system import System, system_of
 from diffvbd.step.coarse_sums import coarse_mass, coarse_stiffness
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -14,16 +15,16 @@ SCENES = 2
 
 
 @pytest.fixture(scope="module")
-def model() -> dv.Model:
+def model() -> System:
     """Bodies of one group and of several, with blocks that are not full."""
     sizes = ((4, 4, 3), (2, 2, 2), (9, 3, 3), (6, 6, 2))
     boxes = [dv.mesh.box(n, 0.1).translate((float(k), 0.0, 0.0)) for k, n in enumerate(sizes)]
     mesh = dv.mesh.join(boxes)
-    # TODO62: give the solver coarse=dv.CoarseSpace(functions=20)
-    return dv.Model(mesh, pinned=mesh.points[:, 1] < 0.01)
+    solver = dv.VBD(0.01, 1, subspace=dv.CoarseSpace(functions=20))
+    return system_of(dv.Model(mesh, pinned=mesh.points[:, 1] < 0.01), solver)
 
 
-def inputs(model: dv.Model, scenes: tuple[int, ...] = (SCENES,) * 4, shared: bool = False) -> list[Tensor]:
+def inputs(model: System, scenes: tuple[int, ...] = (SCENES,) * 4, shared: bool = False) -> list[Tensor]:
     """mu, lam, gradients, volume; with ``shared`` one mu for all tets."""
     rng, count = generator("coarse sums"), model.num_tets
     corners = model.rest_points[model.tets] + 1e-3 * torch.as_tensor(rng.standard_normal((scenes[2], count, 4, 3)))
@@ -32,7 +33,7 @@ def inputs(model: dv.Model, scenes: tuple[int, ...] = (SCENES,) * 4, shared: boo
     return [t.detach().requires_grad_() for t in (mu, lam, *shape_gradients(corners))]
 
 
-def written_out(model: dv.Model, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Tensor) -> Tensor:
+def written_out(model: System, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Tensor) -> Tensor:
     g = model.coarse_geometry
     whole = torch.zeros((model.num_vertices, g.functions + 1), dtype=mu.dtype)
     whole[g.vertex, g.function] = torch.as_tensor(g.weight)
@@ -50,7 +51,7 @@ def written_out(model: dv.Model, mu: Tensor, lam: Tensor, gradients: Tensor, vol
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_stiffness_written_out(model: dv.Model, shared: bool) -> None:
+def test_stiffness_written_out(model: System, shared: bool) -> None:
     given = inputs(model, shared=shared)
     found, expected = coarse_stiffness(model._coarse_plan, *given), written_out(model, *given)
     assert relative_error(found, expected) <= tolerance("formula") and expected.abs().max() > 0
@@ -60,7 +61,7 @@ def test_stiffness_written_out(model: dv.Model, shared: bool) -> None:
         assert relative_error(ours, theirs) <= tolerance("formula") and theirs.abs().max() > 0
 
 
-def test_mass_written_out(model: dv.Model) -> None:
+def test_mass_written_out(model: System) -> None:
     g, mass = model.coarse_geometry, torch.as_tensor(generator("mass").uniform(1, 2, (SCENES, model.num_vertices)))
     mass.requires_grad_()
     whole = torch.zeros((model.num_vertices, g.functions), dtype=mass.dtype)
@@ -76,7 +77,7 @@ def test_mass_written_out(model: dv.Model) -> None:
     assert relative_error(ours, theirs) <= tolerance("formula") and theirs.abs().max() > 0
 
 
-def test_same_bits_on_any_number_of_threads(model: dv.Model) -> None:
+def test_same_bits_on_any_number_of_threads(model: System) -> None:
     plan, given = model._coarse_plan, inputs(model)
     mass = torch.linspace(1, 2, model.num_vertices, dtype=torch.float64)[None].requires_grad_()
     threads, results = torch.get_num_threads(), []

@@ -10,6 +10,7 @@ from helpers.results import assert_same_bits
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.model.system import system_of
 from diffvbd.testing import relative_error, tolerance
 
 pytestmark = pytest.mark.cuda
@@ -25,12 +26,14 @@ def bodies(device: str, **options: Any) -> dv.Model:
     floor = dv.FloorBarrier(kappa=400.0, dhat=0.02, normal=(0.0, 0.0, 1.0))
     energies = (dv.StableNeoHookean(), *((floor,) if options.pop("floor", False) else ()))
     held = mesh.points[:, 0] < 1e-9
-    space = dv.CoarseSpace(every=2)
-    # TODO62: give the solver coarse=space, relaxation=1.5
     return dv.Model(mesh, energies=energies, pinned=held, device=device, **options)
 
 
-def run(model: dv.Model, scenes: int, sweeps: int = 6, steps: int = 2) -> tuple[dict[str, Tensor], list[Tensor]]:
+def solver_of(sweeps: int, **space: int) -> dv.VBD:
+    return dv.VBD(1 / 60, sweeps, relaxation=1.5, subspace=dv.CoarseSpace(**space or {"every": 2}))
+
+
+def run(model: dv.Model, scenes: int) -> tuple[dict[str, Tensor], list[Tensor]]:
     """End and gradients of every argument, and the lengths of the corrections."""
     x = model.rest_points + 0.002 * torch.sin(40 * model.rest_points.flip(-1))
     x = torch.stack([x + 0.001 * i * torch.cos(20 * x) for i in range(scenes)])
@@ -40,7 +43,7 @@ def run(model: dv.Model, scenes: int, sweeps: int = 6, steps: int = 2) -> tuple[
               "rest_points": model.rest_points.clone(), "prescribed": x.clone()}  # fmt: skip
     leaves = {name: t.detach().requires_grad_() for name, t in leaves.items()}
     with dv.record("subspace") as lengths:
-        end = dv.rollout(model, solver=dv.VBD(1 / 60, sweeps), steps=steps, save="last", **leaves)
+        end = dv.rollout(model, solver=solver_of(6), steps=2, save="last", **leaves)
     loss = (end.x[-1] * torch.cos(7 * x)).sum() + 0.01 * (end.v[-1] * torch.sin(9 * x)).sum()
     grads = torch.autograd.grad(loss, list(leaves.values()))
     out = {"x_end": end.x[-1].detach(), "v_end": end.v[-1].detach()}
@@ -78,17 +81,11 @@ def test_a_large_matrix() -> None:
     ends = []
     for device in ("cpu", "cuda"):
         mesh = dv.mesh.box((24, 12, 12), (1.0, 0.5, 0.5))
-        space = dv.CoarseSpace(functions=128)
-        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, device=device)
-        assert model.coarse_geometry.functions > 96
+        model, solver = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, device=device), solver_of(4, functions=128)
+        assert system_of(model, solver).coarse_geometry.functions > 96
         x = model.rest_points
-        # TODO62: subspace from a variable
-        ends.append(
-            dv.step(model, x, torch.zeros_like(x), dv.VBD(1 / 60, 4, relaxation=1.5, subspace=space), mu=1e7, lam=1e7)[
-                0
-            ].cpu()
-            - x.cpu()
-        )
+        end, _ = dv.step(model, x, torch.zeros_like(x), solver, mu=1e7, lam=1e7)
+        ends.append((end - x).cpu())
     assert relative_error(ends[1], ends[0]) <= tolerance("cancelling")
 
 
@@ -99,7 +96,7 @@ def test_a_graph_of_a_step_and_its_backward() -> None:
     out = [torch.zeros_like(x), *(torch.zeros_like(t) for t in leaves)]
 
     def iteration() -> None:
-        end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 5), mu=leaves[0], lam=leaves[1])
+        end, _ = dv.step(model, x, v, solver_of(5), mu=leaves[0], lam=leaves[1])
         bars = torch.autograd.grad(end.square().sum(), leaves)
         for to, value in zip(out, (end.detach(), *bars), strict=True):
             to.copy_(value)
@@ -117,4 +114,4 @@ def test_debug_checks_name_a_wrong_step() -> None:
     x = model.rest_points.clone()
     x[3, 0] = float("nan")
     with dv.debug_checks(), pytest.raises((ValueError, RuntimeError)):
-        dv.step(model, x, torch.zeros_like(x), dv.VBD(1 / 60, 3), mu=1e6, lam=1e6)
+        dv.step(model, x, torch.zeros_like(x), solver_of(3), mu=1e6, lam=1e6)

@@ -118,25 +118,26 @@ def test_every_shape_of_every_argument(device: str, shapes: str, sweeps: int) ->
 def test_values_per_step(device: str) -> None:
     """Forces and prescribed positions that change from step to step."""
     scene = build_scene("plain", "delaunay", "small")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs, solver = scene.model(), scene.inputs(), scene.solver(2)
     rng, steps = generator("per step"), 3
     forces = torch.as_tensor(rng.standard_normal((steps, *inputs["force"].shape)))
     held = inputs.pop("prescribed") + torch.as_tensor(1e-3 * rng.standard_normal((steps, *inputs["force"].shape)))
     inputs |= {"force": forces, "held": held}
 
     def of_reference(force: Tensor, held: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
-        end = reference.rollout(model, steps=steps, sweeps=2, force_per_step=force, prescribed_per_step=held, **options)
+        end = reference.rollout(
+            model, solver=solver, steps=steps, force_per_step=force, prescribed_per_step=held, **options
+        )
         return end.x[-1], end.v[-1]
 
     def of_package(force: Tensor, held: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
-        # TODO62: the solver of this call
-        end = dv.rollout(there, steps=steps, force=dv.per_step(force), prescribed=dv.per_step(held), checkpoint_every=2,
-                         **options, sweeps=2)  # fmt: skip
+        end = dv.rollout(there, solver=solver, steps=steps, force=dv.per_step(force), prescribed=dv.per_step(held),
+                         checkpoint_every=2, **options)  # fmt: skip
         return end.x[-1], end.v[-1]
 
     there = model.to(device)
-    expected = evaluate(of_reference, inputs)
-    result = evaluate(of_package, testing.on_device(inputs, device))
+    expected = evaluate(of_reference, inputs, solver.time_step)
+    result = evaluate(of_package, testing.on_device(inputs, device), solver.time_step)
     assert relative_error(result["x"], expected["x"]) <= tolerance("forward")
     for name in (n for n in expected if n.startswith("grad_")):
         assert result[name].any(), name
@@ -149,6 +150,7 @@ def test_constants_equal_parameters(device: str) -> None:
     scene = build_scene("anchored", "random", "small")
     model, inputs = scene.model(device), scene.inputs(device=device)
     given = dv.step(model, solver=scene.solver(2), **inputs)
-    # TODO62: the solver of this call
-    constant = dv.step(model, **{name: value for name, value in inputs.items() if name != "parameters"}, sweeps=2)
+    without = {k: value for k, value in inputs.items() if not k.startswith(("floor_", "anchor_"))}
+    assert len(without) < len(inputs)
+    constant = dv.step(model, solver=scene.solver(2), **without)
     assert torch.equal(given[0], constant[0]) and torch.equal(given[1], constant[1])

@@ -4,11 +4,12 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.results import evaluated
 from helpers.values import STEP, uniform
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
+from diffvbd.testing import build_scene, relative_error, tolerance
 
 
 def near_rest(mesh: dv.TetMesh, device: str) -> Tensor:
@@ -26,15 +27,13 @@ def cast(value: Any, dtype: torch.dtype) -> Any:
 def test_float32_is_near_float64(device: str, case: str) -> None:
     scene = build_scene(case)
     model, inputs = scene.model(device), cast(scene.inputs(device=device), torch.float32)
-    # TODO62: the solver of this call
-    expected = evaluate(lambda **o: dv.step(model, **o, sweeps=3), cast(inputs, torch.float64))
-    # TODO62: the solver of this call
-    actual = evaluate(lambda **o: dv.step(model.to(dtype=torch.float32), **o, sweeps=3), inputs)
+    expected = evaluated(model, cast(inputs, torch.float64), scene.solver(3))
+    actual = evaluated(model.to(dtype=torch.float32), inputs, scene.solver(3))
     for name, value in expected.items():
         assert actual[name].dtype == torch.float32
         limit = tolerance("float32_gradient" if name.startswith("grad_") else "float32_forward")
         if name == "v":  # a difference of positions over h: as exact as they are
-            scale = float(expected["x"].abs().max()) / inputs["time_step"] + float(value.abs().max())
+            scale = float(expected["x"].abs().max()) / scene.case.time_step + float(value.abs().max())
             assert float((actual[name] - value).abs().max()) <= limit * scale
         else:
             assert relative_error(actual[name], value) <= limit, name
@@ -45,7 +44,6 @@ def test_float32_far_from_the_origin(device: str, distance: float) -> None:
     """Coordinates relative to each body: the step itself loses nothing, only the stored positions are coarse."""
     near = dv.mesh.box((3, 2, 2))
     offset = torch.tensor([distance, 0.0, -distance], device=device)
-    options = {"mu": 1e4, "lam": 2e4, **STEP}
     moves, slopes = [], []
     for mesh, shift in ((near, torch.zeros(3, device=device)), (near.translate(offset.tolist()), offset)):
         model = dv.Model(mesh, pinned=[0, 1], dtype=torch.float32, device=device)
@@ -53,8 +51,7 @@ def test_float32_far_from_the_origin(device: str, distance: float) -> None:
         x = torch.round((near_rest(near, device) + uniform(12, 3, low=-0.03, high=0.03).to(device)) * 1024) / 1024
         x = (x.float() + shift).requires_grad_()
         v = uniform(12, 3, low=-1.0, high=1.0).float().to(device)
-        # TODO62: the solver of this call
-        out = dv.step(model, x, v, **options)
+        out = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
         moves.append(out[1].detach())
         slopes += torch.autograd.grad((out[1] * uniform(12, 3).float().to(device)).sum(), x)
     assert relative_error(moves[1], moves[0]) <= tolerance("float32_forward")

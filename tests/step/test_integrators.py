@@ -1,7 +1,6 @@
 """Claim: SDIRK2 and BDF2 are of second order between contacts, exact in free fall, damp what is stiff, gain no energy
 at an impact, and are differentiated as executed."""
 
-import dataclasses
 import math
 from typing import Any
 
@@ -25,17 +24,18 @@ def random(*key: Any, shape: Any) -> Tensor:
     return torch.from_numpy(generator("integrators", *key).standard_normal(tuple(shape)))
 
 
-def beam(**options: Any) -> dv.Model:
+def beam() -> dv.Model:
     mesh = dv.mesh.beam(7, 3, 3, (0.6, 0.15, 0.15), "kuhn")
-    # TODO62: give the solver relaxation=1.5
-    return dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, **options)
+    return dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01)
 
 
-def marched(
-    model: dv.Model, x: Tensor, v: Tensor, steps: int, integrator: Any, **options: Any
-) -> tuple[Tensor, Tensor]:
-    # TODO62: the solver of this call
-    end = dv.rollout(model, x, v, steps=steps, save="last", **options, integrator=integrator)
+def vbd(time_step: float, sweeps: int, integrator: Any, **options: Any) -> dv.VBD:
+    """The solver of a beam."""
+    return dv.VBD(time_step, sweeps, **{"relaxation": 1.5, "integrator": integrator, **options})
+
+
+def marched(model: dv.Model, x: Tensor, v: Tensor, solver: dv.VBD, steps: int, **inputs: Any) -> tuple[Tensor, Tensor]:
+    end = dv.rollout(model, x, v, solver, steps=steps, save="last", **inputs)
     return end.x[-1], end.v[-1]
 
 
@@ -45,8 +45,7 @@ def test_order_of_a_vibration(integrator: Any) -> None:
     x, v, seconds = model.rest_points, torch.zeros_like(model.rest_points), 0.08
 
     def end(steps: int, scheme: Any) -> Tensor:
-        options = {**MATERIAL, "solver": dv.VBD(seconds / steps, 60)}
-        return marched(model, x, v, steps, scheme, **options)[0]
+        return marched(model, x, v, vbd(seconds / steps, 60, scheme), steps, **MATERIAL)[0]
 
     exact = end(640, dv.SDIRK2())
     coarse, fine = (float((end(n, integrator) - exact).norm()) for n in (40, 80))
@@ -56,13 +55,12 @@ def test_order_of_a_vibration(integrator: Any) -> None:
         assert coarse < 0.2 * float((end(40, dv.ImplicitEuler()) - exact).norm())
 
 
-# TODO62: give the solver of model: subspace="rigid" if rigid else None
 @pytest.mark.parametrize("integrator", SECOND, ids=str)
-@pytest.mark.parametrize("rigid", (True, False))
-def test_free_fall_is_exact(device: str, integrator: Any, rigid: bool) -> None:
+@pytest.mark.parametrize("subspace", ("rigid", None))
+def test_free_fall_is_exact(device: str, integrator: Any, subspace: Any) -> None:
     model = dv.Model(dv.mesh.cube(3), device=device)
     x, v, h = model.rest_points, torch.full_like(model.rest_points, 0.7), 0.05
-    end, speed = marched(model, x, v, 10, integrator, time_step=h, sweeps=2, **MATERIAL)
+    end, speed = marched(model, x, v, dv.VBD(h, 2, integrator=integrator, subspace=subspace), 10, **MATERIAL)
     t = 10 * h
     g = GRAVITY.to(device)
     assert relative_error(end, x + t * v + 0.5 * t * t * g) <= tolerance("free_fall")
@@ -75,14 +73,8 @@ def test_momentum_and_energy_of_a_free_body(integrator: Any) -> None:
     model = dv.Model(dv.mesh.cube(3, 0.2, "kuhn"))
     x = model.rest_points * torch.tensor([1.1, 0.95, 0.97], dtype=torch.float64)
     v = 0.1 * random("momentum", shape=x.shape)
-    options: dict[str, Any] = {"gravity": (0.0, 0.0, 0.0), **MATERIAL, "solver": dv.VBD(0.004, 60)}
-    end = dv.rollout(
-        model,
-        x,
-        v,
-        steps=1000,
-        **(options | {"solver": dataclasses.replace(options["solver"], subspace=None, integrator=integrator)}),
-    )
+    solver = dv.VBD(0.004, 60, subspace=None, integrator=integrator)
+    end = dv.rollout(model, x, v, solver, steps=1000, gravity=(0.0, 0.0, 0.0), **MATERIAL)
     mass = model.mass[:, None]
     before, after = (mass * end.v[0]).sum(0), (mass * end.v[50]).sum(0)  # what sweeps leave adds up later
     assert relative_error(after, before) <= tolerance("momentum")
@@ -97,11 +89,10 @@ def test_momentum_and_energy_of_a_free_body(integrator: Any) -> None:
 @pytest.mark.parametrize("integrator", SECOND, ids=str)
 def test_a_stiff_body_decays(integrator: Any) -> None:
     """Far above its frequencies a step leaves next to nothing of a vibration."""
-    model = beam(coarse="auto")
+    model, solver = beam(), vbd(0.5, 100, integrator, subspace="coarse")
     x = model.rest_points.clone()
     x[:, 1] += 0.05 * x[:, 0] ** 2
-    end, speed = marched(model, x, torch.zeros_like(x), 12, integrator, time_step=0.5, sweeps=100,
-                         gravity=(0.0, 0.0, 0.0), mu=1e7, lam=1e7)  # fmt: skip
+    end, speed = marched(model, x, torch.zeros_like(x), solver, 12, gravity=(0.0, 0.0, 0.0), mu=1e7, lam=1e7)
     assert float((end - model.rest_points).norm()) < 0.02 * float((x - model.rest_points).norm())
     assert float(speed.abs().max()) < 1e-2
 
@@ -148,24 +139,15 @@ def test_impacts_gain_no_energy(integrator: Any, kind: str, time_step: float) ->
     model, x, v = falling(125, kind)
     start = energy_of(model, x, v, 3e4, 3e4)
     scale = start + float(model.mass.sum()) * 9.81 * 0.3
-    history, most, lowest = None, torch.zeros_like(start), torch.ones_like(start)
-    for _ in range(round(0.3 / time_step)):
-        options: dict[str, Any] = {"mu": 3e4, "lam": 3e4, "solver": dv.VBD(time_step, 15)}
-        if isinstance(integrator, dv.BDF2):
-            # TODO62: a history lives in rollouts
-            x, v, history = dv.step(
-                model,
-                x,
-                v,
-                history=history,
-                **(options | {"solver": dataclasses.replace(options["solver"], integrator=integrator)}),
-            )
-        else:
-            x, v = dv.step(
-                model, x, v, **(options | {"solver": dataclasses.replace(options["solver"], integrator=integrator)})
-            )
+    most, lowest = torch.zeros_like(start), torch.ones_like(start)
+
+    def observe(step: int, x: Tensor, v: Tensor) -> None:
+        nonlocal most, lowest
         lowest = torch.minimum(lowest, (x[..., 1] + 0.3).amin(-1))
         most = torch.maximum(most, (energy_of(model, x, v, 3e4, 3e4) - start) / scale)
+
+    solver = dv.VBD(time_step, 15, integrator=integrator)
+    dv.rollout(model, x, v, solver, duration=0.3, save="last", observe=observe, mu=3e4, lam=3e4)
     # after longer steps a shape may be in the air that a barrier has just pushed there
     bound = tolerance("energy_gain") if time_step < 0.005 else 0.02
     assert float(most.max()) <= bound and float(lowest.min()) > 0
@@ -180,15 +162,7 @@ def test_order_through_an_impact(integrator: Any, kind: str) -> None:
     x, v = x[0] - torch.tensor([0.0, float(x[0, :, 1].min()) + 0.29, 0.0], dtype=x.dtype), 0.25 * v[0]
 
     def end(steps: int) -> Tensor:
-        options: dict[str, Any] = {"mu": 3e4, "lam": 3e4, "solver": dv.VBD(0.03 / steps, 30)}
-        return dv.rollout(
-            model,
-            x,
-            v,
-            steps=steps,
-            save="last",
-            **(options | {"solver": dataclasses.replace(options["solver"], integrator=integrator)}),
-        ).x[-1]
+        return marched(model, x, v, dv.VBD(0.03 / steps, 30, integrator=integrator), steps, mu=3e4, lam=3e4)[0]
 
     exact = end(960)
     errors = [float((end(steps) - exact).norm()) for steps in (60, 120)]
@@ -219,7 +193,7 @@ def test_bodies_of_which_one_may_touch_stay_apart(integrator: Any, support: str)
 def test_gradients_are_those_of_what_ran(integrator: Any, case: str) -> None:
     """Against central differences, for a state, a material and a coefficient of the contact."""
     extra: dict[str, Tensor] = {}
-    bare = case.startswith("bare")
+    bare, of_beam = case.startswith("bare"), case in ("pinned", "coarse")
     if case.endswith(("floor", "plane")):
         model, x, v = falling(2, case)
         x = x * (1.3 if bare else 1.0)  # so much that the material matters in short steps
@@ -228,20 +202,20 @@ def test_gradients_are_those_of_what_ran(integrator: Any, case: str) -> None:
         name = "pair_kappa" if case == "bare plane" else name
         extra[name] = torch.tensor(value, dtype=torch.float64, requires_grad=True)
     else:
-        model = (
-            dv.Model(dv.mesh.cube(3, size=0.2)) if case == "free" else beam(coarse="auto" if case == "coarse" else None)
-        )
+        model = beam() if of_beam else dv.Model(dv.mesh.cube(3, size=0.2))
         x = model.rest_points
         v = 0.3 * random("gradients", case, shape=x.shape)
     weight = random("weight", case, shape=x.shape)
     mu = torch.tensor(3e4, dtype=x.dtype, requires_grad=True)
     push = torch.zeros((), dtype=x.dtype, requires_grad=True)
+    solver = dv.VBD(2e-4 if bare else 0.01, 3, integrator=integrator, relaxation=1.5 if of_beam else 1.0,
+                    subspace="coarse" if case == "coarse" else "rigid")  # fmt: skip
 
     def loss(push: Tensor, mu: Tensor, *more: Tensor) -> Tensor:
         parameters = dict(zip(extra, more, strict=True))
         with dv.record("integrator") as euler:
-            end, speed = marched(model, x + 1e-3 * push * weight, v + push * weight, 4, integrator, mu=mu, lam=4e4,
-                                 time_step=2e-4 if bare else 0.01, sweeps=3, parameters=parameters)  # fmt: skip
+            end, speed = marched(model, x + 1e-3 * push * weight, v + push * weight, solver, 4, mu=mu, lam=4e4,
+                                 **parameters)  # fmt: skip
         assert not bare or not any(bool(e.any()) for e in euler), "the barrier is extrapolated"
         return (weight * end).sum() + 1e-2 * (weight * speed).sum()
 
@@ -260,35 +234,18 @@ def test_gradients_are_those_of_what_ran(integrator: Any, case: str) -> None:
 def test_a_scene_is_the_same_alone_in_steps_and_in_checkpoints(integrator: Any) -> None:
     model, x, v = falling(3, "plane")
     v = v.requires_grad_()
-    options: Any = {"steps": 8, "mu": 3e4, "lam": 3e4, "solver": dv.VBD(0.01, 4)}
-    whole = dv.rollout(
-        model,
-        x,
-        v,
-        checkpoint_every=None,
-        **(options | {"solver": dataclasses.replace(options["solver"], integrator=integrator)}),
-    )
+    options: Any = {"steps": 8, "mu": 3e4, "lam": 3e4, "solver": dv.VBD(0.01, 4, integrator=integrator)}
+    whole = dv.rollout(model, x, v, checkpoint_every=None, **options)
     (grad,) = torch.autograd.grad(whole.x[-1].sum(), v)
     assert grad.abs().max() > 0
     for every in (3, dv.BinomialCheckpoints(2)):
-        again = dv.rollout(
-            model,
-            x,
-            v,
-            checkpoint_every=every,
-            **(options | {"solver": dataclasses.replace(options["solver"], integrator=integrator)}),
-        )
+        again = dv.rollout(model, x, v, checkpoint_every=every, **options)
         assert torch.equal(again.x, whole.x)
         assert torch.equal(torch.autograd.grad(again.x[-1].sum(), v)[0], grad)
-    alone = dv.rollout(
-        model, x[1], v[1], **(options | {"solver": dataclasses.replace(options["solver"], integrator=integrator)})
-    )
+    alone = dv.rollout(model, x[1], v[1], **options)
     assert torch.equal(alone.x, whole.x[:, 1])
-    # TODO62: the solver of this call
-    first = dv.rollout(model, x, v, **options | {"steps": 5}, integrator=integrator)
-    # TODO62: the solver of this call
-    rest = dv.rollout(model, first.x[-1], first.v[-1], history=first.history, **options | {"steps": 3},
-                      integrator=integrator)  # fmt: skip
+    first = dv.rollout(model, x, v, **options | {"steps": 5})
+    rest = dv.rollout(model, first.x[-1], first.v[-1], history=first.history, **options | {"steps": 3})
     assert torch.equal(rest.x[-1], whole.x[-1])
 
 
@@ -300,16 +257,10 @@ def test_a_scene_that_touches_is_the_same_beside_one_that_does_not(integrator: A
     model = dv.Model(mesh, energies=(dv.StableNeoHookean(), pairs))
     x, v = model.rest_points.repeat(2, 1, 1), torch.from_numpy(generator("beside").normal(0, 0.3, (2, 16, 3)))
     x[1, 8:, 1], v[:, 8:, 1] = x[1, 8:, 1] + 1, v[:, 8:, 1] - 1
-    found, options = [], {"steps": 3, "time_step": 0.01, "sweeps": 5, "lam": 1e5, "integrator": integrator}
+    found, solver = [], dv.VBD(0.01, 5, integrator=integrator, regularization=tau)
     for scenes in (2, 1):
         own, mu = v[:scenes].clone().requires_grad_(), torch.tensor(1e5, dtype=x.dtype, requires_grad=True)
-        end = dv.rollout(
-            model,
-            x[:scenes],
-            own,
-            mu=mu,
-            **(options | {"solver": dataclasses.replace(options["solver"], regularization=tau)}),
-        ).x[-1][0]
+        end = marched(model, x[:scenes], own, solver, 3, mu=mu, lam=1e5)[0][0]
         grads = torch.autograd.grad(end.square().sum(), (own, mu))
         found.append((end.detach(), grads[0][0], grads[1]))
     for beside, alone in zip(*found, strict=True):
@@ -323,26 +274,25 @@ def test_what_is_held_moves_evenly(integrator: Any) -> None:
     speed = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
     v, steps, h = torch.where(pinned[:, None], speed, 0.0), 5, 0.02
     where = torch.stack([x + (n + 1) * h * v for n in range(steps)])
-    end, after = marched(
-        model, x, v, steps, integrator, prescribed=dv.per_step(where), time_step=h, sweeps=5, **MATERIAL
-    )
+    solver = vbd(h, 5, integrator)
+    end, after = marched(model, x, v, solver, steps, prescribed=dv.per_step(where), **MATERIAL)
     assert torch.equal(end[pinned], where[-1][pinned])
     assert relative_error(after[pinned], v[pinned]) <= tolerance("travel")
     if isinstance(integrator, dv.SDIRK2):
         share = 1 - 1 / math.sqrt(2)
-        even = dv.step(model, x, v, dv.VBD(h, 5, integrator=integrator), prescribed=where[0], **MATERIAL)
+        even = dv.step(model, x, v, solver, prescribed=where[0], **MATERIAL)
         halves = (x + share * (where[0] - x), where[0])
-        given = dv.step(model, x, v, dv.VBD(h, 5, integrator=integrator), prescribed=halves, **MATERIAL)
+        given = dv.step(model, x, v, solver, prescribed=halves, **MATERIAL)
         assert all(torch.equal(a, b) for a, b in zip(even, given, strict=True))
 
 
-@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize("integrator", (dv.ImplicitEuler(), dv.SDIRK2()), ids=str)
 def test_a_converged_step(integrator: Any) -> None:
     model = beam()
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     mu = torch.tensor(1e5, dtype=x.dtype, requires_grad=True)
-    solved = dv.solve(model, x, v, dv.VBD(0.02, 1, integrator=integrator), mu=mu, lam=2e5)
-    swept, _ = marched(model, x, v, 1, integrator, mu=1e5, lam=2e5, time_step=0.02, sweeps=600)
+    solved = dv.solve(model, x, v, vbd(0.02, 0, integrator), mu=mu, lam=2e5)
+    swept, _ = marched(model, x, v, vbd(0.02, 600, integrator), 1, mu=1e5, lam=2e5)
     assert solved.converged and relative_error(solved.x, swept) <= tolerance("global_converged")
     (grad,) = torch.autograd.grad(solved.x.square().sum(), mu)
     assert grad.abs() > 0
@@ -354,7 +304,7 @@ def test_single_precision(integrator: Any) -> None:
     model = beam()
     single = model.to(dtype=torch.float32)
     x = model.rest_points + 20
-    ends = [marched(m, x.to(m.dtype), torch.zeros_like(x).to(m.dtype), 10, integrator, time_step=0.01, sweeps=10,
+    ends = [marched(m, x.to(m.dtype), torch.zeros_like(x).to(m.dtype), vbd(0.01, 10, integrator), 10,
                     **MATERIAL)[0].double() for m in (model, single)]  # fmt: skip
     assert relative_error(ends[1] - x, ends[0] - x) <= tolerance("float32_gradient")
 
@@ -362,70 +312,55 @@ def test_single_precision(integrator: Any) -> None:
 def test_a_history_is_of_one_time_step() -> None:
     model = beam()
     x = model.rest_points
-    # TODO62: BDF2 steps in rollouts
-    *_, history = dv.step(model, x, 0 * x, dv.VBD(0.01, 1, integrator=dv.BDF2()), **MATERIAL)
+    history = dv.rollout(model, x, 0 * x, vbd(0.01, 1, dv.BDF2()), steps=1, **MATERIAL).history
     with pytest.raises(ValueError, match=r"history: expected one of a step of time_step 0.02 s .* got 0.01 s"):
-        dv.rollout(model, x, 0 * x, dv.VBD(0.02, 1, integrator=dv.BDF2()), history=history, steps=1, **MATERIAL)
+        dv.rollout(model, x, 0 * x, vbd(0.02, 1, dv.BDF2()), history=history, steps=1, **MATERIAL)
 
 
-def test_a_tape_of_bdf2() -> None:
-    """Its history is an argument like others, and what follows from a state needs no name."""
-    model = beam()
+def test_a_history_is_differentiable() -> None:
+    model, solver = beam(), vbd(0.01, 3, dv.BDF2())
     x = model.rest_points
-    v = torch.zeros_like(x)
-    options: dict[str, Any] = {**MATERIAL, "solver": dv.VBD(0.01, 3)}
-    # TODO62: BDF2 steps in rollouts
-    x1, v1, history = dv.step(
-        model, x, v, **(options | {"solver": dataclasses.replace(options["solver"], integrator=dv.BDF2())})
-    )
-    moved = history.moved.clone().requires_grad_()
-    # TODO62: a history lives in rollouts
-    # TODO62: BDF2 steps in rollouts
-    x2, _, _ = dv.step(
-        model,
-        x1,
-        v1,
-        history=history._replace(moved=moved),
-        **(options | {"solver": dataclasses.replace(options["solver"], integrator=dv.BDF2())}),
-    )
-    (wanted,) = torch.autograd.grad(x2.sum(), moved)
-    # TODO62: a history lives in rollouts
-    _, _, tape = dv.step_forward(model, x1, v1, wrt=("x", "history.moved"), history=history,
-                                 **(options | {"solver": dataclasses.replace(options["solver"],
-                                                                             integrator=dv.BDF2())}))  # fmt: skip
-    found = dv.step_backward(tape, torch.ones_like(x))
-    assert torch.equal(found["history.moved"], wanted) and wanted.abs().max() > 0
-    assert tape.history is not None and torch.equal(tape.history.v, v1)
+    first = dv.rollout(model, x, 0 * x, solver, steps=1, **MATERIAL)
+    assert first.history is not None
+    leaves = [t.clone().requires_grad_() for t in (first.history.moved, first.history.v)]
+    history = first.history._replace(moved=leaves[0], v=leaves[1])
+    end = dv.rollout(model, first.x[-1], first.v[-1], solver, steps=1, history=history, **MATERIAL)
+    assert all(bool(bar.any()) for bar in torch.autograd.grad(end.x[-1].sum(), leaves))
+
+
+def test_a_step_has_no_history() -> None:
+    model = beam()
+    for run in (dv.step, dv.solve):
+        with pytest.raises(ValueError, match=r"^solver: expected ImplicitEuler\(\) or SDIRK2\(\) in a step: BDF2"):
+            run(model, model.rest_points, 0 * model.rest_points, vbd(0.01, 1, dv.BDF2()), **MATERIAL)
+
+
+def test_bad_integrators() -> None:
+    for integrator, match in (("sdirk2", "integrator: expected .* got str"),
+                              (dv.BDF2, "integrator: expected an object, BDF2")):  # fmt: skip
+        with pytest.raises((TypeError, ValueError), match=match):
+            vbd(0.01, 1, integrator)
 
 
 @pytest.mark.parametrize(
-    ("options", "match"),
+    ("integrator", "options", "match"),
     [
-        ({"integrator": "sdirk2"}, "integrator: expected .* got str"),
-        ({"integrator": dv.BDF2}, "integrator: expected an object, BDF2"),
-        ({"integrator": dv.SDIRK2(), "history": (1, 2)}, "history: expected None beside SDIRK2"),
-        ({"integrator": dv.BDF2(), "history": (1, 2)}, "history: expected what a step with BDF2"),
-        (
-            {
-                "integrator": dv.BDF2(),
-                "history": dv.results.History(torch.zeros(1), torch.zeros(1), torch.zeros(1), 0.01),
-            },
-            r"history.moved: expected shape",
-        ),
-        ({"prescribed": (torch.zeros(3), torch.zeros(3))}, "prescribed: expected a tensor"),
+        (dv.SDIRK2(), {"history": (1, 2)}, "history: expected None beside SDIRK2"),
+        (dv.BDF2(), {"history": (1, 2)}, "history: expected what a step with BDF2"),
+        (dv.BDF2(), {"history": dv.results.History(*[torch.zeros(1)] * 3, 0.01)}, "history.moved: expected shape"),
+        (dv.ImplicitEuler(), {"prescribed": (torch.zeros(3), torch.zeros(3))}, "prescribed: expected"),
     ],
 )
-def test_bad_input(options: dict[str, Any], match: str) -> None:
+def test_bad_input(integrator: Any, options: dict[str, Any], match: str) -> None:
     model = beam()
     x = model.rest_points
     with pytest.raises((TypeError, ValueError), match=match):
-        dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 1), **MATERIAL, **options)
+        dv.rollout(model, x, torch.zeros_like(x), vbd(0.01, 1, integrator), steps=1, **MATERIAL, **options)
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 
-STEP: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "solver": dv.VBD(0.01, 3)}
 CUBE = dv.mesh.cube(2, size=0.2)
 
 
@@ -434,16 +369,14 @@ def held(**options: Any) -> tuple[dv.Model, Tensor, Tensor]:
     return model, model.rest_points, torch.zeros_like(model.rest_points)
 
 
-def taken(model: dv.Model, x: Tensor, v: Tensor, way: str, **options: Any) -> Tensor:
+def taken(model: dv.Model, x: Tensor, v: Tensor, integrator: Any, way: str = "rollout", **options: Any) -> Tensor:
     """The end of a step, by dv.step or by a rollout."""
+    solver = dv.VBD(0.01, 3, integrator=integrator)
     if way == "step":
-        # TODO62: the solver of this call
-        return dv.step(model, x, v, **STEP | options)[0]
-    # TODO62: the solver of this call
-    return dv.rollout(model, x, v, steps=1, **STEP | options).x[-1]
+        return dv.step(model, x, v, solver, mu=1e4, lam=1e4, **options)[0]
+    return dv.rollout(model, x, v, solver, steps=1, mu=1e4, lam=1e4, **options).x[-1]
 
 
-@pytest.mark.parametrize("way", ["step", "rollout"])
 @pytest.mark.parametrize(
     ("name", "change", "got"),
     [
@@ -460,25 +393,15 @@ def taken(model: dv.Model, x: Tensor, v: Tensor, way: str, **options: Any) -> Te
         ("history", lambda h: {"time_step": 0.0101}, "0.0101"),
     ],
 )
-def test_a_history_is_checked_like_a_state(way: str, name: str, change: Any, got: str) -> None:
+def test_a_history_is_checked_like_a_state(name: str, change: Any, got: str) -> None:
     model, x, v = held()
-    # TODO62: BDF2 steps in rollouts
-    x1, v1, history = dv.step(
-        model, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], integrator=dv.BDF2())})
-    )
-    wrong = history._replace(**change(history))
-    raises(lambda: taken(model, x1, v1, way, integrator=dv.BDF2(), history=wrong), name, got)
-
-
-def test_the_time_step_of_a_history_is_a_number() -> None:
-    model, x, v = held()
-    given = STEP | {"solver": dataclasses.replace(STEP["solver"], time_step=torch.tensor(0.01, dtype=torch.float64))}
-    # TODO62: the solver of this call
-    end = dv.rollout(model, x, v, steps=2, **given, integrator=dv.BDF2())
+    end = dv.rollout(model, x, v, dv.VBD(0.01, 3, integrator=dv.BDF2()), steps=1, mu=1e4, lam=1e4)
     assert end.history is not None and type(end.history.time_step) is float
+    wrong = end.history._replace(**change(end.history))
+    raises(lambda: taken(model, end.x[-1], end.v[-1], dv.BDF2(), history=wrong), name, got)
 
 
-@pytest.mark.parametrize("integrator", EVERY, ids=str)
+@pytest.mark.parametrize("integrator", (dv.ImplicitEuler(), dv.SDIRK2()), ids=str)
 def test_colliders_that_are_not_finite_are_named(integrator: Any) -> None:
     energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3, dhat=0.01))
     plane = colliders.Plane((0.0, -0.1, 0.0), (0.0, 1.0, 0.0))
@@ -486,14 +409,13 @@ def test_colliders_that_are_not_finite_are_named(integrator: Any) -> None:
     given = {"colliders": model.collider_points, "colliders_before": model.collider_points}
     for name in given:
         wrong = given | {name: NAN * model.collider_points}
-        raises(lambda g=wrong: taken(model, x, v, "step", integrator=integrator, **g), name, "nan")
+        raises(lambda g=wrong: taken(model, x, v, integrator, "step", **g), name, "nan")
 
 
-@pytest.mark.parametrize("way", ["step", "rollout"])
-@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize(("integrator", "way"), [(dv.SDIRK2(), "step"), *((i, "rollout") for i in SECOND)], ids=str)
 def test_a_solve_that_is_lost_is_no_wrong_argument(integrator: Any, way: str) -> None:
     model, x, v = held(dtype=torch.float32)
-    raises(lambda: taken(model, 1e20 * x, v, way, integrator=integrator), "x, v", "first solve")
+    raises(lambda: taken(model, 1e20 * x, v, integrator, way), "x, v", "first solve")
 
 
 @pytest.mark.parametrize("given", [tuple, lambda both: lambda step, x, v: both], ids=["constant", "function"])
@@ -502,42 +424,21 @@ def test_a_rollout_takes_prescribed_positions_of_two_solves(given: Any) -> None:
     ends = (x.clone(), x.clone())
     ends[0][:2, 1] += 0.001
     ends[1][:2, 1] += 0.002
-    wanted = taken(model, x, v, "step", integrator=dv.SDIRK2(), prescribed=ends)
-    assert torch.equal(taken(model, x, v, "rollout", integrator=dv.SDIRK2(), prescribed=given(ends)), wanted)
-    raises(lambda: taken(model, x, v, "rollout", prescribed=given(ends)), "prescribed", "2 with ImplicitEuler")
+    wanted = taken(model, x, v, dv.SDIRK2(), "step", prescribed=ends)
+    assert torch.equal(taken(model, x, v, dv.SDIRK2(), prescribed=given(ends)), wanted)
+    raises(lambda: taken(model, x, v, dv.ImplicitEuler(), prescribed=given(ends)), "prescribed", "2 with ImplicitEuler")
     for which in (0, 1):
         free = [end.clone() for end in ends]
         free[which][7] += 1
-        run = lambda p=tuple(free): taken(model, x, v, "rollout", integrator=dv.SDIRK2(), prescribed=given(p))  # noqa: E731
-        raises(run, "prescribed", "vertex 7")
+        raises(lambda p=tuple(free): taken(model, x, v, dv.SDIRK2(), prescribed=given(p)), "prescribed", "vertex 7")
 
 
 def test_prescribed_positions_of_two_solves_are_watched() -> None:
     model, x, v = held()
     ends = (x.clone(), x.clone())
     mu = torch.tensor(1e4, dtype=x.dtype, requires_grad=True)
-    # TODO62: the solver of this call
-    end = dv.rollout(model, x, v, steps=4, checkpoint_every=2, prescribed=ends, **STEP | {"mu": mu},
-                     integrator=dv.SDIRK2())  # fmt: skip
+    solver = dv.VBD(0.01, 3, integrator=dv.SDIRK2())
+    end = dv.rollout(model, x, v, solver, steps=4, checkpoint_every=2, prescribed=ends, mu=mu, lam=1e4)
     ends[0].add_(1)
     with pytest.raises(RuntimeError, match="prescribed: changed in place"):
         end.x.sum().backward()
-
-
-@pytest.mark.parametrize("name", ["history.time_step", "history.smooth", "history.other"])
-def test_a_tape_has_no_gradient_of_what_is_not_differentiable(name: str) -> None:
-    model, x, v = held()
-    # TODO62: BDF2 steps in rollouts
-    x1, v1, history = dv.step(
-        model, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], integrator=dv.BDF2())})
-    )
-    # TODO62: a history lives in rollouts
-    run = lambda: dv.step_forward(
-        model,
-        x1,
-        v1,
-        wrt=(name,),
-        history=history,
-        **(STEP | {"solver": dataclasses.replace(STEP["solver"], integrator=dv.BDF2())}),
-    )  # noqa: E731
-    raises(run, "wrt", f"history.moved, history.v.*got '{name}'")

@@ -3,6 +3,7 @@
 import copy
 import io
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -35,16 +36,14 @@ def fresh_compiler() -> None:
 
 
 def compiled_gradients(device: str, backend: str, names: tuple[str, ...], plain: bool, **options: Any) -> None:
-    if plain:
-        options["energies"] = (dv.StableNeoHookean(),)
-    model = small_model(device, **options)
+    model = small_model(device, **{"energies": (dv.StableNeoHookean(),)} if plain else {})
     arguments = {k: t for k, t in small_inputs(model).items() if k in names}
-    expected = gradients(model, arguments)
-    run = torch.compile(lambda a: loss(model, a), fullgraph=True, backend=backend)
+    expected = gradients(model, arguments, **options)
+    run = torch.compile(lambda a: loss(model, a, **options), fullgraph=True, backend=backend)
     leaves = {k: t.clone().requires_grad_() for k, t in arguments.items()}
     value = run(leaves)
     actual = dict(zip(leaves, torch.autograd.grad(value, list(leaves.values())), strict=True))
-    assert relative_error(value, loss(model, arguments)) <= tolerance("formula")
+    assert relative_error(value, loss(model, arguments, **options)) <= tolerance("formula")
     assert_same(actual, expected)
 
 
@@ -59,7 +58,8 @@ def test_compile_of_a_step_with_every_argument(device: str, fresh_compiler: None
 
 @pytest.mark.slow
 def test_compile_of_a_step_with_coarse_corrections(device: str, fresh_compiler: None) -> None:
-    compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False, coarse=dv.CoarseSpace(functions=4, groups=1))
+    solver = replace(STEP["solver"], subspace=dv.CoarseSpace(functions=4, groups=1))
+    compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False, solver=solver)
 
 
 @pytest.mark.slow
@@ -156,14 +156,14 @@ def saved_and_loaded(model: dv.Model) -> dv.Model:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)), saved_and_loaded])
 def test_copies_of_a_model_compute_the_same(device: str, copied: Any) -> None:
-    model = small_model(device, saturation=0.3, relaxation=1.2)
+    model, solver = small_model(device), replace(STEP["solver"], saturation=0.3, relaxation=1.2)
     inputs = small_inputs(model)
     twin = copied(model)
     assert twin is not model and twin._mass.data_ptr() != model._mass.data_ptr()
     assert repr(twin) == repr(model)
-    for a, b in zip(run_step(twin, inputs), run_step(model, inputs), strict=True):
+    for a, b in zip(run_step(twin, inputs, solver=solver), run_step(model, inputs, solver=solver), strict=True):
         assert torch.equal(a, b)
-    assert_same(gradients(twin, inputs), gradients(model, inputs), 0.0)
+    assert_same(gradients(twin, inputs, solver=solver), gradients(model, inputs, solver=solver), 0.0)
 
 
 # --- compiled autograd ------------------------------------------------------------------------------------------------

@@ -37,12 +37,10 @@ def test_a_row_that_would_be_ignored_raises(model: dv.Model) -> None:
     for how in (everywhere, dv.per_step(torch.stack([x, everywhere])), lambda k, x, v: moved(x, 5) if k else x):
         with pytest.raises(ValueError, match=MESSAGE):
             dv.rollout(model, x, v, steps=2, prescribed=how, **GIVEN)
-    options = {name: GIVEN[name] for name in ("mu", "lam", "time_step")}
     with pytest.raises(ValueError, match=MESSAGE):
-        # TODO62: the solver of this call
-        dv.solve(model, x, v, prescribed=everywhere, **options)
+        dv.solve(model, x, v, prescribed=everywhere, **GIVEN)
     with pytest.raises(ValueError, match=MESSAGE):
-        dv.diagnose(model, x, previous=(x, v), prescribed=everywhere, **options)
+        dv.diagnose(model, x, previous=(x, v), prescribed=everywhere, **GIVEN)
     scenes = torch.stack([x, everywhere])
     with pytest.raises(ValueError, match=r"vertex 5 of scene \[1\]"):
         dv.step(model, torch.stack([x, x]), torch.stack([v, v]), prescribed=scenes, **GIVEN)

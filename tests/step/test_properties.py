@@ -1,5 +1,6 @@
 """Claim: in any legal scene a step is finite, equals the reference, and touches nothing that it was given."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -42,16 +43,14 @@ def material(draw: st.DrawFn, rng: np.random.Generator, tets: int) -> Tensor:
     return torch.as_tensor(value * 10.0 ** rng.uniform(-contrast, contrast, tets))
 
 
-# TODO62: give the solver of model: saturation=draw(st.sampled_from((None, None, 0.1 * size))) if exact else 0.1 * size, regularization=draw(st.sampled_from((0.0, 1e-6))), relaxation=draw(st.sampled_from((1.0, 1.6)))
 @st.composite
-def scenes(draw: st.DrawFn) -> tuple[dv.Model, dict[str, Any], int]:
-    """A Model, the arguments of a step as fresh tensors, and the number of sweeps."""
+def scenes(draw: st.DrawFn) -> tuple[dv.Model, dict[str, Any], dv.VBD]:
+    """A Model, the inputs of a step as fresh tensors, and a solver."""
     points, tets = draw(meshes())
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     pinned = rng.random(len(points)) < draw(st.sampled_from((0.0, 0.2, 0.8)))
     pinned[np.setdiff1d(np.arange(len(points)), tets)] = True
     exact = draw(st.integers(0, 2)) > 0  # the paper's block may diverge where lam < mu, unless it is saturated
-    # TODO62: block="exact" if exact else "paper" of the solver
     energies: list[Any] = [dv.StableNeoHookean()]
     size = float(np.ptp(points, axis=0).max())
     strain = 10.0 ** draw(st.sampled_from((-2, -1, 0)))  # from smooth to inverted
@@ -82,12 +81,16 @@ def scenes(draw: st.DrawFn) -> tuple[dv.Model, dict[str, Any], int]:
         "density": model.density.clone(),
         "gravity": torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64),
     }
-    return model, inputs, draw(st.integers(0, 20))
+    saturation = draw(st.sampled_from((None, None, 0.1 * size))) if exact else 0.1 * size
+    solver = dv.VBD(10.0 ** draw(st.floats(-5, 0)), draw(st.integers(0, 20)), saturation=saturation,
+                    block="exact" if exact else "paper", regularization=draw(st.sampled_from((0.0, 1e-6))),
+                    relaxation=draw(st.sampled_from((1.0, 1.6))))  # fmt: skip
+    return model, inputs, solver
 
 
-def rounding(model: dv.Model, inputs: dict[str, Any], sweeps: int, expected: dict[str, Tensor]) -> float:
+def rounding(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD, expected: dict[str, Tensor]) -> float:
     """What rounding alone does to the worst entry of a scene."""
-    samples = [sample(model, inputs, sweeps, 1, expected) for sample in (testing.spread, testing.sensitivity)]
+    samples = [sample(model, inputs, solver, 1, expected) for sample in (testing.spread, testing.sensitivity)]
     return max(e for errors in samples for e in errors.values() if np.isfinite(e))
 
 
@@ -98,13 +101,13 @@ def test_finite_and_equal_to_the_reference(examples: int) -> None:
     @settings(QUICK, max_examples=examples)
     @given(scenes(), st.sampled_from(("full", "compact", "recompute")))
     def check(scene: tuple, tape: str) -> None:
-        model, inputs, sweeps = scene
-        before = {name: a.clone() for name, a in inputs.items() if isinstance(a, Tensor)}
-        result = evaluated(model, inputs, sweeps, tape)
+        model, inputs, solver = scene
+        before = {name: a.clone() for name, a in inputs.items()}
+        result = evaluated(model, inputs, replace(solver, tape=tape))
         assert all(torch.equal(a.nan_to_num(), inputs[name].nan_to_num()) for name, a in before.items())
         assert all(bool(torch.isfinite(a).all()) for a in result.values())
-        expected = testing.reference_result(model, inputs, sweeps)
-        predictor = evaluated(model, inputs, 0, "auto")
+        expected = testing.reference_result(model, inputs, solver)
+        predictor = evaluated(model, inputs, replace(solver, sweeps=0))
 
         def beyond(bar: float) -> list[str]:
             names = [] if relative_error(result["x"], expected["x"]) <= bar else ["x"]
@@ -117,7 +120,7 @@ def test_finite_and_equal_to_the_reference(examples: int) -> None:
 
         compared.append(True)
         if beyond(tolerance("adjoint")):  # executes the reference some more times
-            spread = rounding(model, inputs, sweeps, expected)
+            spread = rounding(model, inputs, solver, expected)
             compared[-1] = spread < 1e-3  # otherwise a block is singular to rounding: finite is all that can be asked
             assert not compared[-1] or not beyond(tolerance("property_factor") * spread)
 
@@ -128,20 +131,19 @@ def test_finite_and_equal_to_the_reference(examples: int) -> None:
 @QUICK
 @given(scenes(), st.data())
 def test_gradients_only_of_what_is_asked(scene: tuple, data: st.DataObject) -> None:
-    model, inputs, sweeps = scene
-    names = [name for name, a in inputs.items() if isinstance(a, Tensor)]
+    model, inputs, solver = scene
+    names = list(inputs)
     asked = data.draw(st.lists(st.sampled_from(names), unique=True, max_size=4))
-    everything = evaluated(model, inputs, sweeps, "auto")
+    everything = evaluated(model, inputs, solver)
     leaves = {name: inputs[name].clone().requires_grad_(name in asked) for name in names}
-    # TODO62: the solver of this call
-    x, v = dv.step(model, **(inputs | leaves), sweeps=sweeps)
+    x, v = dv.step(model, solver=solver, **leaves)
     assert x.requires_grad == v.requires_grad == bool(asked)
     assert relative_error(x, everything["x"]) <= tolerance("forward")
     if not asked:
         return
     weights = testing.generator("loss")
     loss = sum(f * (torch.as_tensor(weights.standard_normal(tuple(a.shape))) * a).sum()
-               for f, a in ((1.0, x), (inputs["time_step"], v)))  # fmt: skip
+               for f, a in ((1.0, x), (solver.time_step, v)))  # fmt: skip
     loss.backward()
     for name, leaf in leaves.items():
         if name not in asked:
@@ -155,7 +157,7 @@ def test_gradients_only_of_what_is_asked(scene: tuple, data: st.DataObject) -> N
 @given(scenes(), st.data())
 def test_strides_do_not_matter(scene: tuple, data: st.DataObject) -> None:
     """Transposed, sliced and expanded tensors give the bits of contiguous ones."""
-    model, inputs, sweeps = scene
+    model, inputs, solver = scene
 
     def strided(a: Tensor) -> Tensor:
         how = data.draw(st.sampled_from(("transposed", "sliced", "offset")))
@@ -167,11 +169,9 @@ def test_strides_do_not_matter(scene: tuple, data: st.DataObject) -> None:
             return wide[..., 1]
         return torch.cat((torch.full_like(a[:1], torch.nan), a))[1:]
 
-    odd = {name: strided(a) if isinstance(a, Tensor) else a for name, a in inputs.items()}
-    # TODO62: the solver of this call
-    x, v = dv.step(model, **inputs, sweeps=sweeps)
-    # TODO62: the solver of this call
-    x1, v1 = dv.step(model, **odd, sweeps=sweeps)
+    odd = {name: strided(a) for name, a in inputs.items()}
+    x, v = dv.step(model, solver=solver, **inputs)
+    x1, v1 = dv.step(model, solver=solver, **odd)
     assert torch.equal(x, x1) and torch.equal(v, v1)
 
 

@@ -1,5 +1,6 @@
 """Claim: with the rigid correction any number of sweeps falls freely, keeps momentum, turns as converged steps do."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.model.system import system_of
 from diffvbd.testing import relative_error
 from diffvbd.testing.tolerances import tolerance
 
@@ -25,13 +27,13 @@ def spinning(model: dv.Model) -> tuple[Tensor, Tensor]:
     return x, torch.linalg.cross(spin.expand_as(x), x - x.mean(0)) + drift
 
 
-def flown(model: dv.Model, mu: float, sweeps: int) -> tuple[float, float]:
+def flown(model: dv.Model, mu: float, solver: dv.VBD) -> tuple[float, float]:
     """Relative loss of momentum, and share of the angular momentum that is left, after 60 steps of 10 ms."""
     x, v = spinning(model)
     p, spin = momenta(model, x, v)
     with torch.no_grad():
         for _ in range(60):
-            x, v = dv.step(model, x, v, dv.VBD(0.01, sweeps), mu=mu, lam=mu, gravity=(0.0, 0.0, 0.0))
+            x, v = dv.step(model, x, v, solver, mu=mu, lam=mu, gravity=(0.0, 0.0, 0.0))
     p1, spin1 = momenta(model, x, v)
     return float((p1 - p).norm() / p.norm()), float(spin1[2] / spin[2])
 
@@ -40,11 +42,10 @@ def flown(model: dv.Model, mu: float, sweeps: int) -> tuple[float, float]:
 def test_free_flight(device: str, mu: float) -> None:
     model = dv.Model(dv.mesh.cube(4, size=0.2, split="kuhn"), device=device)
     for sweeps in (1, 2, 5, 20):
-        lost, left = flown(model, mu, sweeps)
+        lost, left = flown(model, mu, dv.VBD(0.01, sweeps))
         assert lost <= tolerance("rigid_momentum")
         assert abs(left - 0.7548) <= tolerance("rigid_spin")  # implicit Euler's own loss, of converged steps
-    # TODO62: give the solver rigid=False
-    alone, left = flown(dv.Model(model.mesh, device=device), mu, 2)
+    alone, left = flown(model, mu, dv.VBD(0.01, 2, subspace=None))
     assert alone > 0.05 and left < 0.745  # what sweeps alone do
 
 
@@ -95,24 +96,16 @@ def test_a_body_of_thousands_among_small_ones(device: str) -> None:
 
 def test_float32_falls_and_flies(device: str) -> None:
     model = dv.Model(dv.mesh.cube(4, size=0.2, split="kuhn"), dtype=torch.float32, device=device)
-    lost, left = flown(model, 1e5, 5)
+    lost, left = flown(model, 1e5, dv.VBD(0.01, 5))
     assert lost <= tolerance("rigid_momentum_float32") and abs(left - 0.7548) <= tolerance("rigid_spin")
 
 
-# TODO62: give the solver of model: subspace=None
 def test_it_can_be_left_out(device: str) -> None:
-    mesh = dv.mesh.cube(3, split="kuhn")
+    mesh, solver = dv.mesh.cube(3, split="kuhn"), dv.VBD(0.01, 1)
     model = dv.Model(mesh, device=device)
-    assert not model.corrects and dv.Model(mesh, device=device).corrects
-    assert not dv.Model(mesh, pinned=[0], device=device).corrects  # there is no free body
-    touching = (dv.StableNeoHookean(), dv.PairBarrier())
-    assert not dv.Model(mesh, energies=touching, device=device).rigid
-    with pytest.raises(ValueError, match="rigid: expected False beside a PairBarrier or Friction"):
-        # TODO62: give the solver rigid=True
-        dv.Model(mesh, energies=touching, device=device)
-    with pytest.raises(TypeError, match="rigid: expected True, False or None, got int"):
-        # TODO62: give the solver rigid=1
-        dv.Model(mesh, device=device)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match='start: expected "auto", "predictor" or "inertia", got \'rest\''):
-        # TODO62: give the solver start="rest"
-        dv.Model(mesh, device=device)  # type: ignore[arg-type]
+    assert system_of(model, solver).corrects and not system_of(model, replace(solver, subspace=None)).corrects
+    assert not system_of(dv.Model(mesh, pinned=[0], device=device), solver).corrects  # there is no free body
+    touching = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier()), device=device)
+    assert not system_of(touching, solver).rigid  # pairs have a correction of their own
+    with pytest.raises(TypeError, match='subspace: expected "rigid", "coarse", .* or None, got False'):
+        dv.VBD(0.01, 1, subspace=False)  # pyright: ignore[reportArgumentType]

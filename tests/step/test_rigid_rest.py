@@ -9,6 +9,7 @@ import torch
 from helpers.marks import slow
 
 import diffvbd as dv
+from diffvbd.model.system import system_of
 from diffvbd.testing.tolerances import tolerance
 
 H, DENSITY, KAPPA, DHAT, EDGE = 0.01, 3000.0, 1e3, 1e-2, 0.2
@@ -27,10 +28,10 @@ def turned_cube(normal: tuple[float, ...], lift: float) -> dv.TetMesh:
     return mesh.transform(rotation.numpy())
 
 
-def resting(device: str, normal: str = "y", lift: float = 0.012, **options: Any) -> dv.Model:
+def resting(device: str, normal: str = "y", lift: float = 0.012) -> dv.Model:
     floor = dv.FloorBarrier(height=0.0, normal=NORMALS[normal], kappa=KAPPA, dhat=DHAT)
     return dv.Model(turned_cube(NORMALS[normal], lift), density=DENSITY, energies=(dv.StableNeoHookean(), floor),
-                    device=device, **options)  # fmt: skip
+                    device=device)  # fmt: skip
 
 
 def equilibrium_gap(force: float) -> float:
@@ -53,11 +54,11 @@ def gaps(model: dv.Model, x: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def run(model: dv.Model, x: torch.Tensor, v: torch.Tensor, steps: int, sweeps: int, gravity: Any, mu: Any = 2e5
+def run(model: dv.Model, x: torch.Tensor, v: torch.Tensor, steps: int, solver: dv.VBD, gravity: Any, mu: Any = 2e5
         ) -> tuple[torch.Tensor, torch.Tensor, float]:  # fmt: skip
     lowest = math.inf
     for _ in range(steps):
-        x, v = dv.step(model, x, v, dv.VBD(H, sweeps), mu=mu, lam=2 * mu, gravity=gravity)
+        x, v = dv.step(model, x, v, solver, mu=mu, lam=2 * mu, gravity=gravity)
         lowest = min(lowest, float(gaps(model, x).min()))
     return x, v, lowest
 
@@ -76,11 +77,11 @@ def test_a_body_rests(device: str, relaxation: float, sweeps: int) -> None:
     # all of the weight on nine vertices alike, or on the corner that bears least of it
     least = equilibrium_gap(weight / 4)
     for normal in NORMALS if (relaxation, sweeps) in ON_PLANES else ("y",):
-        model = resting(device, normal, relaxation=relaxation)
-        assert model.corrects
+        model, solver = resting(device, normal), dv.VBD(H, sweeps, relaxation=relaxation)
+        assert system_of(model, solver).corrects
         n = torch.tensor(NORMALS[normal], dtype=torch.float64, device=device)
         x = model.rest_points.expand(3, -1, -1).clone()
-        x, v, lowest = run(model, x, torch.zeros_like(x), 500, sweeps, tuple((-9.81 * n).tolist()), mu)
+        x, v, lowest = run(model, x, torch.zeros_like(x), 500, solver, tuple((-9.81 * n).tolist()), mu)
         assert lowest >= 0.1 * least
         assert float(v.norm(dim=-1).max()) <= tolerance("rest_speed")
         moved = (x - model.rest_points).mean(-2)
@@ -108,7 +109,7 @@ def energy(model: dv.Model, x: torch.Tensor, v: torch.Tensor, mu: float) -> torc
 @pytest.mark.parametrize(("sweeps", "relaxation"), ((1, 0.5), (1, 1.0), (1, 1.6), (2, 1.6), (5, 1.0)))
 def test_no_drop_gains_energy(device: str, sweeps: int, relaxation: float) -> None:
     """A hundred drops, tilted and spinning, at 0 to 5 m/s: no step ends with more energy than the run began with."""
-    model = resting(device, lift=0.25, relaxation=relaxation)
+    model, solver = resting(device, lift=0.25), dv.VBD(H, sweeps, relaxation=relaxation)
     generator = torch.Generator().manual_seed(5)
     center = model.rest_points.mean(0)
     axes = torch.nn.functional.normalize(torch.randn(100, 3, generator=generator, dtype=torch.float64), dim=-1)
@@ -128,7 +129,7 @@ def test_no_drop_gains_energy(device: str, sweeps: int, relaxation: float) -> No
     touched = torch.zeros(100, dtype=torch.bool, device=device)
     with torch.no_grad():
         for _ in range(60):
-            x, v = dv.step(model, x, v, dv.VBD(H, sweeps), mu=mu, lam=2 * mu)
+            x, v = dv.step(model, x, v, solver, mu=mu, lam=2 * mu)
             now = energy(model, x, v, mu)
             assert bool(torch.isfinite(now).all())
             assert bool((now <= start + tolerance("energy_gain") * start.abs()).all())
@@ -140,10 +141,10 @@ def test_a_body_slides_without_friction(device: str) -> None:
     """Pushed along a floor it keeps its velocity."""
     model = resting(device)
     x = model.rest_points.clone()
-    x, v, _ = run(model, x, torch.zeros_like(x), 60, 5, (0.0, -9.81, 0.0))
+    x, v, _ = run(model, x, torch.zeros_like(x), 60, dv.VBD(H, 5), (0.0, -9.81, 0.0))
     v = v + torch.tensor([1.0, 0.0, 0.0], dtype=v.dtype, device=device)
     mean = x.mean(0)
-    x, v, _ = run(model, x, v, 100, 5, (0.0, -9.81, 0.0))
+    x, v, _ = run(model, x, v, 100, dv.VBD(H, 5), (0.0, -9.81, 0.0))
     traveled = x.mean(0) - mean
     assert abs(float(traveled[0]) - 1.0) <= tolerance("rest_drift") and abs(float(traveled[2])) <= tolerance(
         "rest_drift"
@@ -157,13 +158,13 @@ def test_the_gradient_of_a_body_at_rest(device: str, sweeps: int, mu: float) -> 
     mass for a force; what raising the floor does differences tell. At rest a correction has nothing else to do."""
     model, n = resting(device), 20
     start, gravity = model.rest_points, (0.0, -9.81, 0.0)
-    rest, still, _ = run(model, start, torch.zeros_like(start), 600, max(sweeps, 1), gravity, mu)
+    rest, still, _ = run(model, start, torch.zeros_like(start), 600, dv.VBD(H, max(sweeps, 1)), gravity, mu)
     share = model.mass / model.mass.sum()
 
     def center(v: torch.Tensor, force: torch.Tensor, height: torch.Tensor, steps: int) -> torch.Tensor:
-        options: dict[str, Any] = {"mu": mu, "lam": 2 * mu, "save": "last", "solver": dv.VBD(H, sweeps)}
-        parameters = {"floor_height": height}
-        return share @ dv.rollout(model, rest, v, steps=steps, force=force, **parameters, **options).x[-1]
+        end = dv.rollout(model, rest, v, dv.VBD(H, sweeps), steps=steps, save="last", mu=mu, lam=2 * mu, force=force,
+                         floor_height=height)  # fmt: skip
+        return share @ end.x[-1]
 
     v, force = still.clone().requires_grad_(), torch.zeros_like(rest).requires_grad_()
     height = torch.zeros(1, dtype=rest.dtype, device=device, requires_grad=True)

@@ -11,6 +11,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import ops, reference
 from diffvbd.adjoint.sweep import sweep
+from diffvbd.model.system import system_of
 from diffvbd.safeguards import FILTER_ETA
 from diffvbd.testing import build_scene, generator, on_device, relative_error, structured, tolerance
 
@@ -51,13 +52,14 @@ def falling(
     return model, x, v
 
 
-def check_all_sweeps(model: dv.Model, x: Tensor, v: Tensor, sweeps: list[int], **options: Any) -> None:
+def check_all_sweeps(model: dv.Model, x: Tensor, v: Tensor, sweeps: list[int], gravity: Any = None,
+                     **options: Any) -> None:  # fmt: skip
     """A step of K sweeps is a prefix of one of K + 1, so the states after every sweep are the steps of 0, 1, ... K."""
     free = ~model.pinned
     assert (gaps(model, x)[..., free, :] > 0).all()
     previous = gaps(model, x)[..., free, :]
     for k in sweeps:
-        end, _ = dv.step(model, x, v, dv.VBD(1 / 60, k), mu=1e4, lam=2e4, **options)
+        end, _ = dv.step(model, x, v, dv.VBD(1 / 60, k, **options), mu=1e4, lam=2e4, gravity=gravity)
         gap = gaps(model, end)[..., free, :]
         assert torch.isfinite(end).all()
         assert (gap > 0).all(), f"sweep {k}: gap {float(gap.min()):.3g}"
@@ -83,16 +85,12 @@ def test_no_sweep_closes_a_gap_of_few_ulps(device: str, clearance: float) -> Non
     check_all_sweeps(model, x, v, list(range(6)), gravity=(0.0, -1e6, 0.0))
 
 
-# TODO62: give the solver of model: relaxation=relaxation, saturation=saturation
 @pytest.mark.parametrize(("relaxation", "saturation", "block"), ((1.9, None, "exact"), (1.6, 0.05, "paper")))
 def test_no_sweep_reaches_a_plane_under_other_safeguards(
     device: str, relaxation: float, saturation: Any, block: str
 ) -> None:
     model, x, v = falling(device, "wedge", 0.0, torch.float64)
-    # TODO62: block=block of the solver
-    energies = (dv.StableNeoHookean(), model.floor)
-    model = dv.Model(model.mesh, pinned=[0], energies=energies, device=device)  # fmt: skip
-    check_all_sweeps(model, x, v, list(range(10)))
+    check_all_sweeps(model, x, v, list(range(10)), relaxation=relaxation, saturation=saturation, block=block)
 
 
 @pytest.mark.parametrize("below", (0.0, 1e-3, 10.0))
@@ -112,29 +110,26 @@ def test_start_below_a_plane_names_the_vertices(device: str, value_checks: None,
 DESCENT = ("plain", "soft", "stiff", "contrast", "no_shear", "inverted", "violent", "tiny", "huge")
 
 
-def predictor(model: dv.Model, inputs: dict[str, Any]) -> Tensor:
+def predictor(model: dv.Model, inputs: dict[str, Any], h: float) -> Tensor:
     """What step() aims at without forces of deformation."""
-    x, v, h = inputs["x"], inputs["v"], inputs["time_step"]
+    x, v = inputs["x"], inputs["v"]
     return torch.where(model.pinned[:, None], inputs["prescribed"], x + h * v + h**2 * inputs["gravity"])
 
 
 def states(
-    device: str, case: str, sweeps: int, **model_options: Any
+    device: str, case: str, sweeps: int, **options: Any
 ) -> tuple[dv.Model, dict[str, Any], Tensor, list[Tensor]]:
     """Model, arguments of the potential, predictor, and the positions after 0, 1, ... sweeps; all on the CPU."""
     scene = build_scene(case, "random", "small")
     energies = (dv.StableNeoHookean(), dv.Anchor(1.0))
-    model_options = {"energies": energies, "start": "predictor", **model_options}
     model = dv.Model(dv.TetMesh(scene.points, scene.tets), density=torch.from_numpy(scene.arrays["density"]),
-                     pinned=torch.from_numpy(scene.pinned), **model_options)  # fmt: skip
-    inputs = scene.inputs()
-    options = {name: inputs[name] for name in ("mu", "lam", "time_step")}
-    given = options | {"gravity": inputs["gravity"], "prescribed": inputs["prescribed"]}
+                     pinned=torch.from_numpy(scene.pinned), energies=energies)  # fmt: skip
+    inputs, h = scene.inputs(), scene.case.time_step
+    given = {name: inputs[name] for name in ("x", "v", "mu", "lam", "gravity", "prescribed")}
     there, given = model.to(device), on_device(given, device)
-    x, v = inputs["x"].to(device), inputs["v"].to(device)
-    # TODO62: the solver of this call
-    path = [dv.step(there, x, v, **given, sweeps=k)[0].cpu() for k in range(sweeps + 1)]
-    return model, options, predictor(model, inputs), path
+    solvers = [dv.VBD(h, k, start="predictor", **options) for k in range(sweeps + 1)]
+    path = [dv.step(there, solver=solver, **given)[0].cpu() for solver in solvers]
+    return model, {"mu": inputs["mu"], "lam": inputs["lam"], "time_step": h}, predictor(model, inputs, h), path
 
 
 @pytest.mark.parametrize("relaxation", (0.5, 1.0, 1.5, 1.9))
@@ -167,12 +162,12 @@ def test_an_update_forgets_where_its_vertex_was(device: str) -> None:
     scene = build_scene("violent", "delaunay", "small")
     model, inputs = scene.model(device), scene.inputs(device=device)
     first = model.color_vertices[: int(model.color_ptr[1])]
-    y = predictor(model, inputs)[None]
+    y = predictor(model, inputs, scene.case.time_step)[None]
 
     def swept(start: Tensor, sweeps: int) -> Tensor:
         fields = ops.SweepFields(start, start.detach(), y, inputs["mu"][None], inputs["lam"][None], model.mass[None],
                                  None, model._energy_data)  # fmt: skip
-        settings = model.settings(inputs["time_step"], sweeps)
+        settings = system_of(model, scene.solver(sweeps)).settings(scene.case.time_step, sweeps)
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.FULL_TAPE)[0]
 
     other = y.clone()

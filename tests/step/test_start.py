@@ -9,16 +9,17 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
+from diffvbd.model.system import system_of
 from diffvbd.testing import generator, relative_error, tolerance
 
 STEP = 1 / 60
 MESH = dv.mesh.beam(6, 3, 3, size=(0.5, 0.2, 0.2))
 STARTS = ("predictor", "inertia")
 SOFT, STIFF = 1e2, 1e7  # [Pa]
+PAIRS = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 1e-2))
 
 
-def model_of(start: Any, device: str, mesh: dv.TetMesh = MESH, **options: Any) -> dv.Model:
-    # TODO62: give the solver start=start
+def model_of(device: str, mesh: dv.TetMesh = MESH, **options: Any) -> dv.Model:
     return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, device=device, **options)
 
 
@@ -31,7 +32,7 @@ def moving(model: dv.Model) -> tuple[Tensor, Tensor]:
 
 def start_of(start: Any, device: str, x: Tensor, v: Tensor, mesh: dv.TetMesh = MESH, **options: Any) -> Tensor:
     """Where a step's sweeps start: a step without sweeps."""
-    return dv.step(model_of(start, device, mesh), x, v, dv.VBD(STEP, 0), **options)[0]
+    return dv.step(model_of(device, mesh), x, v, dv.VBD(STEP, 0, start=start), **options)[0]
 
 
 @pytest.mark.parametrize("floor", (False, True))
@@ -39,17 +40,19 @@ def start_of(start: Any, device: str, x: Tensor, v: Tensor, mesh: dv.TetMesh = M
 def test_auto_takes_the_lower_potential(device: str, mu: float, wanted: str | None, floor: bool) -> None:
     energies: tuple[Any, ...] = (dv.StableNeoHookean(), dv.Anchor(10.0))
     energies += (dv.FloorBarrier(height=-2e-3, kappa=40.0, dhat=0.01),) if floor else ()
-    models = {start: model_of(start, device, energies=energies) for start in ("auto", *STARTS)}
-    x, v = moving(models["auto"])
+    model = model_of(device, energies=energies)
+    x, v = moving(model)
     options = {"mu": mu, "lam": 1.5 * mu}
-    at = {start: dv.step(model, x, v, dv.VBD(STEP, 0), **options)[0].cpu() for start, model in models.items()}
-    plain = models["auto"].to("cpu")
+    solvers = {start: dv.VBD(STEP, 0, start=start) for start in ("auto", *STARTS)}
+    at = {start: dv.step(model, x, v, solver, **options)[0].cpu() for start, solver in solvers.items()}
+    plain = model.to("cpu")
     y = x + STEP * v + STEP**2 * torch.tensor([0.0, -9.81, 0.0], dtype=x.dtype, device=device)
-    y = torch.where(models["auto"].pinned[:, None], x, y).cpu()
+    y = torch.where(model.pinned[:, None], x, y).cpu()
     held_back = relative_error(at["predictor"], y)
     assert held_back > 1e-4 if floor else held_back <= tolerance("ulps")
     assert relative_error(at["predictor"], at["inertia"]) > 1e-4
-    potential = {start: float(reference.incremental_potential(plain, at[start], y, x_prev=x.cpu(), **options))
+    potential = {start: float(reference.incremental_potential(plain, at[start], y, x_prev=x.cpu(), time_step=STEP,
+                                                                 **options))
                  for start in STARTS}  # fmt: skip
     lower = min(STARTS, key=lambda start: potential[start])
     assert wanted in (lower, None)
@@ -67,7 +70,7 @@ def by_tet(*mu: float, device: str) -> Tensor:
 
 def test_bodies_and_scenes_choose_for_themselves(device: str) -> None:
     mesh, half = two_beams(), MESH.num_vertices
-    x, v = moving(model_of("auto", device, mesh))
+    x, v = moving(model_of(device, mesh))
     mu = torch.stack([by_tet(SOFT, STIFF, device=device), by_tet(STIFF, SOFT, device=device)])
     xs, vs = x.repeat(2, 1, 1), v.repeat(2, 1, 1)
     auto, y, coasting = (start_of(start, device, xs, vs, mesh, mu=mu, lam=1.5 * mu) for start in ("auto", *STARTS))
@@ -84,12 +87,12 @@ def test_bodies_and_scenes_choose_for_themselves(device: str) -> None:
 def test_gradients_are_those_of_the_start_that_was_taken(device: str, mu: float, taken: str, sweeps: int) -> None:
     results = []
     for start in ("auto", taken):
-        model = model_of(start, device)
+        model = model_of(device)
         x, v = moving(model)
         given = {"x": x, "v": v, "mu": torch.full((model.num_tets,), mu).to(x), "force": 0.1 * torch.sin(40 * x)}
         given["gravity"] = torch.tensor([0.0, -9.81, 1.0], dtype=x.dtype, device=device)
         leaves: dict[str, Any] = {name: t.clone().requires_grad_() for name, t in given.items()}
-        end, velocity = dv.step(model, solver=dv.VBD(STEP, sweeps), **leaves, lam=1.5 * mu)
+        end, velocity = dv.step(model, solver=dv.VBD(STEP, sweeps, start=start), **leaves, lam=1.5 * mu)
         loss = (torch.cos(3 * end) * end).sum() + (velocity * torch.sin(end)).sum()
         results.append(
             dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values()), allow_unused=True), strict=True))
@@ -108,25 +111,22 @@ def test_gradients_are_those_of_the_start_that_was_taken(device: str, mu: float,
 
 def test_what_is_executed(device: str) -> None:
     """`starts_from`: there is nothing to choose where every body is corrected; beside pairs a step chooses itself."""
-    free, floor = dv.Model(MESH, device=device), dv.FloorBarrier(height=-1.0)
-    friction = (dv.StableNeoHookean(), floor, dv.Friction(0.3))
-    pairs = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 1e-2))
-    assert model_of("auto", device).starts_from == "auto"
-    # TODO62: give the solver rigid=False
-    assert dv.Model(MESH, device=device).starts_from == "auto"
-    assert model_of("auto", device, energies=friction).starts_from == "auto"
-    assert {free.starts_from, model_of("auto", device, energies=pairs).starts_from} == {"predictor"}
-    for start in STARTS:
-        model = model_of(start, device)
-        assert model.start == model.starts_from == start and f'start="{start}"' in repr(model)
-        assert model.to(dtype=torch.float32).start == start
-    assert model_of("auto", device).start == "auto" and "start" not in repr(model_of("auto", device))
+    free, held = dv.Model(MESH, device=device), model_of(device)
+    friction = model_of(device, energies=(dv.StableNeoHookean(), dv.FloorBarrier(height=-1.0), dv.Friction(0.3)))
+    pairs = model_of(device, energies=PAIRS)
+
+    def taken(model: dv.Model, **options: Any) -> str:
+        return system_of(model, dv.VBD(STEP, 1, **options)).starts_from
+
+    assert taken(held) == taken(free, subspace=None) == taken(friction) == "auto"
+    assert taken(free) == taken(pairs) == "predictor"
+    assert all(taken(held, start=start) == start for start in STARTS)
 
 
 def test_bad_starts(device: str) -> None:
     for start in ("rest", "Auto", None, 1):
-        with pytest.raises((ValueError, TypeError), match='^start: expected "auto", "predictor" or "inertia", got '):
-            model_of(start, device)
-    pairs = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 1e-2))
-    with pytest.raises(ValueError, match='^start: expected "auto" or "predictor" beside a PairBarrier.*"inertia"'):
-        model_of("inertia", device, energies=pairs)
+        with pytest.raises((ValueError, TypeError), match='^start: expected "auto" or "predictor" or "inertia", got '):
+            dv.VBD(STEP, 1, start=start)  # pyright: ignore[reportArgumentType]
+    model = model_of(device, energies=PAIRS)
+    with pytest.raises(ValueError, match='^start: expected "auto" or "predictor" with a PairBarrier.*"inertia"'):
+        dv.step(model, *moving(model), dv.VBD(STEP, 1, start="inertia"), mu=SOFT, lam=SOFT)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from helpers.bad_input import STEP as BAD_STEP
 from helpers.bad_input import model_of, raises
-from helpers.results import saved_bytes
+from helpers.results import evaluated, saved_bytes
 from helpers.two_boxes import STEP as CONTACT_STEP
 from helpers.two_boxes import two_boxes
 from helpers.values import STEP, uniform
@@ -21,7 +21,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.checks import name_value
-from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
+from diffvbd.testing import build_scene, relative_error, tolerance
 
 GROUND = {"height": -0.06, "kappa": 2e4, "dhat": 0.1, "damping": 20.0}
 
@@ -101,9 +101,7 @@ def test_broadcasting_equals_a_loop_over_scenes(
     x, v = state(model, *lead)
 
     def run(x: Tensor, v: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-        options: dict[str, Any] = {"mu": 1e4, "lam": 2e4}
-        options |= {"parameters": {name: value}} if "." in name else {name: value}
-        return dv.step(model, x, v, **options, **STEP)
+        return dv.step(model, x, v, **{"mu": 1e4, "lam": 2e4, **STEP, name: value})
 
     actual = run(x, v, value)
     scenes = list(np.ndindex(*lead))
@@ -139,7 +137,7 @@ def test_defaults_are_the_models_own_values(device: str) -> None:
     x, v = state(model)
     plain = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
     options = {"force": torch.zeros_like(x), "gravity": (0.0, -9.81, 0.0), "prescribed": x, "density": 700.0}
-    options |= {"rest_points": model.rest_points, "parameters": {"floor_kappa": 2e4}}
+    options |= {"rest_points": model.rest_points, "floor_kappa": 2e4}
     spelled = dv.step(model, x, v, mu=1e4, lam=2e4, **options, **STEP)
     for a, b in zip(spelled, plain, strict=True):
         assert relative_error(a, b) <= tolerance("sum")
@@ -156,12 +154,10 @@ def same(a: Tensor, b: Tensor) -> bool:
 def test_inputs_are_untouched_and_steps_repeat(device: str) -> None:
     scene = build_scene("floor_damped")
     model, inputs = scene.model(device), scene.inputs(device=device)
-    flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs["parameters"]
     constants = {k: t.clone() for k, t in vars(model).items() if isinstance(t, Tensor)}
-    before = {k: t.clone() for k, t in flat.items()}
-    # TODO62: the solver of this call
-    results = [evaluate(lambda **o: dv.step(model, **o, sweeps=4), inputs) for _ in range(2)]
-    assert all(same(flat[k], before[k]) for k in flat)
+    before = {k: t.clone() for k, t in inputs.items()}
+    results = [evaluated(model, inputs, scene.solver(4)) for _ in range(2)]
+    assert all(same(inputs[k], before[k]) for k in inputs)
     assert all(torch.equal(getattr(model, k), constants[k]) for k in constants)
     assert results[0].keys() == results[1].keys()
     assert all(torch.equal(results[0][k], results[1][k]) for k in results[0])
@@ -190,11 +186,10 @@ def test_a_tape_exists_only_for_steps_that_need_one(device: str) -> None:
     full = sweeps * model.num_active * 72
 
     def run(first: Tensor, second: Tensor, tape: str) -> Tensor:
-        adjoint = dv.ReverseSweep(tape)
-        state = (x, first)
+        solver, at = dv.VBD(0.01, sweeps, tape=tape), x
         for velocity in (first, second):
-            state = dv.step(model, state[0], velocity, dv.VBD(0.01, sweeps), mu=1e4, lam=2e4, adjoint=adjoint)
-        return state[0]
+            at, _ = dv.step(model, at, velocity, solver, mu=1e4, lam=2e4)
+        return at
 
     own = [t for t in vars(model).values() if isinstance(t, Tensor)]
     once = saved_bytes(lambda: run(v, leaf, "full"), own)
@@ -208,23 +203,12 @@ def test_a_tape_exists_only_for_steps_that_need_one(device: str) -> None:
 # --- tapes without autograd -------------------------------------------------------------------------------------------
 
 
-def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The inputs with every tensor a fresh leaf, and those leaves by name."""
-    flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs.get("parameters", {})
-    leaves = {k: t.clone().requires_grad_() for k, t in flat.items()}
-    call = {k: leaves.get(k, value) for k, value in inputs.items()}
-    if "parameters" in inputs:
-        call["parameters"] = {k: leaves[k] for k in inputs["parameters"]}
-    return call, leaves
-
-
 @pytest.mark.parametrize("case", ["plain", "paper", "floor_damped", "anchored", "batch"])
 def test_step_forward_and_backward_equal_autograd(device: str, case: str) -> None:
     scene = build_scene(case)
     model, inputs = scene.model(device), scene.inputs(device=device)
-    call, leaves = leaves_of(inputs)
-    # TODO62: the solver of this call
-    out = dv.step(model, **call, sweeps=3)
+    leaves = {k: t.clone().requires_grad_() for k, t in inputs.items()}
+    out = dv.step(model, solver=scene.solver(3), **leaves)
     grad_x, grad_v = (uniform(*t.shape, low=-1.0, high=1.0).to(device) for t in out)
     expected = torch.autograd.grad(out, list(leaves.values()), (grad_x, grad_v), allow_unused=True, retain_graph=True)
     of_x = torch.autograd.grad(out[0], list(leaves.values()), grad_x, allow_unused=True)
@@ -241,7 +225,7 @@ def test_step_forward_and_backward_equal_autograd(device: str, case: str) -> Non
         for name, slope in zip(leaves, of_x, strict=True):
             assert slope is None or torch.equal(dv.step_backward(tape, grad_x)[name], slope), name
     assert sum(float(g.abs().max()) > 0 for g in grads.values()) >= 5
-    assert all(not t.requires_grad for t in inputs.values() if isinstance(t, Tensor))
+    assert not any(t.requires_grad for t in inputs.values())
 
 
 def test_step_forward_keeps_a_tape_for_wrt_only(device: str) -> None:
@@ -325,8 +309,7 @@ def test_check_gradients_tells_right_from_wrong(device: str, capsys: pytest.Capt
     rest = {k: value for k, value in inputs.items() if k not in arguments}
 
     def loss(**given: Tensor) -> Tensor:
-        # TODO62: the solver of this call
-        return total(*dv.step(model, **given, **rest, sweeps=3))
+        return total(*dv.step(model, solver=scene.solver(3), **given, **rest))
 
     right = dv.check_gradients(loss, arguments)
     assert right.ok, str(right)
@@ -353,7 +336,7 @@ def test_anchor_pulls_chosen_vertices_to_their_points(device: str) -> None:
     k, h = 30.0, 0.02
     model = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=[2, 5]),), device=device)
     x, v = state(model)
-    new, speed = dv.step(model, x, v, dv.VBD(h, 1), mu=0.0, lam=0.0, gravity=(0.0, 0.0, 0.0))
+    new, speed = dv.step(model, x, v, dv.VBD(h, 1), gravity=(0.0, 0.0, 0.0))
     m = model.mass[:, None]
     y = x + h * v
     chosen = torch.zeros(8, 1, dtype=torch.bool).index_fill(0, torch.tensor([2, 5]), True)
@@ -362,10 +345,9 @@ def test_anchor_pulls_chosen_vertices_to_their_points(device: str) -> None:
     assert relative_error(new, expected) <= tolerance("formula")
     assert relative_error(speed, (expected - x) / h) <= tolerance("cancelling")
     by_mask = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=chosen[:, 0]),), device=device)
-    assert torch.equal(dv.step(by_mask, x, v, dv.VBD(h, 1), mu=0.0, lam=0.0, gravity=(0, 0, 0))[0], new)
+    assert torch.equal(dv.step(by_mask, x, v, dv.VBD(h, 1), gravity=(0, 0, 0))[0], new)
     stiffness = torch.full((8,), k, dtype=torch.float64, device=device, requires_grad=True)
-    options = {"mu": 0.0, "lam": 0.0, "gravity": (0.0, 0.0, 0.0), "solver": dv.VBD(h, 1)}
-    out = dv.step(model, x, v, anchor_stiffness=stiffness, **options)
+    out = dv.step(model, x, v, dv.VBD(h, 1), anchor_stiffness=stiffness, gravity=(0.0, 0.0, 0.0))
     (slope,) = torch.autograd.grad(out[0].sum(), stiffness)
     formula = (h * h * m * (points - y) / (m + h * h * k) ** 2).sum(-1) * chosen[:, 0]
     assert relative_error(slope, formula) <= tolerance("cancelling")
@@ -376,8 +358,7 @@ def test_anchor_pulls_chosen_vertices_to_their_points(device: str) -> None:
 
 def forward(device: str, **options: Any) -> tuple[Tensor, dv.results.Tape]:
     model = model_of(device)
-    # TODO62: the solver of this call
-    x, _, tape = dv.step_forward(model, model.rest_points, 0 * model.rest_points, **(BAD_STEP | options))
+    x, _, tape = dv.step_forward(model, model.rest_points, 0 * model.rest_points, **BAD_STEP | options)
     return x, tape
 
 
@@ -405,7 +386,7 @@ def test_a_tape_without_a_graph_is_refused(device: str) -> None:
 
 def test_steps_that_move_with_nothing_have_gradients_of_zero(device: str) -> None:
     """Without sweeps the material is read by nobody, and without wrt there is no gradient to give."""
-    x, tape = forward(device, wrt=("mu",), sweeps=0)
+    x, tape = forward(device, wrt=("mu",), solver=dv.VBD(0.01, 0))
     assert torch.equal(dv.step_backward(tape, torch.ones_like(x))["mu"], torch.zeros_like(x[0, 0]))
     x, tape = forward(device, wrt=())
     assert dv.step_backward(tape, torch.ones_like(x)) == {}
@@ -442,7 +423,6 @@ def test_a_bad_value_that_requires_grad_is_named_without_a_warning() -> None:
 def test_batched_gradients_of_a_step_with_contact_say_so(device: str, options: dict[str, Any], kind: str) -> None:
     model = two_boxes(device, **options)
     x = model.rest_points.clone().requires_grad_()
-    # TODO62: the solver of this call
     for out in dv.step(model, x, torch.zeros_like(x), **CONTACT_STEP):
         rows = torch.ones((2, *x.shape), dtype=x.dtype, device=device)
         with pytest.raises(NotImplementedError, match="batched gradients .* of a step with contact are not supported"):

@@ -396,7 +396,7 @@ def test_what_cannot_be_rough_is_refused(tmp_path: Path) -> None:
     def run(stage: Stage) -> None:
         solve(Problem("cliff", {"x": x}, [stage], lambda: {}), Settings(tmp_path))
 
-    with pytest.raises(ValueError, match=r"stages\[0\].rough: expected False beside an optimizer .*, got True"):
+    with pytest.raises(ValueError, match=r"stages\[0\].rough: expected False with an optimizer .*, got True"):
         run(Stage(lambda: cliff(x), 1, optimizer=torch.optim.SGD, rough=True))
     with pytest.raises(TypeError, match=r"stages\[0\].rough: expected a bool, got 'yes'"):
         run(Stage(lambda: cliff(x), 1, rough="yes"))  # type: ignore[arg-type]

@@ -48,7 +48,7 @@ GRADIENTS = [
     *((name, 0, 1e-6, "long_difference") for name in ("cube-bounce", "bunny-bounce", "learn-controller")),
     *((name, k, 1e-6, "kinked_difference") for name in ("dress-mu-lam", "dress-silhouette") for k in range(3)),
     *(("fit-real-mesh", k, 1e-5, "long_difference") for k in range(2)),
-    *(("million-cubes", k, 1e-4, "coarse_difference") for k in range(2)),  # tiny beside that of the velocity
+    *(("million-cubes", k, 1e-4, "coarse_difference") for k in range(2)),  # tiny against that of the velocity
     ("cover-the-spot", 0, 1e-8, "kinked_difference"),
     ("throw", 0, 1e-6, "kinked_difference"),
 ]
@@ -430,7 +430,7 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="bodies: expected at least 1, got 0"):
         million_cubes.problem(Settings(tmp_path), bodies=0)
     for wrong in ({"bodies": 65}, {"steps": 240}):
-        with pytest.raises(ValueError, match="at most 64|none beside --quick"):
+        with pytest.raises(ValueError, match="at most 64|none with --quick"):
             quick(NAME, tmp_path, **wrong)
     with pytest.raises(ValueError, match="steps: expected at least 120, .* got 119"):
         million_cubes.problem(Settings(tmp_path), bodies=4, steps=119)

@@ -54,7 +54,7 @@ def test_scenes_and_names_are_motions_of_their_own() -> None:
         (X.expand(2, 2, 2, -1, -1), MODEL, ValueError, "source: expected shape"),
         (X[None][:0], MODEL, ValueError, "source: expected at least one frame"),
         (X * float("nan"), MODEL, ValueError, "source: expected finite positions, got some .* frame 0"),
-        (X, None, TypeError, "mesh: expected a dv.Model or a dv.TetMesh beside Tensor, got None"),
+        (X, None, TypeError, "mesh: expected a dv.Model or a dv.TetMesh with Tensor, got None"),
         (X, MESH.points, TypeError, "mesh: expected a dv.Model or a dv.TetMesh, got ndarray"),
         (3.0, MODEL, TypeError, "source: expected a Trajectory, positions, a mesh or a file, got float"),
         ({}, MODEL, ValueError, "source: expected at least one motion"),
