@@ -20,7 +20,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import testing
-from diffvbd.checks import input_name
+from diffvbd._common.checks import input_name
 from diffvbd.solvers import XPBD, ProjectiveDynamics
 from diffvbd.testing import contact_scenes
 from diffvbd.testing.contact_scenes import noise

@@ -6,9 +6,9 @@ import os as _os
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from . import colliders, contact, distributed, mesh, results, solvers, viz
+from ._contact.barrier import Friction, PairBarrier
 from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
-from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .inspect.diagnose import diagnose
 from .inspect.forces import reactions, stress

@@ -17,8 +17,6 @@ import torch
 
 import diffvbd as dv
 from diffvbd.mesh.motions import EXTENSIONS, check_extension
-from diffvbd.said import PAGES
-from diffvbd.scopes import record_to
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.folder import joined
 from diffvbd.tasks.problem import Result, Row, check_device
@@ -26,6 +24,9 @@ from diffvbd.tasks.report import versions
 from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
 from diffvbd.viz.server import require_viser
 from diffvbd.viz.values import QUANTITIES
+
+from ._common.context import record_to
+from ._common.messages import PAGES
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:

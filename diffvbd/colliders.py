@@ -1,5 +1,5 @@
 """Colliders of a Model's ``colliders=``: planes, spheres, capsules and triangle meshes, fixed or moving."""
 
-from .contact.colliders import Capsule, Obstacle, Plane, Sphere
+from ._contact.colliders import Capsule, Obstacle, Plane, Sphere
 
 __all__ = ["Capsule", "Obstacle", "Plane", "Sphere"]

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
-from .checks import check_count, fail
+from ._common.checks import check_count, fail
 
 if dist.is_available():
     # The first step of an optimiser imports this. Its defaults then keep the process group alive beyond

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import (
+from ._common.checks import (
     check_number,
     check_positive,
     check_readable,
@@ -24,7 +24,7 @@ from .checks import (
     refuse_gradients,
     vertex_mask,
 )
-from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT
+from ._common.constants import EXACT_BLOCK, FIRST_VERTEX_BIT
 
 MAX_PLANES = 8
 FADE = 0.1  # of kappa dhat: the normal force from which a contact has half of its damping; twins in csrc and reference

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import check_positive, fail, kind_of
+from ._common.checks import check_positive, fail, kind_of
 
 
 def vertex_distance(x: Tensor, target: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import pytest
 
 SPELLINGS = (
     "from diffvbd.contact import status, record; import diffvbd; assert diffvbd.contact.status is status",
-    "import diffvbd.contact.barrier as b; import diffvbd as dv; assert b.PairBarrier is dv.PairBarrier",
+    "import diffvbd._contact.barrier as b; import diffvbd as dv; assert b.PairBarrier is dv.PairBarrier",
     "from diffvbd import mesh, solvers, testing, energies, losses; assert mesh.cube and testing.evaluate",
     "import diffvbd; assert all(hasattr(diffvbd, name) for name in diffvbd.__all__)",
     "import diffvbd, sys; assert 'torch._dynamo' not in sys.modules",  # which takes a second to load

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import scopes
+from diffvbd._common import context as scopes
 
 OPTIONS: dict[str, Any] = {"mu": 1e4, "lam": 2e4, "solver": dv.VBD(0.01, 2)}
 

@@ -20,10 +20,10 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from .._common.context import is_captured
+from .._common.messages import warn
 from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
-from ..said import warn
-from ..scopes import is_captured
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
 from .sweep import sweep

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from .. import ops
-from ..checks import check_bool, check_count, check_positive, fail, is_word
+from .._common.checks import check_bool, check_count, check_positive, fail, is_word
 
 # Up to which bytes of a step's full tape "auto" keeps it: these, or on CUDA this share of the device's memory if that
 # is more.

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from .._common.context import replaced
 from ..ops import distinct, no_transforms
 from ..ops.regimes import BLOCK, FEW_LANES, THREAD
-from ..tuples import replaced
 
 _FAILED_ALLOCATION = (
     "out of memory", "can't allocate memory", "bad_alloc", "Storage size calculation overflowed", '"aten::new_'

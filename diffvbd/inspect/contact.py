@@ -8,12 +8,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..checks import check_count, check_kind, check_readable, fail
-from ..contact.barrier import PairBarrier
-from ..contact.detection import intersections as find
-from ..contact.surface import build_surface
+from .._common.checks import check_count, check_kind, check_readable, fail
+from .._contact.barrier import PairBarrier
+from .._contact.detection import intersections as find
+from .._contact.surface import build_surface
 from ..model.model import Model
-from ..step.met import Detection, outcomes
+from ..step.contact import Detection, outcomes
 from .forces import ForceParts, Forces, forces
 from .penalty import Bodies, center_of_mass_penalty
 

@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from ..checks import check_bool, check_broadcast, check_tensor, name_value
-from ..mask import ELASTIC
+from .._common.checks import check_bool, check_broadcast, check_tensor, name_value
+from .._common.constants import ELASTIC
+from .._common.messages import percent
+from .._common.messages import warn as say
 from ..model.inputs import LOADS, MODULI, Given
 from ..model.material import moduli_of
 from ..model.model import Model
 from ..model.solver import VBD, ImplicitEuler
 from ..model.system import System, system_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
-from ..said import percent
-from ..said import warn as say
 from ..step.arguments import acceleration_of, check_prescribed, check_state, given_of, prepare, refuse_non_finite
 from ..step.predict import begin
 from ..step.residual import (
@@ -37,7 +37,7 @@ from ..step.residual import (
     rounding,
     share,
 )
-from .wide import check_previous, wide, widen
+from .forces import check_previous, wide, widen
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..checks import check_bool, check_count, check_number, check_positive, fail
+from .._common.checks import check_bool, check_count, check_number, check_positive, fail
 
 
 @dataclass(frozen=True)

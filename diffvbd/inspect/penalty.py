@@ -10,11 +10,10 @@ from torch import Tensor
 from torch.nn.functional import pad, softplus
 
 from .. import ops
-from ..checks import check_count, check_dense, check_positive, check_tensor, fail
-from ..lasting import lasting_tensors
+from .._common.checks import check_count, check_dense, check_positive, check_tensor, fail
+from .._common.context import lasting_tensors, looks_at
 from ..model.model import Model
 from ..ops.contact import neighbor_pairs, unread
-from ..scopes import looks_at
 
 PAIRS_PER_BODY = 16  # room for pairs where max_pairs is not given; equal balls in contact have 6 (12 neighbors each)
 EXACT_SOFTPLUS = 50.0  # from there on softplus(t) = t in either dtype

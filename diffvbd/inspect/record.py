@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any, Literal
 
-from .. import scopes
-from ..checks import fail, is_word
-from ..scopes import record_to
+from .._common import context as scopes
+from .._common.checks import fail, is_word
+from .._common.context import record_to
 
 
 @contextlib.contextmanager

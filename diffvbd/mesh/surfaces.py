@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from diffvbd.mesh.arrays import FloatArray, IntArray, connected, count, float_array, int_array, positive, warn
 from diffvbd.mesh.io import Source, read_triangles
 from diffvbd.mesh.tet_mesh import TetMesh
-from diffvbd.said import LOGGER
+
+from .._common.messages import LOGGER
 
 # Rows: what becomes x, y, z. All are rotations, and each brings the axis of its name to y.
 _TO_Y = {

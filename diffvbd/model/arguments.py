@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_readable, fail, refuse_gradient, to_float
-from ..contact.barrier import Friction, PairBarrier
+from .._common.checks import check_readable, fail, refuse_gradient, to_float
+from .._common.messages import warn
+from .._contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
 from ..mesh import TetMesh
-from ..said import warn
 
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction

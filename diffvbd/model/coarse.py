@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_count, fail, is_word
+from .._common.checks import check_count, fail, is_word
+from .._common.context import replaced
 from ..ops.coarse import PACK as LANES
 from ..ops.coarse import ROW, lengths
 from ..ops.fields import TILE
-from ..tuples import replaced
 from .bodies import connected
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from ..checks import input_name
-from ..contact.barrier import Friction, PairBarrier
+from .._common.checks import input_name
+from .._common.constants import ELASTIC
+from .._contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES
-from ..mask import ELASTIC
 
 MODULI = ("mu", "lam", "young", "poisson")
 LOADS = ("force", "gravity", "prescribed")

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import NUMBERS, check_broadcast, check_readable, check_tensor, fail, name_value, to_float
-from ..scopes import looks_at
+from .._common.checks import NUMBERS, check_broadcast, check_readable, check_tensor, fail, name_value, to_float
+from .._common.context import looks_at
 
 _Vector = tuple[Tensor, ...]  # three components
 

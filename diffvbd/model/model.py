@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_dtype, check_held, check_kind, fail, vertex_mask
-from ..contact.barrier import Friction, PairBarrier
-from ..contact.colliders import Collider
-from ..contact.surface import ContactSurface, build_surface, check_colliders
+from .._common.checks import check_dtype, check_held, check_kind, fail, vertex_mask
+from .._common.constants import CONTACT
+from .._common.context import is_captured, lasting, lasting_tensors
+from .._contact.barrier import Friction, PairBarrier
+from .._contact.colliders import Collider
+from .._contact.surface import ContactSurface, build_surface, check_colliders
 from ..energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
-from ..lasting import lasting, lasting_tensors
-from ..mask import CONTACT
 from ..mesh import TetMesh
-from ..scopes import is_captured
 from .arguments import Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
 from .bodies import find_bodies, first_of_body
 from .inputs import Inputs, inputs_of

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..tuples import replaced
+from .._common.context import replaced
 from .bodies import connected
 from .coarse import ROW, in_blocks
 from .material import rest_metric

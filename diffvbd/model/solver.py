@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ..checks import check_count, check_number, check_positive, fail, is_word
+from .._common.checks import check_count, check_number, check_positive, fail, is_word
 from .coarse import CoarseSpace
 
 PAPER_SATURATION = 0.1  # [m]

@@ -9,11 +9,10 @@ from typing import Any
 import torch
 
 from .. import ops
-from ..checks import check_kind, fail
-from ..contact.surface import ContactSurface
-from ..mask import CONTACT, ELASTIC, EXACT_BLOCK, PAPER_BLOCK
+from .._common.checks import check_kind, fail
+from .._common.constants import CONTACT, ELASTIC, EXACT_BLOCK, FILTER_ETA, PAPER_BLOCK, SATURATION_EPS
+from .._contact.surface import ContactSurface
 from ..ops import regimes
-from ..safeguards import FILTER_ETA, SATURATION_EPS
 from .bodies import find_bodies
 from .coarse import check_coupled, plan_of
 from .material import lumped_mass, rest_metric

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..mask import ELASTIC
-from ..said import page, warn
+from .._common.constants import ELASTIC
+from .._common.messages import page, warn
 from .model import Model
 from .system import System
 

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .._common.constants import FILTER_ETA
+from .._common.context import is_captured
 from ..energies import VERTEX_ENERGIES
-from ..safeguards import FILTER_ETA
-from ..scopes import is_captured
 from .autograd import Bars, Differentiable, sum_to
 from .fields import TouchingFields
 from .load import direct as raw

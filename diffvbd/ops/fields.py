@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from ..mask import FILTERS, KEEPS_POSITIONS
+from .._common.constants import FILTERS, KEEPS_POSITIONS
 from .load import raw
 
 _C: dict[str, Any] = {a.name: a.default_value for a in raw.constants.default._schema.arguments}

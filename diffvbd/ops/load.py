@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from ..scopes import transformed
+from .._common.context import transformed
 
 _FOLDER = Path(__file__).parents[1]  # of the package, where the objects are
 _COMMAND = "pip install --no-build-isolation -e ."  # in a checkout

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import Literal
 
-from ..checks import fail
+from .._common.checks import fail
 from . import THREAD
 
 Regime = Literal["thread", "block", "grid", "color"]

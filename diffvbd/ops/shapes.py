@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
+from .._common.constants import CONTACT
 from ..energies import VERTEX_ENERGIES
-from ..mask import CONTACT
 from .fields import (
     CONSTANTS,
     COUNTS,

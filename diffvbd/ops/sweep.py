@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from ..tuples import replaced
+from .._common.context import replaced
 from .fields import (
     FULL_TAPE,
     NO_TAPE,

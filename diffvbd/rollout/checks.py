@@ -11,21 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import check_bool
+from .._common.checks import check_bool
+from .._common.constants import ELASTIC
+from .._common.context import is_captured, looks_at, may_copy, replaced
+from .._common.messages import is_silent, page, percent, warn
 from ..energies import Anchor
-from ..mask import ELASTIC
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import Integrator
 from ..model.system import System
 from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
-from ..said import is_silent, page, percent, warn
-from ..scopes import is_captured, looks_at, may_copy
 from ..step.arguments import Prepared, acceleration_of, collider_state
-from ..step.contact_cycles import CUT
+from ..step.contact import CUT, outcomes
 from ..step.integrators import Solve
-from ..step.met import outcomes
 from ..step.predict import begin, energy_data
 from ..step.residual import (
     UNBALANCED_FRICTION,
@@ -38,7 +37,6 @@ from ..step.residual import (
     what_helps,
 )
 from ..step.stability import FAR, fault_of, reach_of, size_of
-from ..tuples import replaced
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
+from .._common.checks import check_bool, check_count, fail, is_word
+from .._common.constants import KEEPS_POSITIONS
+from .._common.context import Scope, transformed
 from ..adjoint.routes import Adjoint, TapedSweep, Unrolled
-from ..checks import check_bool, check_count, fail, is_word
-from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
 from ..model.solver import BDF2, VBD
 from ..model.system import System, system_of
-from ..scopes import Scope, transformed
 from ..step.advance import cuda_scratch
-from ..step.contact_cycles import sweeps_of_parts
+from ..step.contact import sweeps_of_parts
 from ..step.integrators import solves_of
 
 

@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_positive, fail, to_float
+from .._common.checks import check_positive, fail, to_float
+from .._common.constants import ELASTIC
+from .._common.context import Finer, record_to, refined
+from .._common.messages import percent
 from ..energies import Anchor
-from ..mask import ELASTIC
 from ..mesh import subdivide
 from ..model.inputs import MODULI
 from ..model.model import Model
 from ..model.solver import VBD
-from ..said import percent
-from ..scopes import Finer, record_to, refined
 from ..step.integrators import History, is_step_of
 from ..step.residual import UNBALANCED, left_of_solve, share
 from .checks import check_checks

@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._common.checks import check_bool, check_count, check_function, check_kind, check_positive, fail, is_word
+from .._common.context import looks_at, recorders, refinement, replaced
+from .._common.messages import is_own
 from ..adjoint.routes import Adjoint, check_adjoint
-from ..checks import check_bool, check_count, check_function, check_kind, check_positive, fail, is_word
 from ..model.inputs import LOADS, Given
 from ..model.model import Model
 from ..model.solver import MAX_SWEEPS, VBD
 from ..model.system import System
 from ..model.warnings import warn_of_inverted_bodies
-from ..said import is_own
-from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
 from ..step.arguments import (
     acceleration_of,
@@ -32,11 +32,10 @@ from ..step.arguments import (
     step_settings,
     system_for,
 )
+from ..step.contact import check_start as refuse_start
 from ..step.integrators import History, check_history, check_staged, solves_of, take
-from ..step.intersections import check_start as refuse_start
 from ..step.residual import ErrorEstimate, cut_share, error_of, of_steps
 from ..step.stability import proven, warn_of_sweeps
-from ..tuples import replaced
 from .checks import Checks, check_checks, checks_contact, look_at_end, look_at_energy, warn_of_contact, warn_of_last_end
 from .memory import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .refine import LOOKS, rollout_finer

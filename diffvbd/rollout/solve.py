@@ -9,15 +9,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from .._common.checks import check_bool, check_count, check_positive, fail, is_word
+from .._common.context import refuse_refinement, refuse_transforms, replaced
+from .._common.messages import log_progress, warn
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, check_adjoint
-from ..checks import check_bool, check_count, check_positive, fail, is_word
 from ..model.model import Model
 from ..model.solver import BDF2, VBD
 from ..model.system import System
 from ..ops import SweepSettings
-from ..said import log_progress, warn
-from ..scopes import refuse_refinement, refuse_transforms
 from ..step.advance import advance, swept
 from ..step.arguments import (
     Prepared,
@@ -30,11 +30,10 @@ from ..step.arguments import (
     refuse_non_finite,
     system_for,
 )
+from ..step.contact import outcomes
 from ..step.integrators import check_staged, take
-from ..step.met import outcomes
 from ..step.predict import Begun, begin
 from ..step.residual import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
-from ..tuples import replaced
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import check_count, fail
-from ..scopes import is_captured
+from .._common.checks import check_count, fail
+from .._common.context import is_captured
 from ..step.integrators import History
 from ..step.residual import ErrorEstimate
 

@@ -14,15 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_count, check_kind, check_number, check_positive, check_time_step, fail
-from ..contact.barrier import PairBarrier
+from .._common.checks import check_count, check_kind, check_number, check_positive, check_time_step, fail
+from .._common.context import record_to, refined, refuse_transforms
+from .._common.messages import log_progress, percent, silence
+from .._contact.barrier import PairBarrier
 from ..model.inputs import MODULI, sorted_inputs
 from ..model.model import Model
 from ..model.solver import BDF2, SDIRK2, VBD, ImplicitEuler, Integrator
 from ..model.system import system_of
 from ..model.warnings import is_nearly_incompressible
-from ..said import log_progress, percent, silence
-from ..scopes import record_to, refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, check_state, given_of, material_of, prepare
 from ..step.integrators import SAME_TIME_STEP
 from ..step.residual import cut_share

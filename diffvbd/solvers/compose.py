@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..checks import check_count, fail
-from ..scopes import Scope, checking
+from .._common.checks import check_count, fail
+from .._common.context import Scope, checking
 
 Rows = Tensor | slice | None
 Tensors = tuple[Tensor, ...]

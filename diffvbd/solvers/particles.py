@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import (
+from .._common.checks import (
     check_broadcast,
     check_count,
     check_dtype,
@@ -24,7 +24,7 @@ from ..checks import (
     refuse_gradient,
     vertex_mask,
 )
-from ..lasting import lasting_tensors
+from .._common.context import lasting_tensors
 from ..mesh import TetMesh
 from ..model.arguments import checked_device
 from ..step.arguments import acceleration_of

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 from torch import Tensor
 
-from ..checks import check_time_step, fail
-from ..lasting import lasting_tensors
+from .._common.checks import check_time_step, fail
+from .._common.context import lasting_tensors
 from ..mesh import TetMesh
 from ..ops.sums import one_thread
 from ..step.arguments import GRAVITY

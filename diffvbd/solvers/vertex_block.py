@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_broadcast, check_kind, check_tensor, check_time_step, fail, name_value
+from .._common.checks import check_broadcast, check_kind, check_tensor, check_time_step, fail, name_value
+from .._common.constants import SATURATION_EPS
 from ..energies import StableNeoHookean
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import VBD
-from ..safeguards import SATURATION_EPS
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
 from .particles import FixedSum, check_finite, placed
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_time_step, fail, is_word
-from ..lasting import lasting_tensors
+from .._common.checks import check_time_step, fail, is_word
+from .._common.context import lasting_tensors
 from ..mesh import TetMesh
 from ..step.arguments import GRAVITY
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose

@@ -15,15 +15,14 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from .._common.constants import VERTEX_ENERGIES
+from .._common.context import checking, recorders, replaced
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep, check_adjoint
 from ..adjoint.sweep import fused_step, is_out_of_memory, sweep
-from ..mask import VERTEX_ENERGIES
 from ..model.system import System
 from ..ops import regimes
 from ..ops.fields import TILE, WORKSPACE_BUDGET
-from ..scopes import checking, recorders
-from ..tuples import replaced
 from .arguments import (
     Prepared,
     acceleration_of,

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import ops, reference
-from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
-from ..checks import (
+from .._common.checks import (
     NUMBERS,
     check_broadcast,
     check_kind,
@@ -25,15 +24,16 @@ from ..checks import (
     name_value,
     to_float,
 )
-from ..contact.colliders import MOST_LENGTH, Plane
-from ..mask import ELASTIC
+from .._common.constants import ELASTIC
+from .._common.context import checking, looks_at, refuse_forward_mode, transformed
+from .._contact.colliders import MOST_LENGTH, Plane
+from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..model.inputs import MODULI, Given, parameters_of, sorted_inputs
 from ..model.material import lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
 from ..model.solver import VBD
 from ..model.system import System, system_of
 from ..model.warnings import warn_of_solver
-from ..scopes import checking, looks_at, refuse_forward_mode, transformed
 from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]

@@ -4,42 +4,41 @@
 from __future__ import annotations
 
 import functools
+import math
+import weakref
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, no_pairs, rubbing, some_of
-from ..adjoint.potential import of_vertices
-from ..adjoint.rise import RiseParts, rise_parts
+from .. import ops
+from .._common.constants import CONTACT
+from .._common.context import checking, is_captured, not_compiled, recorders, replaced
+from .._contact import detection as search
+from .._contact.barrier import PairBarrier
+from .._contact.detection import intersections
+from .._contact.start import PartStart, above_floor, start_between_planes
+from .._contact.surface import LEAST_CAPACITY, ContactSurface
+from ..adjoint.contact import Pairs, no_pairs, rubbing, some_of
+from ..adjoint.potential import RiseParts, of_vertices, rise_parts
 from ..adjoint.sweep import no_transforms, sweep
-from ..contact import detection as search
-from ..contact.start import PartStart, start_between_planes
-from ..contact.surface import LEAST_CAPACITY
-from ..mask import CONTACT
 from ..model.inputs import parameter_of
+from ..model.model import Model
 from ..model.system import System
 from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
+from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
-from ..ops.contact import RoomsOfBodies
-from ..scopes import checking, is_captured, not_compiled, recorders
-from ..tuples import replaced
+from ..ops.contact import RoomsOfBodies, contact_rooms, lift_left, sweep_rooms
+from ..ops.fields import WAYS
+from .arguments import Prepared, collider_state
 from .coarse import matrix_of
-from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_parts, sweeps_of_part, swept_part
-from .corrections import corrected, corrected_after, is_cut
-from .floor_start import start_on_floor
-from .intersections import advice_to_part, refuse_intersections
-from .met import Detection, Met, TooManyPairs, outcomes
-from .motion import Motion, coasting, motion_of
-from .rooms import ROOM, rooms, rooms_of_sweeps
-from .unsupported import rests, unsupported
-
-if TYPE_CHECKING:
-    from .arguments import Prepared
-    from .predict import Begun
+from .contact_corrections import Corrections, Scenes, Trials, bodies_of, corrected, corrected_after, is_cut, touching
+from .predict import Begun
 
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
@@ -399,3 +398,423 @@ def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor,
                 raise
             # nobody has said how many there may be: again, with room for them
             model.model.surface_of_contact = replace(surface, capacity=2 * error.needed)
+
+
+# --- the sweeps of a part of a step with pairs or friction, in cycles, with the coarse correcti -----------------------
+
+# Of a step that nobody has given a number: by how far bodies want to go, and with more of them while pairs hold some up
+MOST_PLANNED, MOST_DETECTIONS = 4, 8
+CUT = 0.01  # share of the vertices that pairs may hold up, beside whole bodies, before it goes on, and a rollout warns
+
+
+class SweptPart(NamedTuple):
+    """Result of the sweeps of a substep."""
+
+    x: Tensor  # [B, V, 3]
+    limits: Tensor  # uint8 [B, K, V]
+    lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
+
+
+def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
+    """Numbers of sweeps of R substeps: K spread evenly, the first ones taking the remainder."""
+    return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
+
+
+def sweeps_of_part(sweeps: int, planned: int, part: int) -> int:
+    """And how many a part has; one beyond those that were planned, as many as the last of these, or one."""
+    shared = sweeps_of_parts(sweeps, planned)
+    return shared[part] if part < planned else max(shared[-1], min(sweeps, 1))
+
+
+def parts_of(over: Tensor) -> int:
+    """Number of substeps of a step without a given number: one, and one more each time that bodies want to go
+    twice as far as the most room that they get. over: of RoomsOfBodies."""
+    most = float(over.max()) if over.numel() else 0.0
+    return min(MOST_PLANNED, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
+
+
+def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, listed: Pairs, settings: SweepSettings,
+               policy: int, debug_step: int) -> SweptPart:  # fmt: skip
+    """Positions [B, V, 3] after the sweeps of a part that begin at x, in the rooms of its start."""
+
+    def sweep(x: Tensor, settings: SweepSettings) -> tuple[Tensor, Tensor]:
+        return of._sweep(x, start.center, start.room, collider, listed, settings, policy, debug_step)
+
+    settings = replaced(settings, coarse=())  # which the operator would make, without pairs
+    cycles = _cycles(of.model, settings.sweeps)
+    if len(cycles) <= 1:
+        return SweptPart(*sweep(x, settings))
+    corrections = None
+    if of.coarse_matrix is not None:
+        judge = _trials(of, start, collider, listed)
+        corrections = Corrections(judge, of.fields, of.coarse_matrix, _scenes(of, start, collider, listed))
+    numbers = settings.numbers
+    within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
+    limits, lengths = [], []
+    for n, count in enumerate(cycles):
+        ends = n + 1 == len(cycles)
+        if corrections is not None and n:
+            x, length = corrections.correct(x)
+            lengths.append(length)
+        x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))
+        limits.append(limit)
+    return SweptPart(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None)
+
+
+def _cycles(model: System, sweeps: int) -> list[int]:
+    """Sweeps of each cycle of a part, with corrections the first sweep alone; [sweeps] where nothing is done between
+    them."""
+    if model.coarse is None or not model.coarse_geometry.bodies:
+        return [sweeps]
+    every, after = model.coarse.every, sweeps - 1
+    return [1, *(min(every, after - begun) for begun in range(0, after, every))]
+
+
+def _scenes(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Scenes:
+    numbers = of.prepared.settings.numbers
+    fields = touching(of, of.x_prev, collider, start, listed)
+    return Scenes(of.model, fields, numbers.time_step, numbers.friction_eps)
+
+
+def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Trials:
+    s = _scenes(of, start, collider, listed)
+    s = replaced(s, fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
+    return Trials(s, of.potential_parts)
+
+
+def of_going(part: SweptPart, going: Tensor) -> SweptPart:
+    """Result of a substep in the scenes that go on, bool [B, 1, 1]; in others it is discarded."""
+    return part if part.lengths is None else replaced(part, lengths=torch.where(going[:, 0], part.lengths, 0.0))
+
+
+def record_parts(model: System, x: Tensor, parts: Sequence[SweptPart]) -> None:
+    """For coarse.record(): what the parts of a step that ends at x have done."""
+    if model.coarse is not None:
+        for found in recorders("subspace"):
+            lengths = [part.lengths for part in parts if part.lengths is not None]
+            empty = x.new_empty((0, len(x), model.coarse_geometry.bodies))
+            found.append(torch.cat([empty, *lengths]).movedim(0, 1))
+
+
+# --- records of a step with contact -----------------------------------------------------------------------------------
+
+
+class Detection(NamedTuple):
+    """One search for pairs, and what its part of the step has decided. Index data; the step differentiates the values
+    anew. N corner points: vertices, then those of colliders.
+
+    Attributes:
+        listed: The pairs that may matter: ``pairs`` [capacity, 6], four corner points, kind (0 point and triangle, 1
+            two edges, 2 point and plane) and scene, or -1; ``constants`` [capacity, 8]; those of each corner point by
+            ``ptr`` [B N + 1] and ``entry`` [4 capacity].
+        near_corners: Corner points and kind of the nearest pair of each corner point, int [B, N, 5]; -1: none.
+        near_values: Its weights, normal and gap [m], [B, N, 8].
+        counts: int64 [4]: pairs that the list needs, pairs that touch, key of one of those or -1, 0.
+        smallest: Smallest gap of each scene, or how far was looked [m], [B].
+        island: Smallest body of those that each body moves with, int [B, bodies]; -1: it stays, being held or near a
+            collider.
+        lowest: Lowest vertex of each body's island above each plane of the floor, int [B, bodies, planes]; else empty.
+        room: How far the vertices of each body may go beside its island, and the largest [m], [B, bodies + 1].
+        own_room: The same beside the rigid motion of the body [m].
+        shares: How much of its two ways each vertex begins the part with, [B, V] each.
+        corrections: Shares of the rigid corrections before and after the sweeps, [B, bodies] each.
+        limits: By how often each update was halved, uint8 [B, K, V]; 8: it was not made.
+        frames: Share of the rigid motion that each body begins the part with, [B, bodies].
+        lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
+        kept: Rows of the listed pairs that sweeps can reach; None where that would have to be read, as on CUDA.
+        sweeps: How many sweeps the part has.
+        going: Scenes that go on in a part beyond those that were planned, bool [B, 1, 1]; None: all, as planned.
+        resting: Vertices of held bodies that begin without gravity's fall, bool [B, V]; None: none.
+    """
+
+    listed: Pairs
+    near_corners: Tensor
+    near_values: Tensor
+    counts: Tensor
+    smallest: Tensor
+    island: Tensor
+    lowest: Tensor
+    room: Tensor
+    own_room: Tensor
+    # what the part has decided
+    shares: tuple[Tensor, ...] | None = None
+    corrections: tuple[Tensor, ...] | None = None
+    limits: Tensor | None = None
+    frames: Tensor | None = None
+    lengths: Tensor | None = None
+    kept: Tensor | None = None
+    sweeps: int = 0
+    going: Tensor | None = None
+    resting: Tensor | None = None
+
+
+class Outcome(NamedTuple):
+    """Record of the latest step of a Model, on its device; read by diffvbd.contact.status."""
+
+    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
+    capacity: int  # pairs of all scenes
+    cut: Tensor  # [B, V] bool: limited in the last sweep; without any, held up at the start
+    smallest: Tensor  # [R, B] [m]
+
+
+class TooManyPairs(RuntimeError):
+    """More pairs than fit; ``needed`` per scene."""
+
+    def __init__(self, needed: int, message: str) -> None:
+        super().__init__(message)
+        self.needed = needed
+
+
+class Met:
+    """Records of the substeps, one after another."""
+
+    def __init__(self) -> None:
+        self.found: list[Detection] = []
+        self.counts: list[Tensor] = []
+        self.swept: list[SweptPart] = []
+        self.cut: Tensor | None = None  # before the first part is over
+
+    def outcome(self, capacity: int, x: Tensor) -> Outcome:
+        """capacity: Pairs of all scenes that fit.  x: [B, V, 3] at the start of the step."""
+        smallest, counts = _stack([d.smallest for d in self.found]), _stack(self.counts)
+        cut = torch.zeros_like(x[..., 0], dtype=torch.bool) if self.cut is None else self.cut
+        return Outcome(counts, capacity, cut, smallest)
+
+
+def _stack(parts: list[Tensor]) -> Tensor:
+    return parts[0][None] if len(parts) == 1 else torch.stack(parts)  # one is not copied: on CUDA that is a launch
+
+
+outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
+
+
+# --- a state whose surfaces intersect is an error ---------------------------------------------------------------------
+
+
+def check_start(model: System, x: Tensor, colliders: Any, colliders_before: Tensor | None, moving: bool) -> None:
+    """Raises where the surfaces of a rollout's initial state intersect; waits for the device. Nothing happens without a
+    PairBarrier, under torch.compile, and while a CUDA graph is captured.
+
+    Args:
+        x: [..., V, 3] [m].  colliders, colliders_before: As given to the rollout.
+        moving: Whether ``colliders`` change from step to step, so that the first of them are not the start.
+    """
+    if model.surface_of_contact is None or x.numel() == 0 or torch.compiler.is_compiling():
+        return
+    if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return  # the step says that there are no transforms of it
+    if is_captured(x):
+        return
+    where = collider_state(model, x, None if moving else colliders, colliders_before)
+    if where is not None:
+        refuse_intersections(model, x.reshape(-1, *x.shape[-2:]), x.new_empty((0,)), where[0],
+                             "; check_start=False starts all the same")  # fmt: skip
+
+
+def advice_to_part(x: Tensor, origin: Tensor, dhat: float) -> str:
+    """Advice about surfaces that touch. x: [B, V, 3] [m], relative to origin [B, V, 3] or empty."""
+    far = max(float(t.abs().max()) for t in (x, origin) if t.numel())
+    rounded = far * torch.finfo(x.dtype).eps
+    if rounded > dhat / 2:
+        return (f"positions of up to {far:.3g} m are rounded by {rounded:.3g} m as {x.dtype}, dhat is {dhat:g} m: "
+                "give x in metres, near the origin")  # fmt: skip
+    return f"move them apart, best by about dhat, {dhat:g} m"
+
+
+def refuse_intersections(model: System, x: Tensor, origin: Tensor, colliders: Tensor, otherwise: str = "") -> None:
+    """Raises where an edge of the surfaces passes through a triangle, or a point lies behind a plane.
+
+    Args:
+        x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  colliders: [B, Vc, 3] [m].
+        otherwise: What else the message advises.
+
+    Raises:
+        ValueError: It names the first crossing of the first scene that has one.
+    """
+    surface, barrier = model.surface_of_contact, model.contact
+    assert surface is not None and barrier is not None
+    found = intersections(x, origin, colliders, surface, barrier.self_contact, barrier.between_bodies)
+    counts = found.counts.tolist()
+    for scene, (crossings, behind) in enumerate(counts):
+        if crossings == behind == 0:
+            continue
+        (edge, triangle), (point, plane) = found.first[scene].tolist()
+        if crossings:
+            ends, corners = surface.edges[edge].tolist(), surface.triangles[triangle].tolist()
+            what = f"the edge of corner points {ends} passes through the triangle {corners}"
+        else:
+            ends, corners = [int(surface.points[point])], surface.planes[plane].tolist()
+            what = f"corner point {ends[0]} lies behind the plane {corners}"
+        of_bodies = all(corner < model.num_vertices for corner in ends + corners)
+        total, below = (sum(row[k] for row in counts) for k in (0, 1))
+        got = [f"{total} edges through triangles"] * bool(total) + [f"{below} points behind planes"] * bool(below)
+        raise ValueError(
+            f"{'x' if of_bodies else 'x or colliders'}: expected surfaces that do not intersect, got "
+            f"{' and '.join(got)}: {what} in scene {scene}, of "
+            f"{surface.owners_of(ends[0], corners[0])}. Contact keeps apart what is apart and cannot undo this: "
+            f"move the bodies apart (diffvbd.contact.intersections lists what crosses){otherwise}"
+        )
+
+
+# --- trust regions ----------------------------------------------------------------------------------------------------
+
+ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
+LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compressed may push
+
+
+@torch.no_grad()
+def rooms(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
+          was: Tensor, now: Tensor, floor: Tensor | None, any_direction: bool) -> RoomsOfBodies:  # fmt: skip
+    """Trust-region radii of bodies until pairs are found again. Index data.
+
+    Args:
+        motion: Where each vertex wants to go.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
+        was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or None.
+        any_direction: Whether the floor has planes across the axes, along which a translation may be turned.
+    """
+    s, dhat = surface, barrier.dhat
+    floor = x.new_empty((0,)) if floor is None else floor.detach().contiguous()
+    return contact_rooms(
+        x.detach(), origin, mass.detach().contiguous(), motion.move.detach().contiguous(), s.held, s.body_order,
+        s.body_ptr, motion.ways, floor, was.detach(), now.detach(), s.planes, s.body, s.radius, s.most_room,
+        s.most_room_alone, s.most_own_room, s.least_own_room, dhat, ROOM, LEAST_ROOM * dhat, any_direction,
+        barrier.self_contact,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def rooms_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor,
+                    begin: Tensor) -> Tensor:  # fmt: skip
+    """Largest displacement of a vertex by the sweeps [B, V] [m]: as far as a barrier pushes, weight
+    pulls, elasticity takes back what bodies deform by on the way and, of what pairs have held up, all; the most of a
+    scene, since bodies push one another. Index data.
+
+    Args:
+        motion: What the part wanted.  start: Its start, whose rooms bound the whole way.
+        x, begin: Where the sweeps begin, and where the part began, [B, V, 3] [m].
+    """
+    s, none = surface, x.new_empty((0,))
+    own_center, own_room = start.own or (none, none)
+    x, led, begin, move, fall = (t.detach().contiguous() for t in (x, start.x, begin, motion.move, motion.fall))
+    return sweep_rooms(
+        x, led, begin, move, fall, motion.apart, motion.stretched, start.center, start.room, own_center, own_room,
+        s.held, s.body_order, s.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
+    )  # fmt: skip
+
+
+# --- intended motion of bodies ----------------------------------------------------------------------------------------
+
+
+def coasting(x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor, order: Tensor, ptr: Tensor,
+             chord: float) -> Tensor:  # fmt: skip
+    """The ways ``move`` [B, V, 3] without what stretches free bodies that turn; differentiable in x, mass and move.
+    Arguments as for :func:`diffvbd.ops.contact.contact_coast`."""
+    given = (t.contiguous() for t in (x, mass, move))
+    return ops_contact.coasting(*given, held, held_bodies, order, ptr, chord)
+
+
+class Motion(NamedTuple):
+    """The ways that vertices want to go in a part of a step."""
+
+    move: Tensor  # [B, V, 3] [m]
+    fall: Tensor  # [B, V, 3] [m]: what contact may bear of it comes after ``move``
+    rigid: Tensor  # [B, V, 3] [m]: of ``move`` a shift and a turn of each body, which brings no two points of it closer
+    ways: ops_contact.Ways  # index data
+
+    @property
+    def apart(self) -> Tensor:
+        """The longest way of a free vertex of each body beside its rigid motion [B, bodies] [m]."""
+        return self.ways.longest[WAYS.index("apart")]
+
+    @property
+    def stretched(self) -> Tensor:
+        """Distance by which the straight paths of a rotation, or of a fraction of it, take a vertex of each body from
+        the rotated body [B, bodies] [m]."""
+        return self.ways.longest[WAYS.index("stretched")]
+
+
+def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, fall: Tensor) -> Motion:
+    """Differentiable in what x, mass and move do to ``rigid``.
+
+    Args:
+        x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].  move, fall: [B, V, 3] [m].
+    """
+    x, mass, move = x.contiguous(), mass.contiguous(), move.contiguous()
+    index = (surface.held, surface.held_bodies, surface.body_order, surface.body_ptr)
+    rigid, longest, sums = ops_contact.rigid_motion(x, mass, move, origin, *index, fall.detach().contiguous())
+    return Motion(move, fall, rigid, ops_contact.Ways(rigid.detach(), longest, sums))
+
+
+# --- residual acceleration of each body -------------------------------------------------------------------------------
+
+
+def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
+                floor_data: Tensor | None, time_step: float) -> Tensor:  # fmt: skip
+    """Residual of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
+    part of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
+
+    Without it every step would push a supported body into its support, and the sweeps would have to take it back.
+
+    Args:
+        x, origin: As the sweeps take them.  push: Forces of pairs on corner points at x [B, N, 3] [N].
+        mass: [1 | B, V] [kg].  floor_data: Of the FloorBarrier [1 | B, 7 planes], or None.  time_step: [s].
+    """
+    surface = model.surface_of_contact
+    assert surface is not None
+    planes = x.new_empty((0,)) if floor_data is None else floor_data
+    constants = (surface.held_bodies, surface.body_order, surface.body_ptr, time_step)
+    at = x.detach() if floor_data is None else x  # without a floor only forces know where vertices are
+    given = (t.contiguous() for t in (at, lift, push, mass, planes))
+    return lift_left(*given, origin, *constants)
+
+
+def rests(model: System, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
+    """Vertices of partly pinned bodies whose potential ``lift`` would increase, bool [B, V]; None
+    without such bodies. Elasticity bears the weight of a body at rest, and its potential is convex about there: it
+    rises by any fall. Few sweeps do not take the fall back, and what stands on such a body would follow it.
+
+    Args:
+        x: Where vertices are without the fall, [B, V, 3] [m].  lift: As :func:`unsupported` returns it.
+        raises: As for :func:`diffvbd._contact.start.start_between_planes`.
+    """
+    assert model.surface_of_contact is not None
+    held = model.surface_of_contact.partly_held
+    return None if held is None else raises(x, x + lift) & held
+
+
+# --- start of the sweeps of a step with friction on a floor and no pairs ----------------------------------------------
+
+PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
+
+
+def start_on_floor(model: System, begun: Begun, floor: Tensor | None, mass: Tensor, prepared: Prepared
+                   ) -> Tensor:  # fmt: skip
+    """Positions [B, V, 3] [m]: free bodies go as wholes, above the floor. If each vertex went as far as the floor lets
+    it by itself, the start would press a body that hits the floor. Differentiable.
+
+    floor: Data of the FloorBarrier [1 | B, 7 planes], or None.  mass: [1 | B, V] [kg].
+    """
+    x, start = begun.x_prev, begun.x_start
+    if floor is None:
+        return start
+    order, ptr, free, held, body = bodies_of(model)
+    body, lift = body[: x.shape[1]].long(), broadcast(begun.lift, x.shape)
+    way = prepared.ways(partial(coasting, x, mass, begun.y - x - lift, held, ~free, order, ptr))
+    if model.starts_from != "inertia":
+        way = way + _borne(floor, x if begun.origin is None else x + begun.origin, lift, body, len(free))
+    none = x.new_empty((0,))
+    origin = none if begun.origin is None else begun.origin
+    left, _ = above_floor(x, none, way, floor, origin, held, order, ptr)
+    return torch.where(free[body, None], x + left, start)
+
+
+def _borne(floor: Tensor, x: Tensor, lift: Tensor, body: Tensor, bodies: int) -> Tensor:
+    """``lift`` = h^2 a [B, V, 3] without what pushes a body into a plane within dhat, which bears it. Of a body at rest
+    nothing is left, on a slope what draws it down the slope."""
+    planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
+    normal = planes[:, 0, :, :3]
+    with torch.no_grad():
+        close = (x @ normal.mT - planes[..., 3] < planes[..., DHAT]).to(x.dtype)
+        near = close.new_zeros((len(x), bodies, close.shape[-1]))
+        near = near.scatter_reduce(1, body[:, None].expand(close.shape), close, "amax")[:, body]
+    return lift - (near * (lift @ normal.mT).clamp(max=0)) @ normal

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,13 +11,14 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import input_name
-from ..mask import ELASTIC
+from .._common.checks import input_name
+from .._common.constants import ELASTIC, FILTER_ETA
+from .._common.context import replaced
+from ..model.bodies import Bodies, OtherBodies
 from ..model.system import System
-from ..tuples import replaced
+from ..ops import STARTS, distinct
+from ..ops.contact import join_data
 from .arguments import CHORD, Prepared, broadcastable
-from .rigid import correct
-from .start import begin as start_of
 
 
 def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -120,3 +122,130 @@ def begin(
     if prepared.euler is not None:
         x_start = torch.where(prepared.euler[..., None], begins(chord=CHORD)[0], x_start)
     return Begun(x_start, start, y, data, origin, (h * h) * acceleration)
+
+
+# --- start of a step --------------------------------------------------------------------------------------------------
+
+_START_TENSORS = 6  # differentiable fields: x, v, acceleration, prescribed, mass, energy_data
+_SCENES = 10  # and origin, mu, lam, rest: what has a scene dimension
+_START_FIELDS = len(ops.BeginFields._fields)
+
+
+def _run_start(*args: Any) -> tuple[Tensor, ...]:
+    groups, other_groups, options = args[_START_FIELDS:]
+    return ops.direct.begin(
+        *ops.as_list(ops.BeginFields(*args[:_START_FIELDS]), args[0]), groups, other_groups, *options
+    )
+
+
+def _reverse_start(
+    bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
+) -> list[Any]:
+    fields, (falls, alone), (groups, options) = ops.BeginFields(*saved[:_START_FIELDS]), saved[_START_FIELDS:], rest
+    x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
+    wants = (needs[2], needs[3], needs[5])
+    *out, shared, own, planes = ops.direct.begin_backward(
+        *ops.as_list(fields, fields.x), x_start_bar, y_bar, falls, alone, groups, *options[:-1], wants
+    )
+    data_out = None
+    if needs[5]:
+        data_out = join_data(shared, own, options[0])
+        if planes.numel():  # the first energy's data
+            of_planes = ops.sum_to(planes, (planes.shape[0], 1, planes.shape[2]))[:, 0]
+            count = planes.shape[2]
+            first, others_out = data_out.narrow(1, 0, count), data_out.narrow(1, count, data_out.shape[1] - count)
+            data_out = torch.cat([first + of_planes, others_out], 1)
+    return [*out, data_out]
+
+
+def _vmap_start(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    tensors, _ = ops.folded(info.batch_size, args[:_SCENES], in_dims, 2)
+    out = apply(*tensors, *args[_SCENES:])
+    shapes = [(info.batch_size, t.shape[0] // info.batch_size) for t in out]  # decisions may have no scene
+    return tuple(t.unflatten(0, shape) for t, shape in zip(out, shapes, strict=True)), (0,) * len(out)
+
+
+def _saved(inputs: tuple, made: tuple) -> tuple:
+    read = replaced(ops.BeginFields(*inputs[:_START_FIELDS]), mu=None, lam=None, rest=None)  # by the reverse
+    return *read, *made[2:]
+
+
+# Fields; groups, other_groups, (data_count, time_step, filter_eta, chord, start, filters, parts).
+_begin = ops.Differentiable(
+    _run_start, _reverse_start, arguments=_START_FIELDS + 3, inputs=_START_TENSORS, outputs=2, saved=_saved,
+    rest=lambda inputs: (inputs[_START_FIELDS], inputs[-1]), vmap=_vmap_start, batched=True,
+)  # fmt: skip
+
+
+def start_of(
+    x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
+    origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float, chord: float, *, start: str, filters: bool,
+    parts: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Start of the sweeps and predictor [m], both [B, V, 3]; differentiable in the first six tensors.
+
+    Args:
+        x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].
+        prescribed: Where pinned vertices go [m], [1 | B, V, 3]; None: they stay.
+        mass, energy_data, origin, mu, lam: As in ops.SweepFields.  pinned: bool [V].
+        rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by choices alone.
+        chord: How far back along its way h v a vertex is taken to have been, over h: 1 where v = (x - x_prev) / h.
+        start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
+        filters: Whether the planes of a floor hold back a start.
+        parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
+    """
+    # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
+    looked_at = mu.detach(), lam.detach(), rest if rest is None else rest.detach()
+    tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
+    *listed, groups = bodies
+    *listed_others, other_groups = others
+    options = (data_count, time_step, FILTER_ETA, chord, STARTS[start], filters)
+    x_start, y, *_ = _begin(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
+    return x_start, y
+
+
+# --- the rigid correction of a step -----------------------------------------------------------------------------------
+
+_RIGID_TENSORS = 5  # differentiable fields: x, x_prev, y, mass, energy_data, all [1 | B, ...]
+_RIGID_FIELDS = len(ops.RigidFields._fields)
+
+
+def _run_correction(*args: Any) -> tuple[Tensor, Tensor]:
+    return ops.direct.rigid(*ops.as_list(ops.RigidFields(*args[:_RIGID_FIELDS]), args[0]), *args[_RIGID_FIELDS:])
+
+
+def _reverse_correction(
+    bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
+) -> list[Any]:
+    x, data_count = saved[0], rest[1]
+    x_bar = torch.zeros_like(x) if bars[0] is None else bars[0]
+    v_bar = x.new_empty((0,)) if bars[1] is None else bars[1]
+    *out, shared, own = ops.direct.rigid_backward(
+        *ops.as_list(ops.RigidFields(*saved), x), x_bar, v_bar, *rest, needs[4]
+    )
+    return [*out, join_data(shared, own, data_count) if needs[4] else None]
+
+
+def _vmap_correction(
+    apply: Any, info: Any, in_dims: tuple, *args: Any
+) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+    tensors, scenes = ops.folded(info.batch_size, args[: _RIGID_TENSORS + 1], in_dims, 3)
+    x, v = apply(*tensors, *args[_RIGID_TENSORS + 1 :])
+    return (x.unflatten(0, (-1, scenes)), v.unflatten(0, (-1, scenes))), (0, 0)
+
+
+# Fields; groups, data_count, time_step.
+_correct = ops.Differentiable(_run_correction, _reverse_correction, arguments=_RIGID_FIELDS + 3, inputs=_RIGID_TENSORS,
+                              outputs=2, tensors=_RIGID_FIELDS, vmap=_vmap_correction, batched=True)  # fmt: skip
+
+
+def correct(
+    x: Tensor, x_prev: Tensor, y: Tensor, mass: Tensor, energy_data: Tensor, origin: Tensor | None, bodies: Bodies,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Positions after every listed body was moved rigidly to the least potential, and the velocities (x - x_prev) / h,
+    [B, V, 3]; differentiable in the first five tensors, whose shapes are those of ops.SweepFields."""
+    tensors = distinct(x, x_prev, y, mass, energy_data, origin)
+    listed = (bodies.order, bodies.ptr, bodies.spread, others.of)
+    return _correct(*tensors, *listed, bodies.groups, data_count, time_step)

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.contact_potential import ContactPotential, StepContact
+from .._common.context import replaced
+from .._common.messages import page
+from ..adjoint.contact import ContactPotential, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..adjoint.sweep import sweep
 from ..model.material import shape_gradients
@@ -18,12 +20,10 @@ from ..model.model import Model
 from ..model.moving import moving_vertices
 from ..model.system import System
 from ..ops.sums import segment_sum
-from ..said import page
-from ..tuples import replaced
 from .arguments import Prepared, acceleration_of, collider_state
 from .coarse import lengths_of, with_corrections
+from .contact import outcomes
 from .integrators import Solve
-from .met import outcomes
 from .predict import Begun, begin
 
 ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a

@@ -19,18 +19,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._common.constants import EXACT_BLOCK
+from .._common.context import looks_at, replaced, unheard
+from .._common.messages import is_silent, page, silence, warn
 from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
-from ..mask import EXACT_BLOCK
 from ..mesh import TetMesh
 from ..model.model import Model
 from ..model.solver import Integrator
 from ..model.system import System, system_of
 from ..model.warnings import height_of_tets, warn_of_over_relaxation, warn_of_thin_tets, warn_of_units
 from ..ops import broadcast
-from ..said import is_silent, page, silence, warn
-from ..scopes import looks_at, unheard
-from ..tuples import replaced
 from .advance import advance
 from .arguments import Prepared, acceleration_of, material_of, prepare
 from .integrators import take

@@ -10,11 +10,11 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
+from .._common.checks import check_tensor, fail, to_float
+from .._common.context import refuse_refinement, refuse_transforms
 from ..adjoint.routes import Adjoint, check_adjoint
-from ..checks import check_tensor, fail, to_float
 from ..model.model import Model
 from ..model.solver import BDF2, VBD
-from ..scopes import refuse_refinement, refuse_transforms
 from .advance import advance
 from .arguments import check_prescribed, check_state, given_of, prepare, system_for
 from .integrators import check_staged, take

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from .. import mesh
-from ..checks import input_name
-from ..contact import colliders
-from ..contact.barrier import Friction, PairBarrier
+from .._common.checks import input_name
+from .._contact import colliders
+from .._contact.barrier import Friction, PairBarrier
 from ..energies import FloorBarrier, StableNeoHookean
 from ..inspect.record import record
 from ..model.model import Model

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.checks import check_count, check_positive
 from diffvbd.mesh.arrays import float_array, to_numpy
+
+from .._common.checks import check_count, check_positive
 
 COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
 OTHER = "#8c8c8c"

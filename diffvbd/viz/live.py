@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..checks import check_bool, check_count, fail
+from .._common.checks import check_bool, check_count, fail
 from ..model.model import Model
 from .drawing import Scenery
 from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_positive, fail
-from ..contact.colliders import Capsule, Plane, Sphere
+from .._common.checks import check_positive, fail
+from .._contact.colliders import Capsule, Plane, Sphere
 from ..mesh.arrays import connected
 from ..mesh.io import load
 from ..mesh.motions import read_frames

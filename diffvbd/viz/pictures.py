@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.checks import check_positive
 from diffvbd.mesh.arrays import to_path
 from diffvbd.mesh.shapes import cube
 from diffvbd.mesh.tet_mesh import boundary_faces
@@ -30,6 +29,8 @@ from diffvbd.viz.drawing import (
     tidy,
 )
 from diffvbd.viz.motion import save_motions
+
+from .._common.checks import check_positive
 
 FRAMES = 40  # of a longer motion so many are shown
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_positive, fail
+from .._common.checks import check_positive, fail
 from ..mesh.write import replace
 from ..model.model import Model
 from .drawing import Scenery, as_array

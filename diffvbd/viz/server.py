@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from ..checks import fail
+from .._common.checks import fail
 
 TRIED = 1000  # ports
 _REPLACING = threading.Lock()

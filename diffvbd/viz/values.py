@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..checks import fail, is_word
+from .._common.checks import fail, is_word
 from ..inspect.forces import forces, stress
 from ..model.model import Model
 from ..model.solver import VBD

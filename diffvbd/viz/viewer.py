@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_count, fail, is_word
+from .._common.checks import check_count, fail, is_word
+from .._common.context import record_to
 from ..rollout.trajectory import Trajectory
-from ..scopes import record_to
 from .drawing import Scenery, as_array
 from .motion import Mesh, Motion, motions_of, smooth_parts
 from .server import open_server

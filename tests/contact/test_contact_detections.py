@@ -10,7 +10,7 @@ from conftest import DEVICES
 
 import diffvbd as dv
 from diffvbd.mesh import box, join
-from diffvbd.step.contact_cycles import MOST_DETECTIONS, parts_of
+from diffvbd.step.contact import MOST_DETECTIONS, parts_of
 from diffvbd.testing.tolerances import tolerance
 
 STEPS = 9

@@ -14,10 +14,10 @@ import diffvbd as dv
 from diffvbd import mesh, ops
 from diffvbd.ops import contact as contact_rigid
 from diffvbd.ops.fields import FEW, MOST_COUPLED
-from diffvbd.step.rigid_terms import Scenes
+from diffvbd.step.contact_corrections import Scenes
 from diffvbd.testing import relative_error, tolerance
 
-corrections = importlib.import_module("diffvbd.step.corrections")
+corrections = importlib.import_module("diffvbd.step.contact_corrections")
 LOW, HALF_GAP, SPEED = -5e-4, 2.5e-4, 1e-3
 ENERGIES = (dv.StableNeoHookean(), dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3),
             dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5, SPEED))  # fmt: skip

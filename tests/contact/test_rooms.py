@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.contact.surface import ContactSurface
+from diffvbd._contact.surface import ContactSurface
 from diffvbd.ops import contact as ops_detect
 from diffvbd.ops.contact import RoomsOfBodies
 from diffvbd.ops.fields import WAYS
-from diffvbd.step.motion import Motion, motion_of
-from diffvbd.step.rooms import LEAST_ROOM, ROOM, rooms
+from diffvbd.step.contact import Motion, motion_of
+from diffvbd.step.contact import LEAST_ROOM, ROOM, rooms
 from diffvbd.testing import generator, tolerance
 
 DHAT = 0.02

@@ -19,7 +19,7 @@ from helpers.compiler import cxx
 from helpers.paths import CSRC, needs_csrc
 
 from diffvbd import energies, ops
-from diffvbd.mask import CONTACT, FIRST_VERTEX_BIT
+from diffvbd._common.constants import CONTACT, FIRST_VERTEX_BIT
 from diffvbd.testing import generator, tolerance
 
 SOURCE = Path(__file__).with_name("headers.cpp")

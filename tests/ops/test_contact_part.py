@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.contact.above_floor import above_floor
+from diffvbd._contact.start import above_floor
 from diffvbd.ops import contact as ops_part
 from diffvbd.ops.contact import PartBodies, Whole
 from diffvbd.ops.fields import ASKS

@@ -10,18 +10,18 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import mesh, ops
-from diffvbd.adjoint.contact_lag import of_scene
+from diffvbd.adjoint.contact import of_scene
 from diffvbd.ops import broadcast
 from diffvbd.ops import contact as ops_rigid
 from diffvbd.ops.autograd import in_shape
 from diffvbd.ops.fields import MOST_COUPLED
 from diffvbd.ops.sums import Order, of_segments, sum_segments
 from diffvbd.reference.rigid_contact import LEAST_INERTIA
-from diffvbd.step.rigid_terms import Scenes, vertex_blocks, vertex_gradient
+from diffvbd.step.contact_corrections import Scenes, vertex_blocks, vertex_gradient
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import noise
 
-rigid_contact = importlib.import_module("diffvbd.step.rigid_contact")
+rigid_contact = importlib.import_module("diffvbd.step.contact_corrections")
 ELASTIC = dv.StableNeoHookean()
 
 

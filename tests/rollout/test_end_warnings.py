@@ -15,7 +15,7 @@ from diffvbd.mesh import box
 from diffvbd.model.system import system_of
 from diffvbd.rollout import checks
 from diffvbd.step.arguments import material_of, prepare
-from diffvbd.step.contact_cycles import CUT
+from diffvbd.step.contact import CUT
 from diffvbd.step.residual import cut_share
 from diffvbd.step.stability import FAR
 from diffvbd.testing import tolerance

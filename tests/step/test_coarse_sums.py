@@ -8,7 +8,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd.model.material import shape_gradients
 from diffvbd.model.system import System, system_of
-from diffvbd.step.coarse_sums import coarse_mass, coarse_stiffness
+from diffvbd.step.coarse import coarse_mass, coarse_stiffness
 from diffvbd.testing import generator, relative_error, tolerance
 
 SCENES = 2

@@ -13,7 +13,7 @@ from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.safeguards import FILTER_ETA
+from diffvbd._common.constants import FILTER_ETA
 from diffvbd.testing import tolerance
 
 KAPPA, DHAT, DENSITY, START = 1e3, 1e-2, 3000.0, 5e-3

@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from diffvbd._common.constants import FILTER_ETA
 from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.ops.contact import Decided, PartBodies, part_start
 from diffvbd.reference.energies import FloorBarrier
-from diffvbd.safeguards import FILTER_ETA
 from diffvbd.step.arguments import CHORD
-from diffvbd.step.start import begin
+from diffvbd.step.predict import begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {

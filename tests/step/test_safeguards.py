@@ -12,7 +12,7 @@ import diffvbd as dv
 from diffvbd import ops, reference
 from diffvbd.adjoint.sweep import sweep
 from diffvbd.model.system import system_of
-from diffvbd.safeguards import FILTER_ETA
+from diffvbd._common.constants import FILTER_ETA
 from diffvbd.testing import build_scene, generator, on_device, relative_error, structured, tolerance
 
 # --- the step filter -------------------------------------------------------------------------------------------------

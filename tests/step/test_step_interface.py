@@ -20,7 +20,7 @@ from helpers.values import STEP, uniform
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.checks import name_value
+from diffvbd._common.checks import name_value
 from diffvbd.testing import build_scene, relative_error, tolerance
 
 GROUND = {"height": -0.06, "kappa": 2e4, "dhat": 0.1, "damping": 20.0}

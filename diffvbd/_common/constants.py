@@ -10,3 +10,9 @@ FIRST_VERTEX_BIT = 3  # shift of the first energy of energies.VERTEX_ENERGIES
 FILTERS = 1 << FIRST_VERTEX_BIT  # the one energy with a step filter, FloorBarrier
 KEEPS_POSITIONS = CONTACT | FILTERS  # gaps must come back to the bit
 VERTEX_ENERGIES = -1 << FIRST_VERTEX_BIT
+
+
+# --- constants of the safeguards --------------------------------------------------------------------------------------
+
+SATURATION_EPS = 1e-12  # [m], keeps |d| + c + eps away from 0 (paper, appendix on safeguards)
+FILTER_ETA = 0.9  # largest fraction of a gap that one move may close (method.md, section 6)

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from .._common.checks import fail
+from .._contact.barrier import PairBarrier
+from .._contact.detection import detect
+from .._contact.surface import LEAST_CAPACITY, ContactSurface
 from ..energies import damped_share
 from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from ..reference.energies import smoothed
-from .barrier import PairBarrier
-from .detection import detect
-from .surface import LEAST_CAPACITY, ContactSurface
 
 
 class NearPairs(NamedTuple):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .._contact.barrier import PairBarrier
+from .._contact.surface import ContactSurface
 from ..ops import contact as contact_lag
 from ..ops import contact as ops_contact
-from .barrier import PairBarrier
-from .surface import ContactSurface
 
 
 def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ..checks import check_bool, check_count, check_number, check_positive, fail, refuse_gradients
-from ..mask import CONTACT
+from .._common.checks import check_bool, check_count, check_number, check_positive, fail, refuse_gradients
+from .._common.constants import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
 LEAST_VELOCITY = 1e-12  # [m/s]; its square times that of a time step must be a number in float32

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._contact.barrier import PairBarrier
+from .._contact.colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 from ..mesh import TetMesh
-from .barrier import PairBarrier
-from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # Mean edges of its body that a vertex may go where no reach is given: beside its island, where one body moves and where

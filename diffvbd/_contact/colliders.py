@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_positive, fail
+from .._common.checks import check_positive, fail
 from ..mesh.arrays import float_array, int_array
 from ..mesh.surfaces import surface_arrays
 

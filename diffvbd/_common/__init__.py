@@ -1,0 +1,1 @@
+"""Checks, messages, constants and context that all packages share."""

@@ -1,0 +1,1 @@
+"""Contact between surfaces, from potentials to starts; knows no Model."""

@@ -1,0 +1,13 @@
+"""State, forces and detections of contact: what a user asks of a Model with a PairBarrier, Friction or a floor."""
+
+from .inspect.contact import Status, intersections, reserve, status
+from .inspect.forces import ForceParts, Forces, forces
+from .inspect.penalty import Bodies, center_of_mass_penalty
+from .step.contact import Detection
+
+__all__ = ["Bodies", "Detection", "ForceParts", "Forces", "Status", "center_of_mass_penalty", "forces", "intersections",
+           "reserve", "status"]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
