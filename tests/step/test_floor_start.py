@@ -16,7 +16,7 @@ from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.ops.contact import Decided, PartBodies, part_start
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.step.arguments import CHORD
-from diffvbd.step.predict import begin
+from diffvbd.step.predict import start_of as begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {
