@@ -117,7 +117,7 @@ class Differentiable:
             *given, rest, needs = args
             bars = [g if g is None else g.contiguous() for g in given[:outputs]]
             out = reverse(bars, given[outputs:], rest, needs)
-            return tuple(_like(bar, t) for bar, t, need in zip(out, given[outputs:], needs, strict=False)
+            return tuple(in_shape(bar, t) for bar, t, need in zip(out, given[outputs:], needs, strict=False)
                          if need and t is not None)  # fmt: skip
 
         class _Reverse(Function):
@@ -184,7 +184,7 @@ class Differentiable:
             return self.run(*args)
 
 
-def _like(bar: Tensor | None, t: Tensor) -> Tensor:
+def in_shape(bar: Tensor | None, t: Tensor) -> Tensor:
     """An adjoint in the shape of its input."""
     if bar is None or bar.numel() == 0:
         return torch.zeros_like(t)

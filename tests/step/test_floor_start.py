@@ -16,7 +16,7 @@ from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.ops.contact import Decided, PartBodies, part_start
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.step.arguments import CHORD
-from diffvbd.step.predict import start_of
+from diffvbd.step.predict import start_of as begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {
@@ -69,9 +69,9 @@ def by_begin(a: dict[str, Tensor]) -> Tensor:
     bodies = Bodies(empty, one, torch.empty(0, dtype=torch.float64), tets, one, (0, 0, 0, 0))
     others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one, tets, one, (0, 0, 0, 0))
     step = a["step"].expand_as(x).contiguous()
-    start, _ = start_of(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none,
-                        none, torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0, CHORD,
-                        start="inertia", filters=True, parts=False)  # fmt: skip
+    start, _ = begin(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none, none,
+                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0, CHORD,
+                     start="inertia", filters=True, parts=False)  # fmt: skip
     return start - x
 
 
