@@ -262,7 +262,7 @@ def contact_step(
         density=density,
         parameters=parameters,
     )
-    energies = build_energies(scene, elsewhere=("pair_barrier", "friction"))
+    energies = build_energies(scene, elsewhere=("pair", "friction"))
     energies += floor_friction(scene, energies)
     floor = next((energy for energy in energies if isinstance(energy, FloorBarrier)), None)
     masses = color_masses(scene)
