@@ -20,7 +20,7 @@ using Count = unsigned long long;
 
 // Memory of the trials of all scenes.
 template <class T>
-struct Trial {
+struct MoveTrial {
   const double *center, *motion;
   double *share, *low, *next, *displacement, *size;  // [B, bodies]
   double *before, *after;                            // [B, bodies] potentials
@@ -36,7 +36,7 @@ struct Trial {
 };
 
 template <class T>
-__device__ void begin_body(const RigidInputs<T>& in, const Trial<T>& t, int64_t unit) {
+__device__ void begin_body(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t unit) {
   t.share[unit] = 1;
   t.displacement[unit] = t.size[unit] = 0;
   t.lead[unit] = static_cast<int32_t>(unit % in.bodies());
@@ -64,7 +64,7 @@ struct Vertex {
 
 // Bounds of the motion of bodies.
 template <class T>
-__device__ void find_displacement(const RigidInputs<T>& in, const Trial<T>& t, int64_t row) {
+__device__ void find_displacement(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t row) {
   const Vertex<T> at(in, row);
   const Body<T> body{in.scene, at.scene, at.body};
   const Farthest own = farthest_of(in, body, at.v, t.center + 3 * at.unit, t.motion + kUnknowns * at.unit);
@@ -73,7 +73,7 @@ __device__ void find_displacement(const RigidInputs<T>& in, const Trial<T>& t, i
 
 // Lists the pairs that may act, and unites bodies that decide jointly, in any order.
 template <class T>
-__device__ void join_pair(const RigidInputs<T>& in, const Trial<T>& t, int64_t pair, bool repels) {
+__device__ void join_pair(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t pair, bool repels) {
   const int32_t* record = (repels ? in.gate.listed.pairs : in.lagged.pairs) + kPairRow * pair;
   const int64_t scene = record[5], first = scene * in.bodies();
   if (repels) {
@@ -89,7 +89,7 @@ __device__ void join_pair(const RigidInputs<T>& in, const Trial<T>& t, int64_t p
 }
 
 template <class T>
-__device__ void displace(const RigidInputs<T>& in, const Trial<T>& t, int64_t row, T* x) {
+__device__ void displace(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t row, T* x) {
   const Vertex<T> at(in, row);
   if (!x && t.decided[at.unit]) return;
   const Vector r = diffvbd::wide_at(in.scene.x + 3 * row) - vector_of(t.center + 3 * at.unit);
@@ -104,7 +104,7 @@ __device__ void displace(const RigidInputs<T>& in, const Trial<T>& t, int64_t ro
 // Contribution of a vertex to the potential of its body. After a motion it also marks the body where the deformation
 // radius or an energy does not admit it.
 template <class T>
-__device__ void test_vertex(const RigidInputs<T>& in, const Trial<T>& t, int64_t row, bool moved) {
+__device__ void test_vertex(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t row, bool moved) {
   const Vertex<T> at(in, row);
   if (!in.free[at.body] || t.decided[at.unit]) return;
   const Body<T> body{in.scene, at.scene, at.body};
@@ -116,7 +116,7 @@ __device__ void test_vertex(const RigidInputs<T>& in, const Trial<T>& t, int64_t
 
 // Contribution of a near or lagged pair. Before a motion it also records the two bodies in contact.
 template <class T>
-__device__ void test_pair_of(const RigidInputs<T>& in, const Trial<T>& t, int64_t pair, bool repels, double& value,
+__device__ void test_pair_of(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t pair, bool repels, double& value,
                              bool moved) {
   const int32_t* record = (repels ? in.gate.listed.pairs : in.lagged.pairs) + kPairRow * pair;
   const int32_t owner = owner_of(in, record);
@@ -134,7 +134,7 @@ __device__ void test_pair_of(const RigidInputs<T>& in, const Trial<T>& t, int64_
 
 // Potential of a body with the pairs that it owns.
 template <class T, class Team>
-__device__ double potential_of(const RigidInputs<T>& in, const Trial<T>& t, const Team& team, int64_t scene,
+__device__ double potential_of(const RigidInputs<T>& in, const MoveTrial<T>& t, const Team& team, int64_t scene,
                                int32_t which, int64_t listed) {
   const Body<T> body{in.scene, scene, which};
   double sum[1];
@@ -161,7 +161,7 @@ __device__ double potential_of(const RigidInputs<T>& in, const Trial<T>& t, cons
 // Potentials of up to kWarps bodies at once: the part of a thread, from the items first, first + stride, ... of
 // vertices, listed and lagged pairs. listed: of all scenes.
 template <class T>
-__device__ void own_potentials(const RigidInputs<T>& in, const Trial<T>& t, int64_t scene, int32_t first,
+__device__ void own_potentials(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t scene, int32_t first,
                                int32_t stride, int64_t listed, double (&out)[kWarps]) {
   const int64_t listed_begin = in.first_listed(scene), lagged_begin = in.first_lagged(scene);
   const auto vertices = static_cast<int32_t>(in.scene.vertices);
@@ -206,7 +206,7 @@ struct SharedDecision {
 // Decision about a trial, by the block of the scene: bodies accept their motion or get a shorter one. Returns whether
 // all bodies have decided. Sums are integers, so their order does not matter.
 template <class T>
-__device__ bool decide(const RigidInputs<T>& in, const Trial<T>& t, int64_t scene, int attempt,
+__device__ bool decide(const RigidInputs<T>& in, const MoveTrial<T>& t, int64_t scene, int attempt,
                        SharedDecision& shared) {
   const int64_t n = in.bodies(), first = scene * n;
   const bool is_shared = n <= kMostShared;
@@ -295,7 +295,7 @@ constexpr int64_t kLargeBody = 32;  // vertices from which a block sums a body r
 
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    begin_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t) {
+    begin_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t) {
   const int64_t i = own_item();
   if (i < in.scene.scenes) t.done[i] = 0, t.contact_count[i] = t.near_count[i] = 0;
   if (i < in.scene.scenes * in.bodies()) begin_body(in, t, i);
@@ -303,14 +303,14 @@ __global__ void __launch_bounds__(kOne)
 
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    displacement_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t) {
+    displacement_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t) {
   const int64_t row = own_item();
   if (row < in.scene.scenes * in.scene.vertices) find_displacement(in, t, row);
 }
 
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    join_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t, int64_t listed) {
+    join_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t, int64_t listed) {
   const int64_t item = own_item();
   const bool repels = item < listed;
   const int64_t pair = repels ? item : item - listed;
@@ -321,14 +321,15 @@ __global__ void __launch_bounds__(kOne)
 
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    displace_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t, T* x) {
+    displace_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t, T* x) {
   const int64_t row = own_item();
   if (row < in.scene.scenes * in.scene.vertices) displace(in, t, row, x);
 }
 
 template <class T>
-__global__ void __launch_bounds__(kOne) test_kernel(const __grid_constant__ RigidInputs<T> in,
-                                                    const __grid_constant__ Trial<T> t, int64_t listed, bool moved) {
+__global__ void __launch_bounds__(kOne)
+    test_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t, int64_t listed,
+                bool moved) {
   const int64_t item = own_item(), rows = in.scene.scenes * in.scene.vertices, pair = item - rows;
   if (item < rows) {
     test_vertex(in, t, item, moved);
@@ -345,7 +346,7 @@ __global__ void __launch_bounds__(kOne) test_kernel(const __grid_constant__ Rigi
 // Potentials of all bodies, a block or a warp each.
 template <class T, bool large>
 __global__ void __launch_bounds__(kThreads)
-    potential_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t, int64_t listed,
+    potential_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t, int64_t listed,
                      double* out) {
   __shared__ double part[kWarps][kMostSums];
   const int64_t unit = large ? blockIdx.x : int64_t{kWarps} * blockIdx.x + threadIdx.x / 32;
@@ -364,7 +365,7 @@ __global__ void __launch_bounds__(kThreads)
 // A block for each scene.
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    decide_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t, int attempt) {
+    decide_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t, int attempt) {
   __shared__ SharedDecision shared;
   if (t.done[blockIdx.x]) return;
   const bool done = decide(in, t, blockIdx.x, attempt, shared);
@@ -392,7 +393,7 @@ struct BlockOfScene {
 // All trials of a small scene, by a cluster.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    scene_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Trial<T> t, int64_t listed,
+    scene_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ MoveTrial<T> t, int64_t listed,
                  const __grid_constant__ RigidOutcome<T> out, T* x) {
   // potentials: of few bodies, by block. Their last bits depend on the number of blocks; decisions tolerate that
   __shared__ double part[kWarps][kMostSums], potentials[kMostBlocks][kWarps];
@@ -475,9 +476,9 @@ __global__ void __launch_bounds__(kThreads)
 
 // Memory of the trials in the workspace.
 template <class T>
-Trial<T> lay_out(const RigidInputs<T>& in, const PairCapacity& capacity, Parts<16>& take) {
+MoveTrial<T> lay_out(const RigidInputs<T>& in, const PairCapacity& capacity, Parts<16>& take) {
   const int64_t scenes = in.scene.scenes, units = scenes * in.bodies(), rows = scenes * in.scene.vertices;
-  Trial<T> t{};
+  MoveTrial<T> t{};
   take(t.low, units), take(t.next, units), take(t.displacement, units), take(t.size, units);
   take(t.before, units), take(t.after, units), take(t.largest, units), take(t.increase, units), take(t.total, units);
   take(t.vertex_energy, rows), take(t.pair_energy, capacity.rows());
@@ -505,7 +506,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairCapacity& capacity, c
   const int64_t scenes = in.scene.scenes, units = scenes * in.bodies(), rows = scenes * in.scene.vertices;
   if (rows == 0 || units == 0) return cudaSuccess;
   Parts<16> take(workspace);
-  Trial<T> t = lay_out(in, capacity, take);
+  MoveTrial<T> t = lay_out(in, capacity, take);
   t.center = center, t.motion = motion, t.share = out.fraction, t.move = move;
   if (has_block_each(in.scene.vertices, scenes, capacity.rows())) {
     return launch_clusters(scene_kernel<T>, scenes, capacity.rows(), kThreads, stream, in, t, capacity.listed, out, x);
