@@ -88,7 +88,7 @@ class GlobalAdjoint:
             1e-5 in float32. An ill-conditioned system may not get there: then the solve fails.
         max_iterations: Of conjugate gradients; None: ten times the unknowns of a scene, at most 10,000.
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where a solve does not meet the tolerance.
-        report: Called with a :class:`diffvbd.LinearSolve` after each backward of a step, e.g. ``solves.append``.
+        report: Called with a :class:`diffvbd.results.LinearSolve` after each backward of a step, e.g. ``solves.append``.
 
     Raises:
         RuntimeError: In the backward, for a solve that fails, for adjoints that are not finite, and while a CUDA graph
