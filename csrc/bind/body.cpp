@@ -112,20 +112,20 @@ void require_states(const BeginFields& f) {
           "diffvbd::begin: expected ptr, tet_ptr, other_ptr and other_tet_ptr int32 [bodies + 1]");
 }
 
-// Predictor and start of the sweeps. chord: as in rigid/coast.h. from: of the bodies that are not corrected, 0 x + h v,
-// 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]: with
-// parts, 1 where the vertices of a body that is corrected start each by itself.
+// Predictor and start of the sweeps. chord: as in rigid/coast.h. kind: of the start of bodies that are not corrected, 0
+// x + h v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes,
+// bodies]: with parts, 1 where the vertices of a body that is corrected start each by itself.
 DIFFVBD_OPERATOR(Out<4>, begin, DIFFVBD_PARAMETERS(BEGIN) Ints groups, Ints other_groups, Ints data_count,
-                 double time_step, double filter_eta, double chord, int64_t from, bool filters, bool parts) {
+                 double time_step, double filter_eta, double chord, int64_t kind, bool filters, bool parts) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   require_states(f);
   const Device device(x);
-  const BeginSettings settings{data_count, time_step, filter_eta, chord, from, filters};
+  const BeginSettings settings{data_count, time_step, filter_eta, chord, kind, filters};
   return dispatch_float(x, [&]<class T>(T) {
-    const bool chooses = from == start::kLower && other_bodies(f) > 0, may_part = parts && corrected_bodies(f) > 0;
+    const bool chooses = kind == start::kLower && other_bodies(f) > 0, may_part = parts && corrected_bodies(f) > 0;
     const Tensor x_start = device.like_x(), y = device.like_x();
     const Tensor from_y = chooses && filters ? device.like_x() : y, apart = may_part ? device.like_x() : y;
-    const Tensor falls = device.empty({from == start::kLower ? x.size(0) : 0, other_bodies(f)}, ScalarType::Byte);
+    const Tensor falls = device.empty({kind == start::kLower ? x.size(0) : 0, other_bodies(f)}, ScalarType::Byte);
     const Tensor alone = device.empty({parts ? x.size(0) : 0, corrected_bodies(f)}, ScalarType::Byte);
     const auto in = begin_inputs<T>(f, settings, x_start, y, falls, alone);
     start::Candidates<T> two{}, parting{};
@@ -147,13 +147,13 @@ DIFFVBD_OPERATOR(Out<4>, begin, DIFFVBD_PARAMETERS(BEGIN) Ints groups, Ints othe
 // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes by
 // vertex [scenes, vertices, scalars of the planes].
 DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_bar, In y_bar, In falls, In alone,
-                 Ints groups, Ints data_count, double time_step, double filter_eta, double chord, int64_t from,
+                 Ints groups, Ints data_count, double time_step, double filter_eta, double chord, int64_t kind,
                  bool filters, Flags wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   require_states(f);
   require(wants.size() == 3, "diffvbd::begin_backward: expected 3 wishes");
   const Device device(x);
-  const BeginSettings settings{data_count, time_step, filter_eta, chord, from, filters};
+  const BeginSettings settings{data_count, time_step, filter_eta, chord, kind, filters};
   return dispatch_float(x, [&]<class T>(T) {
     // where the bodies that are corrected coast to, and their predictor, once more
     const Tensor coasted = order.numel() > 0 ? device.like_x() : x, y = order.numel() > 0 ? device.like_x() : x;

@@ -14,11 +14,10 @@ from pathlib import Path
 
 import torch
 
+_PACKAGE = Path(__file__).parents[1]
 # torch's frames are those of its decorators and of its backward, contextlib's those of decorators of ours
-_INSIDE = (*(str(Path(module).parent) + os.sep for module in (__file__, torch.__file__)), contextlib.__file__)
+_INSIDE = (*(str(folder) + os.sep for folder in (_PACKAGE, Path(torch.__file__).parent)), contextlib.__file__)
 
-
-_PACKAGE = Path(__file__).parent
 # Inside an installed package, beside the package in a checkout.
 PAGES = next((path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), _PACKAGE / "docs")
 

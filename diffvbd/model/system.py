@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from .. import ops
-from .._common.checks import check_kind, fail
+from .._common.checks import check_kind, check_positive, fail
 from .._common.constants import CONTACT, ELASTIC, EXACT_BLOCK, FILTER_ETA, PAPER_BLOCK, SATURATION_EPS
 from .._contact.surface import ContactSurface
 from ..ops import regimes
@@ -63,6 +63,9 @@ class System(Model):
 
     def _check(self) -> None:
         """Raises where a solver does not suit the Model."""
+        for name, unit in (("saturation", "m"), ("regularization", "kg")):
+            if getattr(self, name):  # in the Model's dtype, of which the solver knows nothing
+                check_positive(name, getattr(self, name), unit, self.dtype)
         if self.start == "inertia" and self.contact is not None:
             fail("start", '"auto" or "predictor" with a PairBarrier, whose steps approach y in substeps', '"inertia"')
         if self.coarse is None:

@@ -117,7 +117,7 @@ class Differentiable:
             *given, rest, needs = args
             bars = [g if g is None else g.contiguous() for g in given[:outputs]]
             out = reverse(bars, given[outputs:], rest, needs)
-            return tuple(_like(bar, t) for bar, t, need in zip(out, given[outputs:], needs, strict=False)
+            return tuple(in_shape(bar, t) for bar, t, need in zip(out, given[outputs:], needs, strict=False)
                          if need and t is not None)  # fmt: skip
 
         class _Reverse(Function):
@@ -147,7 +147,8 @@ class Differentiable:
                 made = output if isinstance(output, tuple) else (output,)
                 ctx.save_for_backward(*(inputs[:first] if saved is None else saved(inputs, made)))
                 ctx.rest = inputs[first:] if rest is None else rest(inputs)
-                ctx.mark_non_differentiable(*made[outputs:])
+                if made[outputs:]:  # torch.compile takes no empty mark of a function with one output
+                    ctx.mark_non_differentiable(*made[outputs:])
                 ctx.set_materialize_grads(False)
 
             @staticmethod
@@ -183,9 +184,9 @@ class Differentiable:
             return self.run(*args)
 
 
-def _like(bar: Tensor | None, t: Tensor) -> Tensor:
+def in_shape(bar: Tensor | None, t: Tensor) -> Tensor:
     """An adjoint in the shape of its input."""
-    if bar is None or (bar.numel() == 0 and t.numel() > 0):
+    if bar is None or bar.numel() == 0:
         return torch.zeros_like(t)
     return sum_to(bar, t.shape)
 

@@ -115,7 +115,7 @@ def _begin(a: Any) -> Any:
     def decisions(made: bool, ptr: Tensor) -> Tensor:
         return new(a.x, a.x.shape[0] if made else 0, ptr.shape[0] - 1, dtype=BYTE)
 
-    return *same(a.x, 2), decisions(getattr(a, "from") == START_LOWER, a.other_ptr), decisions(a.parts, a.ptr)
+    return *same(a.x, 2), decisions(a.kind == START_LOWER, a.other_ptr), decisions(a.parts, a.ptr)
 
 
 def _begin_backward(a: Any) -> Any:

@@ -608,7 +608,7 @@ def check_start(model: System, x: Tensor, colliders: Any, colliders_before: Tens
     where = collider_state(model, x, None if moving else colliders, colliders_before)
     if where is not None:
         refuse_intersections(model, x.reshape(-1, *x.shape[-2:]), x.new_empty((0,)), where[0],
-                             "; check_start=False starts all the same")  # fmt: skip
+                             "; checks=dv.Checks(start=False) starts all the same")  # fmt: skip
 
 
 def advice_to_part(x: Tensor, origin: Tensor, dhat: float) -> str:

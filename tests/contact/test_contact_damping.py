@@ -39,10 +39,10 @@ def test_no_jump_at_dhat(support: str) -> None:
     assert relative_error(landing(0.015, 50.0, support), landing(0.015, 0.0, support)) > 1e-6
 
 
-@pytest.mark.parametrize(("support", "name"), (("pairs", "pair_barrier"), ("floor", "floor_barrier")))
+@pytest.mark.parametrize(("support", "name"), (("pairs", "pair_kappa"), ("floor", "floor_kappa")))
 def test_a_barrier_that_is_none_damps_nothing_and_has_a_gradient(support: str, name: str) -> None:
     kappa = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    given = {"parameters": {f"{name}.kappa": kappa}}
+    given = {name: kappa}
     damped, free = (landing(0.015, damping, support, **given) for damping in (50.0, 0.0))
     assert torch.equal(damped, free)
     slopes = [torch.autograd.grad(end[:, 1].square().sum(), kappa)[0] for end in (damped, free)]
@@ -66,7 +66,7 @@ def test_none_is_as_much_as_zero(name: str) -> None:
     damps = name == "friction"
     none = ends(rubs=not damps, damping=5.0 if damps else 0.0)
     zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    given = ends(rubs=True, damping=5.0 if damps else 0.0, parameters={name: zero})
+    given = ends(rubs=True, damping=5.0 if damps else 0.0, **{name: zero})
     for a, b in zip(none, given, strict=True):
         assert relative_error(a, b) <= tolerance("contact_forward")
     both = ends(rubs=True, damping=5.0)

@@ -18,18 +18,12 @@ from torch.profiler import ProfilerActivity, profile
 import diffvbd as dv
 from diffvbd.mesh import box
 from diffvbd.testing import contact_scenes, relative_error, tolerance
-from diffvbd.testing.contact_scenes import GRAVITY, Scene, split
+from diffvbd.testing.contact_scenes import GRAVITY, Scene, compiled
 
 
-def run(scene: Scene, model: dv.Model, steps: int = 2, sweeps: int = 4, **options: Any) -> dict[str, Tensor]:
+def run(scene: Scene, model: dv.Model, steps: int = 2) -> dict[str, Tensor]:
     """End state and gradients of a scene."""
-    leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
-    given, parameters = split(leaves)
-    x, v = given.pop("x"), given.pop("v")
-    for _ in range(steps):
-        x, v = dv.step(model, x, v, dv.VBD(scene.time_step, sweeps), gravity=GRAVITY, **parameters, **given,
-                       **options)  # fmt: skip
-    return contact_scenes._result(x, v, leaves)
+    return compiled(scene, steps, scene.solver(4), model)[0]
 
 
 # --- a Model moves and is kept ---------------------------------------------------------------------------------------
@@ -79,8 +73,7 @@ def test_scenes_do_not_mix(one_regime: None, device: str) -> None:
 
     def run(x: Tensor, v: Tensor, points: Tensor, kappa: Tensor) -> tuple[Tensor, ...]:
         leaves = [t.clone().requires_grad_() for t in (x, v, points, kappa)]
-        named = {"pair_kappa": leaves[3]}
-        out = dv.step(model, *leaves[:2], colliders=leaves[2], colliders_before=points, **named, **STEP)
+        out = dv.step(model, *leaves[:2], colliders=leaves[2], colliders_before=points, pair_kappa=leaves[3], **STEP)
         return (*out, *torch.autograd.grad((out[0] ** 2).sum() + (out[1] ** 2).sum(), leaves))
 
     together = run(x, noise, points, kappa)
@@ -104,11 +97,9 @@ def test_no_scenes_no_pairs_no_sweeps() -> None:
     assert dv.step(model, none, none, **STEP)[0].shape == (0, 16, 3)
     assert dv.contact.status(model).cut == []
     for integrator in (dv.SDIRK2(), dv.BDF2()):
-        assert dv.step(
-            model, none, none, **(STEP | {"solver": dataclasses.replace(STEP["solver"], integrator=integrator)})
-        )[0].shape == (0, 16, 3)
+        ran = dv.rollout(model, none, none, dv.VBD(0.01, 3, integrator=integrator), steps=1, mu=2e4, lam=4e4)
+        assert ran.x.shape == (2, 0, 16, 3)
     mu = none.new_ones((0, 1)).requires_grad_()
-    # TODO62: the solver of this call
     ran = dv.rollout(model, none, none, steps=2, **(STEP | {"mu": mu}))
     assert torch.autograd.grad(ran.x.sum(), mu)[0].shape == (0, 1)
     empty = dv.Model(dv.TetMesh(np.zeros((0, 3)), np.zeros((0, 4), np.int64)), energies=model.energies)
@@ -118,7 +109,7 @@ def test_no_scenes_no_pairs_no_sweeps() -> None:
     assert dv.contact.status(held).pairs == 0
     before = x.clone()
     apart = two_boxes(things=[ball()], dhat=1e-3)
-    end, _ = dv.step(apart, x, 0 * x, **(STEP | {"solver": dataclasses.replace(STEP["solver"], solver=scene.solver(0))}))
+    end, _ = dv.step(apart, x, 0 * x, dv.VBD(0.01, 0), mu=2e4, lam=4e4)
     assert relative_error(end - x, (0 * x).index_fill(1, torch.tensor([1]), -9.81e-4)) <= tolerance("property_subset")
     assert torch.equal(x, before)
 
@@ -173,13 +164,12 @@ def test_a_checkpointed_rollout_is_the_same_to_the_bit(every: Any) -> None:
 def test_step_forward_and_backward() -> None:
     scene = contact_scenes.obstacles()
     leaves = scene.leaves()
-    given, parameters = split(leaves)
-    options: dict[str, Any] = {"gravity": GRAVITY, "solver": dv.VBD(scene.time_step, 3)}
-    out = dv.step(scene.model, **parameters, **given, **options)
+    options: dict[str, Any] = {"gravity": GRAVITY, "solver": scene.solver(3)}
+    out = dv.step(scene.model, **leaves, **options)
     grads = [torch.ones_like(out[0]), 1e-2 * torch.ones_like(out[1])]
     expected = torch.autograd.grad(out, list(leaves.values()), grads)
-    plain, named = split({k: v.detach() for k, v in leaves.items()})
-    x, v, tape = dv.step_forward(scene.model, wrt=tuple(leaves), **named, **plain, **options)
+    plain = {k: v.detach() for k, v in leaves.items()}
+    x, v, tape = dv.step_forward(scene.model, wrt=tuple(leaves), **plain, **options)
     assert torch.equal(x, out[0]) and torch.equal(v, out[1])
     result = dv.step_backward(tape, *grads)
     assert {"colliders", "colliders_before", "friction"} <= set(result)
@@ -253,8 +243,7 @@ def test_contact_that_meets_nothing_changes_nothing(detections: int) -> None:
     model = dv.Model(plain.mesh, energies=(dv.StableNeoHookean(), barrier), pinned=[0])
     x, v = plain.rest_points, contact_scenes.noise("alone", shape=(27, 3), size=0.3)
     for sweeps in (0, 1, 5):
-        for a, b in zip(dv.step(model, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], solver=scene.solver(sweeps))})),
-                        dv.step(plain, x, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"],
-                                                                                      sweeps=sweeps)})), strict=True):  # fmt: skip
+        solver = dv.VBD(0.01, sweeps)
+        for a, b in zip(*(dv.step(m, x, v, solver, mu=2e4, lam=4e4) for m in (model, plain)), strict=True):
             assert relative_error(a, b) <= tolerance("forward" if a.abs().max() < 1 else "invariance")
     assert dv.contact.status(model).cut == [0] and dv.contact.status(model).pairs == 0

@@ -140,8 +140,8 @@ def test_a_rollout_refuses_a_start_that_intersects(device: str, dtype: torch.dty
     assert message.startswith(f"x: expected surfaces that do not intersect, got {len(listed)} edges through triangles")
     assert f"corner points {ends} passes through the triangle {corners} in scene 0" in message
     assert "in scene 0, of body 0 and body 1. " in message or "in scene 0, of body 1 and body 0. " in message
-    assert "move the bodies apart" in message and "check_start=False" in message
-    assert run(model, check_start=False).x.isfinite().all()
+    assert "move the bodies apart" in message and "Checks(start=False)" in message
+    assert run(model, checks=dv.Checks(start=False)).x.isfinite().all()
     assert run(model, steps=0).steps == [0]
     with dv.debug_checks(), pytest.raises(ValueError, match="x: expected surfaces that do not intersect, got"):
         dv.step(model, model.rest_points, torch.zeros_like(model.rest_points), **STEP)
@@ -174,7 +174,7 @@ def test_colliders(device: str) -> None:
 def test_a_captured_rollout_is_not_checked() -> None:
     model = overlapping("cuda")
     x = model.rest_points
-    run(model, x, check_start=False)
+    run(model, x, checks=dv.Checks(start=False))
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         captured = run(model, x).x[-1]

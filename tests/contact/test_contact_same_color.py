@@ -92,22 +92,23 @@ def met(model: dv.Model, part: Part, x: Tensor) -> tuple[int, int]:
 def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
     scene, steps = SCENES[name](), 1 if name == "folded" else 2
     model = scene.model.to(device)
-    _, parts = compiled(scene, steps, sweeps)
-    expected = unrolled(scene, steps, sweeps, parts)
+    solver = scene.solver(sweeps)
+    _, parts = compiled(scene, steps, solver)
+    expected = unrolled(scene, steps, solver, parts)
 
     @functools.cache
     def other(seed: int) -> dict[str, Tensor]:
         if seed == 3:
-            return unrolled(scene, steps, sweeps, parts, seed=1)
+            return unrolled(scene, steps, solver, parts, seed=1)
         # what roundings of the start make of the same executed sequence
         toward = scene.x + contact_scenes.noise("rounding", seed, shape=scene.x.shape, size=1.0)
-        return unrolled(replace(scene, x=torch.nextafter(scene.x, toward)), steps, sweeps, parts)
+        return unrolled(replace(scene, x=torch.nextafter(scene.x, toward)), steps, solver, parts)
 
     start = scene.x.reshape(-1, *scene.x.shape[-2:])
     inside, third = met(scene.model, parts[0][0], start)
     assert inside > 0 and (third > 0 or name == "two_tets"), (inside, third)
     for tape in ("full", "recompute"):
-        result, found = compiled(scene, steps, sweeps, tape, model)
+        result, found = compiled(scene, steps, replace(solver, tape=tape), model)
         assert len(found) == len(parts)
         if device == "cpu":  # elsewhere lists keep what is out of reach
             sizes = ([[len(p.pairs) for p in own] for own in of] for of in (found, parts))
@@ -115,12 +116,11 @@ def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
         assert result.keys() == expected.keys()
         others = [functools.partial(other, seed) for seed in (3, 0, 1, 2)]
         forward, adjoint = tolerance("contact_forward"), tolerance("contact_adjoint")
-        if (
-            name == "two_tets"
-        ):  # which fly apart, in contact, farther than a thousand times what friction is smoothed by
+        if name == "two_tets":
+            # they fly apart, in contact, farther than a thousand times what friction is smoothed by
             adjoint = tolerance("far_slip_adjoint")
         assert_near_contact(result, expected, forward, adjoint, scene.time_step, others)
-        assert all(result[key].any() for key in ("grad_x", "grad_v", "grad_pair_barrier.kappa"))
+        assert all(result[key].any() for key in ("grad_x", "grad_v", "grad_pair_kappa"))
 
 
 @pytest.mark.parametrize("name", ("two_on_one", "twins"))
@@ -128,7 +128,7 @@ def test_the_order_inside_a_color_does_not_matter(name: str) -> None:
     """Another numbering of the vertices, the same colors: the same step but for rounding. An update that saw its
     neighbor's new place would depend on who comes first."""
     scene = SCENES[name]()
-    result, _ = compiled(scene, 1, 3)
+    result, _ = compiled(scene, 1, scene.solver(3))
     model, count = scene.model, scene.model.num_vertices
     rank = torch.arange(count)
     for first, end in itertools.pairwise(model.color_ptr.tolist()):
@@ -140,7 +140,7 @@ def test_the_order_inside_a_color_does_not_matter(name: str) -> None:
     other = Scene(dv.Model(mesh, energies=model.energies), scene.x[rank.argsort()], scene.v[rank.argsort()],
                   inputs=dict(scene.inputs), parameters=scene.parameters)  # fmt: skip
     other.inputs["force"] = scene.inputs["force"][rank.argsort()]
-    turned, _ = compiled(other, 1, 3)
+    turned, _ = compiled(other, 1, other.solver(3))
     assert set(map(frozenset, _members(other.model))) == {
         frozenset(rank[torch.tensor(sorted(m))].tolist()) for m in _members(model)
     }

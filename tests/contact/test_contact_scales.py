@@ -191,9 +191,8 @@ def test_friction_and_damping_do_not_depend_on_the_frame(part: str, shape: str, 
         """Where the body is in the frame, and the gradient of a sum of that by its velocity."""
         times = TIME_STEP * torch.arange(1, steps + 1, dtype=x.dtype, device=device)
         v = (own + frame).expand_as(x).clone().requires_grad_()
-        motion = dv.rollout(model, x, v, dv.VBD(TIME_STEP, 150), steps=steps, mu=1e5, lam=1e5,
-                            colliders=dv.per_step(at + times[:, None,
-                                                             None] * frame), colliders_before=at, save="last")  # fmt: skip
+        motion = dv.rollout(model, x, v, dv.VBD(TIME_STEP, 150), steps=steps, mu=1e5, lam=1e5, colliders_before=at,
+                            colliders=dv.per_step(at + times[:, None, None] * frame), save="last")  # fmt: skip
         found = motion.x[-1] - times[-1] * frame
         weights = torch.linspace(-1, 1, found.numel(), dtype=x.dtype, device=device).view_as(found)
         return found.detach(), torch.autograd.grad((weights * found).sum(), v)[0]

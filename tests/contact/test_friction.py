@@ -72,7 +72,7 @@ def settle(block: Block, angle: float, shear: float) -> None:
     normal = GRAVITY * math.cos(angle)
     options: dict[str, Any] = {"gravity": (shear * normal, -normal, 0.0)}
     if model.friction is not None:
-        options["parameters"] = {"friction": 0.0}
+        options["friction"] = 0.0
     for _ in range(80):
         kappa, dhat = torch.full_like(x[:, 1], KAPPA), torch.full_like(x[:, 1], DHAT)
         load = torch.where(free, -_barrier_slope(x[:, 1] + GAP, kappa, dhat), 0.0)

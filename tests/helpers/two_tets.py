@@ -45,11 +45,11 @@ def stand_in(model: dv.Model, **changes: Any) -> Any:
     values = {name: getattr(model, name) for name in (*names, "regularization", "relaxation", "block", "coarse")}
     values |= {"rigid": False, "starts_from": "predictor"}
     detections = changes.pop("detections", 1)
-    barrier = {"kappa": 200.0, "dhat": DHAT, "damping": 3.0, "detections": detections}
+    barrier = {"name": "pair", "kappa": 200.0, "dhat": DHAT, "damping": 3.0, "detections": detections}
     values |= {
         "body": torch.tensor([0] * 4 + [1] * 4),
         "contact": SimpleNamespace(**barrier),
-        "friction": SimpleNamespace(coefficient=0.4, velocity=0.05),
+        "friction": SimpleNamespace(name="friction", coefficient=0.4, velocity=0.05),
         "collider_points": COLLIDERS,
         "surface_of_contact": SimpleNamespace(radius=RADII),
         "plane_points": torch.tensor([False] * 3 + [True] * 3),

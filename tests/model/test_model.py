@@ -1,6 +1,5 @@
 """Model: coloring, masses, pins, copies, presets, and the number of colors against DSATUR."""
 
-import dataclasses
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -86,38 +85,40 @@ def test_pins_by_mask_or_indices(pinned: Any) -> None:
 # --- what a Model shows -----------------------------------------------------------------------------------------------
 
 
-# TODO62: give the solver of model: saturation=0.25, regularization=1e-3, relaxation=1.5
 def test_repr_says_what_it_is() -> None:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(damping=3.0), dv.Anchor(2.0))
-    model = dv.Model(dv.mesh.beam(5, 3, 3, split="kuhn"), pinned=[0, 1], energies=energies)  # fmt: skip
+    model = dv.Model(dv.mesh.beam(5, 3, 3, split="kuhn"), pinned=[0, 1], energies=energies)
     text = repr(model)
     for part in ("45 vertices", "96 tets", "2 pinned", f"{model.num_colors} colors", "20 kg", "StableNeoHookean",
-                 "FloorBarrier", "damping=3.0", "Anchor", "stiffness=2.0", "saturation=0.25 m",
-                 "regularization=0.001 kg", "relaxation=1.5", "float64", "cpu"):  # fmt: skip
+                 "FloorBarrier", "damping=3.0", "Anchor", "stiffness=2.0", "float64", "cpu"):  # fmt: skip
         assert part in text, part
     assert "\n" not in text and len(text) < 700
-    plain = repr(dv.Model(dv.mesh.cube(split="kuhn"), dtype=torch.float32))
-    assert "float32" in plain and "saturation" not in plain and "relaxation" not in plain
+    assert "float32" in repr(dv.Model(dv.mesh.cube(split="kuhn"), dtype=torch.float32))
+    told = str(dv.VBD.paper(0.25, 7, relaxation=1.5, subspace="coarse", block="exact", saturation=None))
+    assert told == "h = 0.25 s, ImplicitEuler, K = 7, relaxation 1.5, coarse"
+    assert str(dv.VBD.paper(0.01, 1, subspace=None)).endswith('plain, block="paper"')
 
 
-# TODO62: give the solver of other: saturation=0.2, paper=True
+def test_inputs_are_declared_by_energies() -> None:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=300.0), dv.Friction(0.3))
+    table = dv.Model(dv.mesh.cube(split="kuhn"), energies=energies).inputs
+    assert (table["floor_kappa"].unit, table["floor_kappa"].default) == ("N/m", "300")
+    assert table["friction"].source == "Friction" and table["young"].source == "StableNeoHookean"
+    assert "anchor_stiffness" not in table and len(str(table).splitlines()) == len(table) + 1
+    bare = dv.Model(dv.mesh.cube(split="kuhn"), energies=()).inputs
+    assert set(bare) == {"force", "gravity", "prescribed", "colliders", "colliders_before", "rest_points", "density"}
+
+
 def test_paper_preset() -> None:
-    mesh = dv.mesh.cube(split="kuhn")
-    model = dv.Model(mesh, density=700.0, pinned=[0])
-    assert [e.block for e in model.energies] == ["paper"]
-    assert (model.saturation, model.regularization, model.relaxation) == (0.1, 1e-6, 1.0)
-    assert model.pinned[0] and float(model.density[0]) == 700.0
-    floor = dv.FloorBarrier(height=-1.0)
-    other = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor))
-    assert other.energies[0].block == "paper" and len(other.energies) == 2 and other.saturation == 0.2
-    same = dv.Model(mesh, 700.0, [0], (dv.StableNeoHookean(),), 0.1, 1e-6)
-    v = torch.ones(8, 3, dtype=torch.float64)
-    assert torch.equal(
-        dv.step(model, model.rest_points, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], paper=True)}))[0],
-        dv.step(same, same.rest_points, v, **(STEP | {"solver": dataclasses.replace(STEP["solver"], block="paper")}))[
-            0
-        ],
-    )
+    model = dv.Model(dv.mesh.cube(split="kuhn"), density=700.0, pinned=[0])
+    solver = dv.VBD.paper(1 / 60, 2)
+    assert (solver.block, solver.saturation, solver.regularization, solver.relaxation) == ("paper", 0.1, 1e-6, 1.0)
+    assert dv.VBD.paper(1 / 60, 2, saturation=0.2).saturation == 0.2
+    same = dv.VBD(1 / 60, 2, block="paper", saturation=0.1, regularization=1e-6)
+    assert solver == same and dv.VBD(1 / 60, 2) != same
+    ends = [dv.step(model, model.rest_points, torch.ones(8, 3, dtype=torch.float64), **STEP | {"solver": each})[0]
+            for each in (solver, same, STEP["solver"])]  # fmt: skip
+    assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
 
 
 # --- copies -----------------------------------------------------------------------------------------------------------
@@ -164,10 +165,9 @@ def test_a_device_without_kernels_raises() -> None:
 # --- degenerate models ------------------------------------------------------------------------------------------------
 
 
-def gradients(model: dv.Model, x: Tensor, **options: Any) -> tuple[Tensor, Tensor, Tensor]:
+def gradients(model: dv.Model, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     x, v = x.clone().requires_grad_(), torch.ones_like(x).requires_grad_()
-    # TODO62: the solver of this call
-    new, speed = dv.step(model, x, v, **{**STEP, **options})
+    new, speed = dv.step(model, x, v, **STEP)
     return (new.detach(), *torch.autograd.grad(new.sum() + speed.sum(), (x, v), allow_unused=True))
 
 
@@ -181,7 +181,7 @@ def test_an_empty_mesh_is_legal(batch: tuple[int, ...]) -> None:
     assert new.shape == x.shape and by_x.shape == x.shape
     trajectory = dv.rollout(model, x, x, steps=2, **STEP)
     assert trajectory.x.shape == (3, *x.shape)
-    assert model.memory(dv.VBD(0.01, 2))["total"] >= 0
+    assert dv.memory(model, STEP["solver"])["total"] >= 0
     for dtype in (torch.float32, torch.float64):
         assert dv.step(model.to(dtype=dtype), x.to(dtype), x.to(dtype), **STEP)[0].shape == x.shape
 
@@ -208,28 +208,25 @@ def test_vertices_without_tets_are_legal_when_pinned() -> None:
 def test_a_model_without_elastic_energy_falls_freely() -> None:
     model = dv.Model(dv.mesh.cube(split="kuhn"), energies=())
     v = torch.full((8, 3), 2.0, dtype=torch.float64)
-    x, _ = dv.step(model, model.rest_points, v, dv.VBD(0.1, 3), mu=0.0, lam=0.0)
+    x, _ = dv.step(model, model.rest_points, v, dv.VBD(0.1, 3))
     expected = model.rest_points + 0.1 * v + 0.01 * torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
     assert relative_error(x, expected) <= tolerance("ulps")
 
 
 def test_safeguards_out_of_scale_warn() -> None:
-    small = dv.mesh.cube(size=0.003, split="kuhn")
-    with pytest.warns(UserWarning, match="regularization: 1e-06 kg is 0.44"):
-        # TODO62: give the solver the preset VBD.paper
-        dv.Model(small)
-    with pytest.warns(UserWarning, match="relaxation: .* got 1.9"):
-        # TODO62: give the solver relaxation=1.9
-        dv.Model(small)
-    with pytest.warns(UserWarning, match="may diverge"):
-        # TODO62: give the solver relaxation=1.6
-        dv.Model(small, energies=(dv.StableNeoHookean(),))
+    def step(size: float, solver: dv.VBD) -> None:
+        model = dv.Model(dv.mesh.cube(size=size, split="kuhn"))
+        dv.step(model, model.rest_points, 0 * model.rest_points, solver, mu=1e4, lam=2e4)
+
+    for solver, message in ((dv.VBD.paper(0.01, 1), "regularization: 1e-06 kg is 0.44"),
+                            (dv.VBD(0.01, 1, relaxation=1.9), "relaxation: .* got 1.9"),
+                            (dv.VBD(0.01, 1, relaxation=1.6, block="paper"), "may diverge")):  # fmt: skip
+        with pytest.warns(UserWarning, match=message):
+            step(0.003, solver)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # TODO62: give the solver the preset VBD.paper
-        dv.Model(dv.mesh.cube(split="kuhn"))
-        # TODO62: give the solver relaxation=1.6
-        dv.Model(small)
+        step(1.0, dv.VBD.paper(0.01, 1))
+        step(0.003, dv.VBD(0.01, 1, relaxation=1.6))
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -237,7 +234,6 @@ def test_safeguards_out_of_scale_warn() -> None:
 
 LOOSE = dv.TetMesh(np.concatenate([MESH.points, np.ones((2, 3)) * 3]), MESH.tets)
 
-# TODO62: block="paper" of the solver
 MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("mesh", {"mesh": "beam.msh"}, "str"),
     ("mesh", {"mesh": (MESH.points, MESH.tets)}, "tuple"),
@@ -263,14 +259,9 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("pinned", {"pinned": [10**400]}, "list"),
     ("density", {"density": torch.ones(6, device="meta")}, "meta"),
     ("density", {"density": torch.ones(6).to_sparse()}, "sparse"),
-    *((name, {name: 10**400}, "1329 bits") for name in ("density", "saturation", "regularization", "relaxation")),
+    ("density", {"density": 10**400}, "1329 bits"),
     ("density", {"density": ones().requires_grad_()}, r"requires grad.* density= to a step"),
-    ("relaxation", {"relaxation": ones().requires_grad_()}, "requires grad"),
     ("pinned", {"pinned": (MESH.points[:, 0] == 0).astype(int)}, "8 integers that are 0 or 1"),
-    ("saturation", {"saturation": 0.0}, "0"),
-    ("saturation", {"saturation": -0.1}, "-0.1"),
-    ("saturation", {"saturation": NAN}, "nan"),
-    *((name, {name: 1e39, "dtype": torch.float32}, r"1e\+39") for name in ("saturation", "regularization")),
     *(
         (name, {"energies": energy, "dtype": torch.float32}, r"1e\+39")
         for name, energy in (
@@ -280,17 +271,6 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
             ("stiffness", dv.Anchor(1e39)),
         )
     ),
-    ("saturation", {"saturation": "some"}, "str"),
-    ("saturation", {"saturation": True}, "bool"),
-    ("regularization", {"regularization": -1e-6}, "-1e-06"),
-    ("regularization", {"regularization": NAN}, "nan"),
-    ("regularization", {"regularization": "some"}, "str|some"),
-    ("regularization", {"regularization": None}, "None"),
-    ("relaxation", {"relaxation": 0.0}, "0"),
-    ("relaxation", {"relaxation": 2.0}, "2"),
-    ("relaxation", {"relaxation": -1.0}, "-1"),
-    ("relaxation", {"relaxation": NAN}, "nan"),
-    ("relaxation", {"relaxation": None}, "None"),
     ("energies", {"energies": ("neo",)}, "str"),
     ("energies", {"energies": (dv.StableNeoHookean,)}, "type"),
     ("energies", {"energies": None}, "None"),
@@ -299,7 +279,7 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("dtype", {"dtype": torch.float16}, "float16"),
     ("dtype", {"dtype": "float32"}, "float32"),
     # arrays, of which == makes arrays
-    *((name, {name: np.arange(2)}, r"\[0,? 1\]|ndarray") for name in ("dtype", "device", "start", "rigid", "coarse")),
+    *((name, {name: np.arange(2)}, r"\[0,? 1\]|ndarray") for name in ("dtype", "device")),
 ]
 
 
@@ -308,9 +288,34 @@ def test_bad_argument_of_a_model(name: str, options: dict[str, Any], got: str) -
     raises(lambda: dv.Model(**{"mesh": MESH, **options}), name, got)
 
 
-# TODO62: block="best" of the solver
+SOLVERS: list[tuple[str, Any, str]] = [
+    *((name, 10**400, "1329 bits") for name in ("saturation", "regularization", "relaxation")),
+    *((name, ones().requires_grad_(), "requires grad") for name in ("saturation", "regularization", "relaxation")),
+    *(
+        ("saturation", bad, got)
+        for bad, got in ((0.0, "0"), (-0.1, "-0.1"), (NAN, "nan"), ("some", "str"), (True, "bool"))
+    ),
+    *(("regularization", bad, got) for bad, got in ((-1e-6, "-1e-06"), (NAN, "nan"), ("some", "str"), (None, "None"))),
+    *(("relaxation", bad, got) for bad, got in ((0.0, "0"), (2.0, "2"), (-1.0, "-1"), (NAN, "nan"), (None, "None"))),
+    *((name, "best", "best") for name in ("block", "start", "tape", "subspace")),
+    # arrays, of which == makes arrays
+    *((name, np.arange(2), r"\[0,? 1\]|ndarray") for name in ("block", "start", "tape", "subspace")),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "got"), SOLVERS, ids=lambda a: str(a)[:30].replace("\n", " "))
+def test_bad_argument_of_a_solver(name: str, value: Any, got: str) -> None:
+    raises(lambda: dv.VBD(**{"time_step": 0.01, "sweeps": 1, name: value}), name, got)
+
+
+@pytest.mark.parametrize("name", ("saturation", "regularization"))
+def test_numbers_of_a_solver_that_float32_cannot_hold(name: str) -> None:
+    model = dv.Model(MESH, dtype=torch.float32)
+    solver = dv.VBD(0.01, 1, **{name: 1e39})
+    raises(lambda: dv.step(model, model.rest_points, 0 * model.rest_points, solver, mu=1.0, lam=1.0), name, r"1e\+39")
+
+
 ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
-    ("block", lambda: dv.StableNeoHookean(), "best"),
     *((n, lambda n=n: dv.FloorBarrier(**{n: -1.0}), "-1") for n in ("kappa", "dhat", "damping")),
     *((n, lambda n=n: dv.FloorBarrier(**{n: NAN}), "nan") for n in ("kappa", "dhat", "damping", "height")),
     *((n, lambda n=n: dv.FloorBarrier(**{n: True}), "bool|True") for n in ("kappa", "dhat", "damping")),
@@ -338,23 +343,21 @@ ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
     *((n, lambda n=n: dv.PairBarrier(**{n: 10**400}), "bits") for n in ("kappa", "dhat", "damping", "reach")),
     *((n, lambda n=n: dv.Friction(**{n: 10**400}), "bits") for n in ("coefficient", "velocity")),
     *(
-        (n, lambda n=n: dv.FloorBarrier(**{n: ones().requires_grad_()}), f"requires grad.*floor_barrier.{n}")
+        (n, lambda n=n: dv.FloorBarrier(**{n: ones().requires_grad_()}), f"requires grad.*floor_{n}")
         for n in ("kappa", "dhat", "damping", "height", "normal")
     ),
     *((n, lambda n=n: dv.PairBarrier(**{n: ones().requires_grad_()}), "requires grad") for n in ("kappa", "dhat")),
-    ("coefficient", lambda: dv.Friction(ones().requires_grad_()), "requires grad.*friction.coefficient"),
+    ("coefficient", lambda: dv.Friction(ones().requires_grad_()), "requires grad.*friction"),
     *(
-        (n, lambda n=n: dv.Anchor(**{n: ones(8, 3).requires_grad_()}), f"requires grad.*anchor.{n}")
+        (n, lambda n=n: dv.Anchor(**{n: ones(8, 3).requires_grad_()}), f"requires grad.*anchor_{n}")
         for n in ("stiffness", "points")
     ),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=torch.zeros(7, dtype=torch.bool)),)), "7"),
-    ("tape", lambda: dv.ReverseSweep("half"), "half"),
     ("dtype", lambda: dv.Model(MESH).to(dtype=torch.int64), "int64"),
-    ("sweeps", lambda: dv.Model(MESH).memory(sweeps=-1), "-1"),
-    ("steps", lambda: dv.Model(MESH).memory(sweeps=1, steps=1.5), "1.5"),
-    ("scenes", lambda: dv.Model(MESH).memory(sweeps=1, scenes=True), "bool"),
-    ("save", lambda: dv.Model(MESH).memory(sweeps=1, save="most"), "most"),
-    ("save", lambda: dv.Model(MESH).memory(sweeps=1, save=0), "0"),
+    *(
+        (n, lambda n=n, bad=bad: dv.memory(dv.Model(MESH), dv.VBD(0.01, 1), **{n: bad}), got)
+        for n, bad, got in (("steps", 1.5, "1.5"), ("scenes", True, "bool"), ("save", "most", "most"), ("save", 0, "0"))
+    ),
 ]
 
 

@@ -94,11 +94,10 @@ def test_a_step_takes_either_pair(device: str, lead: tuple[int, ...], numbers: b
     assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])
     mixed = dv.step(model, x, v, young=scalar(E, device), poisson=NU, **STEP)
     assert relative_error(mixed[0], expected[0]) <= tolerance("formula")
-    options = {}
-    end = dv.solve(model, x, v, dv.VBD(0.01, 1), young=young, poisson=poisson, **options).x
-    assert torch.equal(end, dv.solve(model, x, v, dv.VBD(0.01, 1), mu=mu, lam=lam, **options).x)
-    figures = dv.diagnose(model, x, dv.VBD(0.01, 1), young=young, poisson=poisson, warn=False, **options)
-    assert figures.courant == dv.diagnose(model, x, dv.VBD(0.01, 1), mu=mu, lam=lam, warn=False, **options).courant
+    end = dv.solve(model, x, v, young=young, poisson=poisson, **STEP).x
+    assert torch.equal(end, dv.solve(model, x, v, mu=mu, lam=lam, **STEP).x)
+    figures = dv.diagnose(model, x, young=young, poisson=poisson, warn=False, **STEP)
+    assert figures.courant == dv.diagnose(model, x, mu=mu, lam=lam, warn=False, **STEP).courant
 
 
 def test_rollouts_take_values_per_step_and_functions(device: str) -> None:
@@ -111,19 +110,15 @@ def test_rollouts_take_values_per_step_and_functions(device: str) -> None:
         return 0.1 * k
 
     options = {"steps": 3, **STEP}
-    # TODO62: the solver of this call
     found = dv.rollout(model, x, v, young=dv.per_step(young), poisson=poisson, checkpoint_every=None, **options).x
     assert calls == [0, 1, 2]
     pairs = [dv.lame(young[k], scalar(0.1 * k, device)) for k in range(3)]
     mu, lam = (dv.per_step(torch.stack([pair[i] for pair in pairs])) for i in (0, 1))
-    # TODO62: the solver of this call
     expected = dv.rollout(model, x, v, mu=mu, lam=lam, **options).x
     assert relative_error(found, expected) <= tolerance("formula")
     slopes = [torch.autograd.grad(x[-1].sum(), young, retain_graph=True)[0] for x in (found, expected)]
     assert relative_error(*slopes) <= tolerance("schedules") and (slopes[0] != 0).all()
-    # TODO62: the solver of this call
     constant = dv.rollout(model, x, v, young=E, poisson=NU, **options).x
-    # TODO62: the solver of this call
     assert torch.equal(constant, dv.rollout(model, x, v, mu=dv.lame(E, NU)[0], lam=dv.lame(E, NU)[1], **options).x)
 
 
@@ -155,7 +150,7 @@ def test_exactly_one_pair(given: dict[str, Any], message: str) -> None:
     for run in (
         lambda: dv.step(model, x, v, **given, **STEP),
         lambda: dv.rollout(model, x, v, steps=2, **given, **STEP),
-        lambda: dv.solve(model, x, v, dv.VBD(0.01, 1), **given),
+        lambda: dv.solve(model, x, v, **given, **STEP),
         lambda: dv.diagnose(model, x, **given),
         lambda: dv.step_forward(model, x, v, **given, **STEP),
     ):

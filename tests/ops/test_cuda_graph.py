@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import torch
 from helpers.regimes import REGIMES, captured, forced
-from helpers.results import TAPES, assert_same_bits
+from helpers.results import TAPES, assert_same_bits, evaluated
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.testing import build_scene, evaluate, generator
+from diffvbd.testing import build_scene, generator
 
 pytestmark = pytest.mark.cuda
 
@@ -34,12 +34,12 @@ def no_synchronisation() -> Iterator[None]:
 class Optimisation:
     """Material, start velocity and floor of a dropped cube are fitted to where its vertices shall be at the end."""
 
-    def __init__(self, steps: int, lead: tuple[int, ...], **options: Any) -> None:
+    def __init__(self, steps: int, lead: tuple[int, ...], tape: Any = "auto", **options: Any) -> None:
         mesh = dv.mesh.cube(3, 0.1).translate([0.0, 0.01, 0.0])  # 27 vertices, the lowest within dhat
         energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=400.0, dhat=0.02, damping=1.0))
         self.model = dv.Model(mesh, energies=energies, device="cuda")
         self.x = self.model.rest_points.expand(*lead, -1, -1).contiguous()
-        self.options = {"steps": steps, "time_step": 0.005, "sweeps": 5, "save": "last", **options}
+        self.options = {"solver": dv.VBD(0.005, 5, tape=tape), "steps": steps, "save": "last", **options}
 
         def leaf(value: Tensor | float) -> Tensor:
             return torch.as_tensor(value, dtype=torch.float64).to("cuda").clone().requires_grad_()
@@ -57,7 +57,6 @@ class Optimisation:
     def iteration(self) -> None:
         leaf = self.leaves
         self.optimizer.zero_grad(set_to_none=True)
-        # TODO62: the solver of this call
         end = dv.rollout(self.model, self.x, leaf["speed"].expand_as(self.x), mu=leaf["log_mu"].exp(),
                          lam=leaf["log_lam"].exp(), floor_height=leaf["height"], **self.options)  # fmt: skip
         loss = (end.x[-1] - self.target).square().sum()
@@ -93,7 +92,7 @@ def test_an_optimisation_of_a_hundred_steps_replays_to_the_bit() -> None:
 @pytest.mark.parametrize("tape", TAPES)
 @pytest.mark.parametrize("regime", REGIMES)
 def test_every_regime_and_tape_can_be_captured(regime: str, tape: str) -> None:
-    check_optimisation(6, (3,), regime, adjoint=dv.ReverseSweep(tape))
+    check_optimisation(6, (3,), regime, tape=tape)
 
 
 @pytest.mark.parametrize("schedule", (2, dv.BinomialCheckpoints(2)), ids=("segments", "binomial"))
@@ -129,10 +128,8 @@ def test_a_captured_step_reads_what_its_arguments_hold_now(regime: str) -> None:
 
 def loss_and_gradients(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any]) -> Callable[[], list[Tensor]]:
     """A call of `run` and its backward, with leaves and weights made beforehand."""
-    parameters = {name: t.clone().requires_grad_() for name, t in inputs.get("parameters", {}).items()}
-    call = {name: t.clone().requires_grad_() if isinstance(t, Tensor) else t for name, t in inputs.items()}
-    call |= {"parameters": parameters} if parameters else {}
-    leaves = [t for t in (*call.values(), *parameters.values()) if isinstance(t, Tensor)]
+    call = {name: t.clone().requires_grad_() for name, t in inputs.items()}
+    leaves = list(call.values())
     weights = torch.as_tensor(generator("loss").standard_normal(tuple(inputs["x"].shape)), device="cuda")
 
     def once() -> list[Tensor]:
@@ -149,7 +146,7 @@ def test_a_step_and_its_backward_do_not_synchronise(case: str, tape: str, regime
     scene = build_scene(case)
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")
     with forced(regime):
-        once = loss_and_gradients(lambda **o: dv.step(model, **o, solver=scene.solver(3), adjoint=dv.ReverseSweep(tape)), inputs)
+        once = loss_and_gradients(lambda **o: dv.step(model, solver=scene.solver(3, tape=tape), **o), inputs)
         expected = once()  # kernels are loaded on first use
         with no_synchronisation():
             actual = once()
@@ -221,12 +218,12 @@ def deterministic() -> Iterator[None]:
 def test_deterministic_algorithms(case: str, tape: str, regime: str | None, request: pytest.FixtureRequest) -> None:
     scene = build_scene(case, "random")
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")
-    adjoint = dv.ReverseSweep(tape)
+    solver = scene.solver(3, tape=tape)
     with forced(regime):
-        expected = evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, solver=scene.solver(3)), inputs)
+        expected = evaluated(model, inputs, solver)
         request.getfixturevalue("deterministic")
-        actual = evaluate(lambda **o: dv.step(model, adjoint=adjoint, **o, solver=scene.solver(3)), inputs)
-        rebuilt = evaluate(lambda **o: dv.step(scene.model("cuda"), adjoint=adjoint, **o, solver=scene.solver(3)), inputs)
+        actual = evaluated(model, inputs, solver)
+        rebuilt = evaluated(scene.model("cuda"), inputs, solver)
     for name, value in expected.items():
         assert torch.equal(actual[name], value), name
         assert torch.equal(rebuilt[name], value), name

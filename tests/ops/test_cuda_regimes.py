@@ -3,19 +3,21 @@ each repeats itself to the bit, and the automatic choice is one of them."""
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.exactness import BATCHED, check, check_shapes
-from helpers.regimes import REGIMES, forced, large_inputs
+from helpers.regimes import REGIMES, forced, large_inputs, large_solver
 from helpers.results import TAPES, assert_same_bits, evaluated
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
 from diffvbd import testing
+from diffvbd.model.system import system_of
 from diffvbd.ops import regimes
 from diffvbd.ops.regimes import regime
 from diffvbd.testing import (
@@ -104,16 +106,19 @@ BODY = dv.StableNeoHookean()
 ODD: dict[str, tuple[Callable[[], dv.TetMesh], dict[str, Any], tuple[str, ...]]] = {  # mesh, options, regimes
     "fan for a thread": (lambda: ball(4, 7), {"energies": (BODY, BELOW)}, REGIMES),
     "fan of 98": (lambda: ball(8, 12), {"energies": (BODY, BELOW, dv.Anchor(10.0)), "pinned": [1]}, REGIMES[1:]),
-    "fan of 602": (lambda: ball(20, 30), {"energies": (BODY,), "relaxation": 1.3}, REGIMES[1:]),
+    "fan of 602": (lambda: ball(20, 30), {"energies": (BODY,)}, REGIMES[1:]),
     "bodies": (bodies, {"energies": (BODY, FLOOR), "pinned": [0]}, REGIMES),
     "isolated vertices": (cube_with_loose_vertices, {"energies": (BODY, FLOOR), "pinned": [0, 8, 9, 10]}, REGIMES),
     "one tet": (lambda: dv.TetMesh(np.eye(4)[:, 1:], [[0, 1, 2, 3]]), {"energies": (BODY,)}, REGIMES),
     "no energies": (dv.mesh.cube, {"energies": ()}, REGIMES),
     "floor alone": (dv.mesh.cube, {"energies": (FLOOR,)}, REGIMES),
-    "anchor alone": (dv.mesh.cube, {"energies": (dv.Anchor(50.0, vertices=[1, 4]),), "saturation": 0.05}, REGIMES),
+    "anchor alone": (dv.mesh.cube, {"energies": (dv.Anchor(50.0, vertices=[1, 4]),)}, REGIMES),
     "all pinned": (dv.mesh.cube, {"energies": (BODY, FLOOR), "pinned": range(8)}, REGIMES),
     "no tets": (lambda: dv.TetMesh(np.eye(3)[:2], np.zeros((0, 4), dtype=int)), {"pinned": [0, 1]}, REGIMES),
 }
+
+
+ODD_SOLVERS: dict[str, dict[str, Any]] = {"fan of 602": {"relaxation": 1.3}, "anchor alone": {"saturation": 0.05}}
 
 
 def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, Any]]:
@@ -138,7 +143,9 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
         "density": torch.tensor(90.0, dtype=torch.float64),
     }
     if model.floor is not None:
-        inputs["parameters"] = {"floor_kappa": torch.tensor(3e4, dtype=torch.float64)}
+        inputs["floor_kappa"] = torch.tensor(3e4, dtype=torch.float64)
+    if not any(isinstance(energy, dv.StableNeoHookean) for energy in model.energies):
+        del inputs["mu"], inputs["lam"]
     return model, inputs
 
 
@@ -147,21 +154,23 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
 @pytest.mark.parametrize("scenes", ((), (5,)), ids=("one", "batch"))
 @pytest.mark.parametrize(("name", "regime"), [(name, r) for name, entry in ODD.items() for r in entry[2]])
 def test_odd_scenes_equal_the_cpu(name: str, regime: str, scenes: tuple[int, ...], sweeps: int) -> None:
-    assert_equal_to_the_cpu(*odd_scene(name, scenes), sweeps, regime)
+    solver = dv.VBD(0.02, sweeps, **ODD_SOLVERS.get(name, {}))
+    assert_equal_to_the_cpu(*odd_scene(name, scenes), solver, regime)
 
 
-def assert_equal_to_the_cpu(model: dv.Model, inputs: dict[str, Any], sweeps: int, regime: str) -> None:
+def assert_equal_to_the_cpu(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD, regime: str) -> None:
     """State and all gradients, under each tape."""
     for tape in TAPES:
-        expected = evaluated(model, inputs, sweeps, tape)
+        taped = replace(solver, tape=tape)
+        expected = evaluated(model, inputs, taped)
         with forced(regime):
-            result = evaluated(model.to("cuda"), on_device(inputs, "cuda"), sweeps, tape)
+            result = evaluated(model.to("cuda"), on_device(inputs, "cuda"), taped)
         assert relative_error(result["x"], expected["x"]) <= tolerance("spread_factor") * tolerance("forward")
         for key, value in expected.items():
             if key.startswith("grad_"):
                 error = relative_error(result[key], value)
                 # masses of a body that falls freely hardly matter: what is left of their gradient is small differences
-                moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, sweeps)[key]
+                moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, solver)[key]
                 assert error <= testing.bar(moved), (key, tape)
 
 
@@ -190,7 +199,7 @@ def test_any_number_of_threads_per_vertex(
     x = model.rest_points + noise(3, model.num_vertices, 3, size=0.02)
     inputs = {"x": x, "v": noise(*x.shape, size=1.0), "mu": 1e4 * (1 + noise(*material, size=0.5)),
               "lam": (1e8 if what == "uneven" else 2e4) * (1 + noise(*material, size=0.5))}  # fmt: skip
-    assert_equal_to_the_cpu(model, inputs, 6, "color")
+    assert_equal_to_the_cpu(model, inputs, dv.VBD(0.02, 6), "color")
 
 
 @pytest.mark.parametrize("regime", (None, *REGIMES))
@@ -218,8 +227,9 @@ def test_runs_repeat_to_the_bit(
     regime: str | None, cells: int, lead: tuple[int, ...], tape: str, dtype: torch.dtype
 ) -> None:
     model, inputs = large_inputs(cells, *lead, dtype=dtype)
+    solver = large_solver(3, tape=tape)
     with forced(regime):
-        expected = evaluated(model, inputs, 3, tape)
+        expected = evaluated(model, inputs, solver)
         for i in range(3):
             # memory that held other numbers, and other work on the device at the same time
             torch.full((1 << 24,), float("nan"), device="cuda")
@@ -228,7 +238,7 @@ def test_runs_repeat_to_the_bit(
                 busy = torch.ones(1 << 24, device="cuda")
                 for _ in range(10 * i):
                     busy.mul_(1.5)
-            assert_same_bits(evaluated(model, inputs, 3, tape), expected)
+            assert_same_bits(evaluated(model, inputs, solver), expected)
             side.synchronize()
 
 
@@ -240,13 +250,12 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
     model, inputs = large_inputs(2 if regime == "thread" else 4, 130)
     inputs["lam"] = inputs["lam"] * torch.linspace(0.5, 1.5, 130, dtype=torch.float64, device="cuda")[:, None]
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device="cuda")
-    names = ("x", "v", "mu", "lam")
+    names, solver = ("x", "v", "mu", "lam"), large_solver(3, tape=tape)
     shared = {name: value for name, value in inputs.items() if name not in names}
 
     def run(i: Any) -> tuple[Tensor, ...]:
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
-        options = {**dict(zip(names, leaves, strict=True)), **shared}
-        x, v = dv.step(model, **options, solver=scene.solver(3), adjoint=dv.ReverseSweep(tape))
+        x, v = dv.step(model, solver=solver, **shared, **dict(zip(names, leaves, strict=True)))
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     batches = [range(130), range(20, 130), range(60, 101), range(62, 66), *(range(i, i + 1) for i in (0, 31, 64, 129))]
@@ -257,10 +266,10 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
                 results[batch] = [value[None] for value in run(batch[0])]
             else:
                 results[batch] = run(slice(batch.start, batch.stop))
-            launch = model.settings(inputs["time_step"], 3, len(batch)).launch
+            launch = system_of(model, solver).settings(solver.time_step, 3, len(batch)).launch
             launches[batch] = launch[:1] if regime == "thread" else launch  # there a vertex has one thread anyway
     scales = [float(value.abs().max()) for value in results[batches[0]]]
-    scales[1] = scales[0] / inputs["time_step"]  # v is a difference of positions
+    scales[1] = scales[0] / solver.time_step  # v is a difference of positions
     bars = [tolerance("spread_factor") * tolerance("forward")] * 2 + [tolerance("adjoint")] * len(names)
     equal = set()
     for batch, part in itertools.permutations(batches, 2):
@@ -283,10 +292,10 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
 # --- the choice -------------------------------------------------------------------------------------------------------
 
 
-def launches(model: dv.Model, inputs: dict[str, Any], tape: str) -> tuple[int, int]:
+def launches(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD) -> tuple[int, int]:
     """Of sweeps and of reverse sweeps in one step: of each color where that is the regime."""
     with profile(activities=[ProfilerActivity.CUDA]) as seen:
-        evaluated(model, inputs, 3, tape)
+        evaluated(model, inputs, solver)
         torch.cuda.synchronize()
     of = {
         name: sum(e.count for e in seen.key_averages() if name in e.key) for name in ("sweep_forward", "sweep_reverse")
@@ -296,19 +305,19 @@ def launches(model: dv.Model, inputs: dict[str, Any], tape: str) -> tuple[int, i
 
 @pytest.mark.parametrize("tape", TAPES)
 def test_the_reverse_may_take_another_regime_than_the_sweeps(tape: str) -> None:
-    model, inputs = large_inputs(9, 80)
+    (model, inputs), solver = large_inputs(9, 80), large_solver(3, tape=tape)
     inputs.pop("rest_points")
-    assert model.settings(0.01, 3, 80).launch[:2] == (regimes.GRID, regimes.COLOR)
-    chosen = evaluated(model, inputs, 3, tape)
+    assert system_of(model, solver).settings(0.01, 3, 80).launch[:2] == (regimes.GRID, regimes.COLOR)
+    chosen = evaluated(model, inputs, solver)
     with forced("grid"):
-        forward = evaluated(model, inputs, 3, tape)
-        few = launches(model, inputs, tape)
+        forward = evaluated(model, inputs, solver)
+        few = launches(model, inputs, solver)
     with forced("color"):
-        reverse = evaluated(model, inputs, 3, tape)
-        many = launches(model, inputs, tape)
+        reverse = evaluated(model, inputs, solver)
+        many = launches(model, inputs, solver)
     assert all(torch.equal(chosen[k], forward[k]) for k in ("x", "v"))
     assert few[0] < many[0] and few[1] < many[1]
-    assert launches(model, inputs, tape) == (few[0], many[1])
+    assert launches(model, inputs, solver) == (few[0], many[1])
     limit = tolerance("property_factor") * tolerance("adjoint")
     for key, value in reverse.items():
         assert value.any() and (key == "v" or relative_error(chosen[key], value) <= limit), key
@@ -319,17 +328,17 @@ def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: 
     """A step of an inference run equals the step of a training run to the bit, whatever the tape."""
     model, inputs = large_inputs(cells, *lead)
     inputs.pop("rest_points")
-    bare = dv.step(model, **inputs, solver=scene.solver(3))
+    bare = dv.step(model, solver=large_solver(3), **inputs)
     for tape in TAPES:
-        taped = evaluated(model, inputs, 3, tape)
+        taped = evaluated(model, inputs, large_solver(3, tape=tape))
         assert torch.equal(taped["x"], bare[0]) and torch.equal(taped["v"], bare[1]), tape
 
 
 def test_a_regime_that_cannot_run_a_scene_raises() -> None:
     model, inputs = large_inputs(10)
     with forced("thread"), pytest.raises(ValueError, match="regime"):
-        dv.step(model, **inputs, solver=scene.solver(1))
-    dv.step(model, **inputs, solver=scene.solver(1))  # outside, the choice is free again
+        dv.step(model, **inputs, solver=large_solver(1))
+    dv.step(model, **inputs, solver=large_solver(1))  # outside, the choice is free again
 
 
 @pytest.mark.parametrize("name", ("warp", "", "Thread", 3))
@@ -347,15 +356,14 @@ def test_an_unknown_regime_raises(name: Any) -> None:
 def test_one_launch_and_a_launch_for_each_color_give_the_same_bits(name: str, sweeps: int, tape: str) -> None:
     scene = SCENES[name]()
     model, found = scene.model.to("cuda"), []
-    for regime in ("grid", "color"):
-        with forced(regime):
-            found.append(compiled(scene, 2, sweeps, tape, model)[0])
+    for each in ("grid", "color"):
+        with forced(each):
+            found.append(compiled(scene, 2, scene.solver(sweeps, tape=tape), model)[0])
     for key, value in found[0].items():
         assert torch.equal(value, found[1][key]), key
     assert all(found[0][key].any() for key in ("x", "v", "grad_x", "grad_v"))
 
 
-# TODO62: give the solver of model: subspace=dv.CoarseSpace(every=3)
 def cubes(scenes: int) -> tuple[dv.Model, dict[str, Tensor]]:
     """A cube that falls on another one, with friction, over a floor, in scenes that differ."""
     cube = dv.mesh.cube(3, size=0.2)
@@ -370,12 +378,15 @@ def cubes(scenes: int) -> tuple[dv.Model, dict[str, Tensor]]:
     return model, {"x": x, "v": v, "mu": 1e5 * shares.expand(-1, model.num_tets).clone()}
 
 
+CONTACT = dv.VBD(0.01, 5, subspace=dv.CoarseSpace(every=3))
+
+
 def run_of_contact(
     model: dv.Model, given: dict[str, Tensor], tape: str, scenes: int | None = None
 ) -> dict[str, Tensor]:
     """The state after a step of the first scenes, and gradients of a fixed sum of it for each scene."""
     leaves = {key: value[:scenes].clone().requires_grad_() for key, value in given.items()}
-    x, v = dv.step(model, solver=dv.VBD(0.01, 5, tape=tape), **leaves, lam=1e5)
+    x, v = dv.step(model, solver=replace(CONTACT, tape=tape), **leaves, lam=1e5)
     weights = torch.linspace(-1, 1, x[0].numel(), dtype=x.dtype, device=x.device).view_as(x[0])
     grads = torch.autograd.grad((weights * (x + 0.01 * v)).sum(), list(leaves.values()))
     return {"x": x.detach(), "v": v.detach(), **{f"grad_{k}": g for k, g in zip(leaves, grads, strict=True)}}
@@ -389,8 +400,8 @@ def test_more_vertices_than_blocks(tape: str) -> None:
     blocks = 4 * torch.cuda.get_device_properties("cuda").multi_processor_count
     assert blocks < model.num_vertices * scenes / model.num_colors <= regimes.MANY_LANES_VERTICES[0]
     found = []
-    for regime in ("grid", "color"):
-        with forced(regime):
+    for each in ("grid", "color"):
+        with forced(each):
             found.append(run_of_contact(model, given, tape))
     assert_same_bits(*found)
     assert dv.contact.status(model).pairs > scenes
@@ -399,9 +410,10 @@ def test_more_vertices_than_blocks(tape: str) -> None:
 @pytest.mark.parametrize("tape", TAPES)
 def test_some_threads_a_vertex(tape: str) -> None:
     model, given = cubes(400)
-    launch = model.settings(0.01, 5, 400).launch
+    system = system_of(model, CONTACT)
+    launch = system.settings(0.01, 5, 400).launch
     assert launch == (regimes.COLOR, regimes.COLOR, regimes.SOME_LANES, regimes.SOME_REVERSE_LANES)
-    assert model.settings(0.01, 5, 1).launch == (regimes.GRID, regimes.GRID, regimes.MANY_LANES, regimes.MANY_LANES)
+    assert system.settings(0.01, 5, 1).launch == (regimes.GRID, regimes.GRID, regimes.MANY_LANES, regimes.MANY_LANES)
     many, one = run_of_contact(model, given, tape), run_of_contact(model, given, tape, 1)
     for key, value in one.items():
         assert value.any(), key

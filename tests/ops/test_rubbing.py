@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.adjoint.contact import Pairs, of_scene, pair_lag, rubbing, sum_at_corners
 from diffvbd._contact import detection
+from diffvbd.adjoint.contact import Pairs, of_scene, pair_lag, rubbing, sum_at_corners
 from diffvbd.energies import damped_share
 from diffvbd.testing import relative_error, tolerance
 

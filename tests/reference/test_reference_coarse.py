@@ -16,13 +16,14 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import reference
 from diffvbd.model.coarse import CoarseSpace, build_coarse
+from diffvbd.model.system import system_of
 from diffvbd.reference import coarse, sweep
 from diffvbd.reference.scene import build_layout, build_scene
 from diffvbd.testing import generator, relative_error, structured, tolerance
 
 NAMES = ("tets", "rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation")
-NAMES += ("regularization", "relaxation", "rigid", "starts_from")
-POINTS, BODIES, SCENES = 72, 2, 2
+NAMES += ("regularization", "relaxation", "block", "rigid", "starts_from")
+POINTS, BODIES, SCENES, H = 72, 2, 2, 0.02
 TURN = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.9], [0.5, 0.0, 0.3], [-0.9, -0.3, 0.0]]).double())
 
 
@@ -32,8 +33,9 @@ def stand_in(every: int = 2, coarse: bool = True, **options: Any) -> Any:
     mesh = dv.TetMesh(np.concatenate((left, right + [0.0, 1.7, 0.3])), np.concatenate((tets, more + len(left))))
     floor = dv.FloorBarrier(height=-0.05, kappa=2e4, dhat=0.1, damping=20.0)
     energies = (dv.StableNeoHookean(), dv.Anchor(300.0, vertices=torch.tensor([3, 60])), floor)
-    model = dv.Model(mesh, **({"pinned": np.flatnonzero(left[:, 0] == 0), "energies": energies} | options))
-    values = {name: getattr(model, name) for name in NAMES}
+    model = dv.Model(mesh, pinned=np.flatnonzero(left[:, 0] == 0), energies=energies)
+    system = system_of(model, dv.VBD(0.01, 1, **options))
+    values = {name: getattr(system, name) for name in NAMES}
     if coarse:
         space = CoarseSpace(functions=12, groups=3, every=every)
         geometry = build_coarse(mesh.points, mesh.tets, model.pinned.numpy(), np.arange(POINTS) >= len(left), space)
@@ -63,14 +65,13 @@ def inputs_of(model: Any, jitter: float = 0.02) -> dict[str, Any]:
         "gravity": torch.tensor([0.3, -9.81, 0.1]).double(),
         "prescribed": x + 0.01 * normal(SCENES, POINTS, 3),
         "rest_points": rest + 5e-3 * normal(SCENES, POINTS, 3),
-        "parameters": {"anchor_stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2))},
-        "time_step": 0.02,
+        "anchor_stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2)),
     }
 
 
 def coarse_of(model: Any, x: Tensor, energies: Any = None, **changes: Any) -> tuple[coarse.Coarse, Any]:
     """The correction of a run from x, and its scene."""
-    options = {"mu": 8e3, "lam": 2e4, "rest_points": None, "density": None, "parameters": None}
+    options = {"mu": 8e3, "lam": 2e4, "time_step": H, "rest_points": None, "density": None, "parameters": None}
     scene = build_scene(model, build_layout(model), x, **(options | changes))
     return coarse.Coarse(scene, sweep.build_energies(scene) if energies is None else energies), scene
 
@@ -120,6 +121,7 @@ def test_functions_that_span_everything_make_a_newton_step() -> None:
         function_ptr=[0, 4], vertex=[1, 2, 3, 4], function=[0, 1, 2, 3], weight=[1.0] * 4, tet_group=[0, 1],
         group_body=[0, 0], filling=[False] * 4,
     )  # fmt: skip
+    model = system_of(model, dv.VBD(H, 1))
     model = SimpleNamespace(**{n: getattr(model, n) for n in NAMES}, coarse=CoarseSpace(), coarse_geometry=geometry)
     rest = model.rest_points
     correction, scene = coarse_of(model, rest)
@@ -142,35 +144,31 @@ def test_functions_that_span_everything_make_a_newton_step() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sweeps", "rigid"), [(0, False), (1, False), *(slow(*a) for a in ((0, True), (1, True), (4, False), (4, True)))]
+    ("sweeps", "subspace"),
+    [(0, None), (1, None), *(slow(*a) for a in ((0, "rigid"), (1, "rigid"), (4, None), (4, "rigid")))],
 )
-def test_step_against_central_differences(sweeps: int, rigid: bool) -> None:
+def test_step_against_central_differences(sweeps: int, subspace: Any) -> None:
     """With as many sweeps, and the lengths of the corrections as they were found."""
-    model = stand_in(relaxation=1.3, rigid=rigid, start="predictor")
+    model, solver = stand_in(relaxation=1.3, subspace=subspace, start="predictor"), dv.VBD(H, sweeps)
     inputs = inputs_of(model)
     rng = generator("loss of a coarse step")
     weights = [torch.as_tensor(rng.standard_normal((SCENES, POINTS, 3))) for _ in range(2)]
-    names = [name for name in inputs if isinstance(inputs[name], Tensor)]
-    flat = {name: inputs[name] for name in names} | inputs["parameters"]
     lengths: list[Tensor] = []
-    reference.step(model, sweeps=sweeps, record=lengths, **inputs)
+    reference.step(model, solver=solver, record=lengths, **inputs)
     assert lengths[0].shape == (model.coarse.corrections(sweeps), SCENES, BODIES) and (lengths[0] > 0).any()
 
     def loss(values: dict[str, Tensor]) -> Tensor:
-        given = {name: values[name] for name in names}
-        parameters = {name: values[name] for name in inputs["parameters"]}
-        x, v = reference.step(model, time_step=0.02, sweeps=sweeps, coarse_steps=lengths[0], parameters=parameters,
-                              **given)  # fmt: skip
-        return (weights[0] * x + 0.02 * weights[1] * v).sum()
+        x, v = reference.step(model, solver=solver, coarse_steps=lengths[0], **values)
+        return (weights[0] * x + H * weights[1] * v).sum()
 
-    leaves = {name: value.clone().requires_grad_() for name, value in flat.items()}
+    leaves = {name: value.clone().requires_grad_() for name, value in inputs.items()}
     gradients = torch.autograd.grad(loss(leaves), list(leaves.values()))
     for name, gradient in zip(leaves, gradients, strict=True):
-        direction = torch.as_tensor(rng.standard_normal(tuple(gradient.shape))) * flat[name].abs().max()
+        direction = torch.as_tensor(rng.standard_normal(tuple(gradient.shape))) * inputs[name].abs().max()
         value = float((gradient * direction).sum())
 
         def error(size: float, name: str = name, value: float = value, direction: Tensor = direction) -> float:
-            ends = [float(loss(flat | {name: flat[name] + sign * size * direction})) for sign in (1, -1)]
+            ends = [float(loss(inputs | {name: inputs[name] + sign * size * direction})) for sign in (1, -1)]
             return abs(value - (ends[0] - ends[1]) / (2 * size))
 
         assert gradient.any(), name
@@ -182,7 +180,7 @@ def test_step_against_central_differences(sweeps: int, rigid: bool) -> None:
     [(0, 3, "c"), (1, 3, "sc"), (2, 3, "scs"), (4, 3, "scsss"), (5, 3, "scssscs"), (4, 1, "scscscs")],
 )
 def test_order_of_a_step(sweeps: int, every: int, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = stand_in(every=every, relaxation=1.4, rigid=True)
+    model = stand_in(every=every, relaxation=1.4)
     seen, relaxations, corrected, swept = [], [], coarse.Coarse.correct, sweep.run_sweeps
 
     def correct(*args: Any) -> Any:
@@ -196,5 +194,5 @@ def test_order_of_a_step(sweeps: int, every: int, expected: str, monkeypatch: py
 
     monkeypatch.setattr(coarse.Coarse, "correct", correct)
     monkeypatch.setattr(sweep, "run_sweeps", run_sweeps)
-    reference.step(model, sweeps=sweeps, **inputs_of(model))
+    reference.step(model, solver=dv.VBD(H, sweeps), **inputs_of(model))
     assert "".join(seen) == expected and relaxations == [None] * (sweeps - 1) + [1.0] * min(sweeps, 1)

@@ -94,7 +94,9 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
 @pytest.mark.parametrize("travel", (1e-4, 1e-2))
 def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
     """mu lambda f0(|u|) by a formula of its own, below and above the travel at which friction is full."""
-    model, x_prev, pairs = setup(contact=SimpleNamespace(kappa=200.0, dhat=DHAT, damping=0.0, detections=1))
+    model, x_prev, pairs = setup(
+        contact=SimpleNamespace(name="pair", kappa=200.0, dhat=DHAT, damping=0.0, detections=1)
+    )
     x = x_prev + travel * torch.as_tensor(generator("travel").standard_normal((8, 3)))
     start = torch.cat((x_prev, COLLIDERS))[None]
     now = COLLIDERS + travel * 0.3

@@ -11,13 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd._contact.start import Decided, _Start
-from diffvbd.model.bodies import Bodies, OtherBodies
-from diffvbd.ops.contact import PartBodies
-from diffvbd.reference.energies import FloorBarrier
 from diffvbd._common.constants import FILTER_ETA
+from diffvbd.model.bodies import Bodies, OtherBodies
+from diffvbd.ops.contact import Decided, PartBodies, part_start
+from diffvbd.reference.energies import FloorBarrier
 from diffvbd.step.arguments import CHORD
-from diffvbd.step.predict import begin
+from diffvbd.step.predict import start_of as begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {
@@ -92,7 +91,7 @@ def by_contact(a: dict[str, Tensor]) -> Tensor:
     none, still, all_of_it = x.new_zeros((0,)), torch.zeros_like(x), torch.ones_like(x[..., 0])
     decided = Decided(x.new_zeros((scenes, 1)), (all_of_it, all_of_it), torch.zeros((scenes, 1)) > 0, none, bodies)
     u = x.new_zeros((scenes, 1, 3))
-    target, short = _Start.apply(x, a["step"].contiguous(), still, u, still, packed(a), decided)
+    target, short = part_start(x, a["step"].contiguous(), still, u, still, packed(a), decided)
     assert not short.any()
     return target - x
 
