@@ -8,7 +8,7 @@ _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 from . import colliders, contact, distributed, mesh, results, solvers, viz
 from ._contact.barrier import Friction, PairBarrier
 from ._version import __version__ as __version__
-from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
+from .adjoint.routes import GlobalAdjoint, ReverseSweep, Unrolled
 from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .inspect.diagnose import diagnose
 from .inspect.forces import reactions, stress
@@ -40,7 +40,6 @@ __all__ = [
     "Friction",
     "GlobalAdjoint",
     "ImplicitEuler",
-    "LinearSolve",
     "Model",
     "PairBarrier",
     "ReverseSweep",

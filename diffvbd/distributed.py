@@ -85,7 +85,7 @@ def gathered(values: Tensor, count: int) -> Tensor:
 
 
 def backward(loss: Callable[[slice], Tensor], parameters: Iterable[Tensor], scenes: int, parts: int = 8) -> Tensor:
-    """Adds the gradient of a loss over all scenes to ``.grad`` of the parameters, with the same bits on any number of
+    """The gradient of a loss over all scenes, added to ``.grad`` of the parameters, with the same bits on any number of
     ranks.
 
     The scenes are cut into parts, and the parts are dealt to the ranks. A part is evaluated in one go wherever it is,

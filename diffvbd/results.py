@@ -1,5 +1,6 @@
 """Records that functions of the package return."""
 
+from .adjoint.routes import LinearSolve
 from .inspect.diagnose import Diagnosis
 from .inspect.forces import Stress
 from .inspect.gradcheck import GradientCheck
@@ -19,6 +20,7 @@ __all__ = [
     "GradientCheck",
     "GradientTest",
     "History",
+    "LinearSolve",
     "Prediction",
     "Refinement",
     "Share",

@@ -1,14 +1,25 @@
-"""Claim: the public modules can be imported by their names, in a fresh process and in either spelling."""
+"""Claim: the public names are few, typed and described; their modules are imported by name, in either spelling."""
 
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import diffvbd as dv
+
+MOST = 43  # public names beside the modules' own
+# Docstrings name a thing; they do not begin with what it does.
+VERB = re.compile(
+    r"(Bring|Check|Compute|Draw|Fill|Get|Open|Return|Run|Save|Set|Show|Write)s? "
+    r"|(Add|Evaluate|Find|Give|Look|Make|Mark|Split|Take)s? |Inside"
+)
+
 SPELLINGS = (
-    "from diffvbd.contact import status, record; import diffvbd; assert diffvbd.contact.status is status",
-    "import diffvbd._contact.barrier as b; import diffvbd as dv; assert b.PairBarrier is dv.PairBarrier",
+    "from diffvbd.contact import status; import diffvbd; assert diffvbd.contact.status is status",
+    "import diffvbd.contact as c; import diffvbd as dv; assert c is dv.contact and c.forces",
     "from diffvbd import mesh, solvers, testing, energies, losses; assert mesh.cube and testing.evaluate",
     "import diffvbd; assert all(hasattr(diffvbd, name) for name in diffvbd.__all__)",
     "import diffvbd, sys; assert 'torch._dynamo' not in sys.modules",  # which takes a second to load
@@ -47,7 +58,28 @@ def test_a_folder_of_the_same_name_does_not_hide_the_package(tmp_path: Path) -> 
 
 
 def test_an_unknown_name_is_named() -> None:
-    import diffvbd as dv
-
     with pytest.raises(AttributeError, match="'diffvbd.contact' has no attribute 'stauts'"):
         _ = dv.contact.stauts  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_public_names_are_few() -> None:
+    assert dir(dv) == sorted(dir(dv)) and len(dir(dv)) <= MOST
+    assert not [name for name in dir(dv) if name.startswith("_")]
+
+
+PUBLIC = {
+    f"{module.__name__}.{name}": getattr(module, name)
+    for module in (dv, dv.colliders, dv.contact, dv.distributed, dv.mesh, dv.results, dv.solvers, dv.viz)
+    for name in module.__all__
+    if callable(getattr(module, name))
+}
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_things_are_typed_and_described(name: str) -> None:
+    thing = PUBLIC[name]
+    signature = inspect.signature(thing)
+    untyped = [p.name for p in signature.parameters.values() if p.annotation is p.empty]
+    assert not untyped and (inspect.isclass(thing) or signature.return_annotation is not signature.empty)
+    text = inspect.getdoc(thing) or ""
+    assert text[:1].isupper() and (text.startswith("Checks of") or not VERB.match(text)), text[:60]

@@ -1,4 +1,4 @@
-"""Claim: debug_checks() and contact.record() hold for the thread or task that is inside, and for its backward."""
+"""Claim: debug_checks() and record() hold for the thread or task that is inside, and for its backward."""
 
 import threading
 from collections.abc import Callable

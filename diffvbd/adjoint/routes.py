@@ -49,7 +49,7 @@ class TapedSweep(ReverseSweep):
 
 @dataclass(frozen=True)
 class Unrolled:
-    """torch.autograd through the executed colored sweep in plain torch (``diffvbd.reference``).
+    """The executed colored sweep in plain torch (``diffvbd.reference``), differentiated by torch.autograd.
 
     Exact for every number of sweeps, as ReverseSweep is, at a hundred times its time and tens of times its memory: for
     checking a gradient, or for a formula that is not compiled yet. Not recommended otherwise. The forward is plain
@@ -88,7 +88,7 @@ class GlobalAdjoint:
             1e-5 in float32. An ill-conditioned system may not get there: then the solve fails.
         max_iterations: Of conjugate gradients; None: ten times the unknowns of a scene, at most 10,000.
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where a solve does not meet the tolerance.
-        report: Called with a :class:`diffvbd.LinearSolve` after each backward of a step, e.g. ``solves.append``.
+        report: Called with a :class:`diffvbd.results.LinearSolve` after each step's backward, e.g. ``solves.append``.
 
     Raises:
         RuntimeError: In the backward, for a solve that fails, for adjoints that are not finite, and while a CUDA graph

@@ -81,7 +81,7 @@ def status(model: Model) -> Status:
 
 
 def reserve(model: Model, pairs: int) -> None:
-    """Gives a Model room for ``pairs`` pairs per scene, more or less than it had, from its next step on. A captured
+    """Room of a Model for ``pairs`` pairs per scene, more or less than it had, from its next step on. A captured
     graph keeps the room that it was captured with. Without a ``capacity`` of the PairBarrier an eager step still takes
     more where it needs more.
 

@@ -122,8 +122,8 @@ def diagnose(
     warn: bool = True,
     **inputs: Any,
 ) -> Diagnosis:
-    """Looks for what makes a result unreliable: collapsed or inverted tets, lost digits, safeguards out of scale, too
-    few sweeps. Not differentiable; call it on a first and a last frame, not in every step.
+    """What makes a result unreliable: collapsed or inverted tets, lost digits, safeguards out of scale, too few
+    sweeps. Not differentiable; call it on a first and a last frame, not in every step.
 
     Args:
         model: The scene.

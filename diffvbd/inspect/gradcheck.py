@@ -41,7 +41,7 @@ def check_gradients(
     seed: int = 0,
     verbose: bool = True,
 ) -> GradientCheck:
-    """Checks the gradient of ``loss(**arguments)`` against central differences along random directions.
+    """Comparison of the gradient of ``loss(**arguments)`` with central differences along random directions.
 
     For each argument the difference quotient is taken at several steps and the one nearest the adjoint counts: large
     steps truncate, small ones round, and where a contact or filter switches there may be no good step at all.

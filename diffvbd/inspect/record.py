@@ -41,7 +41,7 @@ def record(kind: Literal["subspace", "contact", "integrator"]) -> Iterator[list[
 
 @contextlib.contextmanager
 def debug_checks(enabled: bool = True) -> Iterator[None]:
-    """Inside, a position that is not finite raises RuntimeError naming step, sweep, color, vertex and scene.
+    """A context in which a position that is not finite raises RuntimeError with step, sweep, color, vertex and scene.
 
     Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot
     work with raise only here, because looking at them waits for the device. It holds for the thread or task that is

@@ -37,7 +37,7 @@ def write_series(
     point_data: Mapping[str, Any] | None = None,
     cell_data: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a motion; the extension tells for whom.
+    """File of a motion; the extension tells for which program.
 
     * .pvd, for ParaView: the tets, as `path` and one file `<stem>_<k>.vtu` for each frame next to it.
     * .usdc, .usd (binary) and .usda (text): the surface of each body as a `Mesh` of its own with points that change in

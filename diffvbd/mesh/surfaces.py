@@ -69,7 +69,7 @@ class Repair(NamedTuple):
 def repair(
     surface: Source | tuple[Any, Any], size: float | None = None, scale: float | None = None, up: str = "y"
 ) -> Repair:
-    """Bring a triangle surface to metres and to y up, and repair it. Needs the extra: `pip install diffvbd[mesh]`.
+    """A triangle surface, brought to metres and to y up, and repaired. Needs the extra: `pip install diffvbd[mesh]`.
 
     Vertices in the same place (within 1e-8 of the diagonal of the bounding box) are welded, triangles without area or
     there twice are dropped, all are wound like their neighbours and outwards. A piece within the bounding box of
@@ -253,7 +253,7 @@ def tetrahedralize(
     epsilon: float | None = None,
     max_triangles: int | None = 3000,
 ) -> TetMesh:
-    """Fill a triangle surface with tets. Needs the extra: `pip install diffvbd[mesh]`.
+    """Tets that fill a triangle surface. Needs the extra: `pip install diffvbd[mesh]`.
 
     fTetWild accepts surfaces with holes and self-intersections; what it returns stays within `epsilon` of the input.
     Its time grows with the input triangles more than with the output: a scan of 100,000 triangles does not end in

@@ -61,7 +61,7 @@ def save(
     *,
     points: Any = None,
 ) -> None:
-    """Write a mesh through meshio; the extension tells the format (.vtu, .vtk, .msh, .mesh, .inp, .xdmf, ...).
+    """File of a mesh, written by meshio; the extension tells the format (.vtu, .vtk, .msh, .mesh, .inp, .xdmf, ...).
 
     In .stl, .obj and .ply the boundary is written: triangles whose normals point outwards. With more than one body the
     label of each tet is written as cell data `body`, in formats that hold cell data. `load_fields` reads point_data and

@@ -159,7 +159,7 @@ def refine(
     gradient: Tensor | Sequence[Tensor] | None = None,
     mesh: bool = False,
 ) -> Refinement:
-    """Evaluates an optimised result once more with twice the sweeps and half the time step, and if asked on a finer
+    """An optimised result, evaluated once more with twice the sweeps and half the time step, and if asked on a finer
     mesh and with its gradient.
 
     An optimiser may find what only coarse settings reward. Such a result loses what it gained when its motion is

@@ -24,7 +24,7 @@ class PerStep:
 
 
 def per_step(values: Tensor) -> PerStep:
-    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...].
+    """A tensor of values for each step of a rollout, shape [steps, ...].
 
     Raises:
         TypeError: What is no tensor, or has no dimension. Another number of steps than that of the rollout raises
@@ -64,8 +64,8 @@ class StepAverage:
 
 
 def step_average(function: Callable[[float], Any], samples: int = 32) -> StepAverage:
-    """Marks a function of the time [s] since the start of the rollout, whose mean over each step is the value of that
-    step: for loads that begin, end or swing within a step. No impulse is lost, and times in the function, such as that
+    """A function of the time [s] since the start of the rollout, whose mean over each step is the value of that step:
+    for loads that begin, end or swing within a step. No impulse is lost, and times in the function, such as that
     of a release, keep their gradient, which values at the middle of each step lose.
 
     An edge should last some h / ``samples``. For sharper ones divide the differences of the integral by h, and pass

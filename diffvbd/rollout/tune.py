@@ -1036,7 +1036,7 @@ def error_budget(
     progress: bool = False,
     **inputs: Any,
 ) -> ErrorBudget:
-    """Splits the error of a rollout by cause, by trial runs that have less of one error at a time.
+    """The error of a rollout by cause, from trial runs that have less of one error at a time.
 
     sweeps: the same steps with sweeps until more change nothing and their forces balance. time step: those against
     SDIRK2 with four times the steps. precision: the same run in double precision. contact: the converged steps with

@@ -36,7 +36,7 @@ def draw(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Draw one shape into a matplotlib 3D axes.
+    """One shape, drawn into a matplotlib 3D axes.
 
     Args:
         axes: Axes with projection "3d".

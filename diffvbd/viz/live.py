@@ -36,7 +36,7 @@ def live(
     play: bool = True,
     browser: bool = False,
 ) -> Viewer:
-    """Show a motion in a page of a local server: play, scrub, color, watch an optimisation, move sliders.
+    """A page of a local server that shows a motion: play, scrub, color, watch an optimisation, move sliders.
 
     Args:
         source: What to show:

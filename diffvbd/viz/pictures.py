@@ -44,7 +44,7 @@ def animation(
     view: tuple[float, float] = VIEW,
     color: Any = None,
 ) -> None:
-    """Save motions side by side as a .gif that runs in real time, or slower where it would last less than 2 s; or
+    """Motions side by side, saved as a .gif that runs in real time, or slower where it would last less than 2 s; or
     as an .npz, which :func:`live` shows.
 
     Args:
@@ -95,7 +95,7 @@ def comparison(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save a grid of shapes, one row per motion and one column per time, with the course of an optimisation.
+    """Picture of shapes in a grid, one row per motion and one column per time, with the course of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -146,7 +146,7 @@ def learning(
     scenery: Sequence[Scenery] = (),
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save shapes, one row per motion and one column per time, with losses over the seconds that they took.
+    """Picture of shapes, one row per motion and one column per time, with losses over the seconds that they took.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -194,8 +194,8 @@ def paths(
     target: Scenery,
     history: Sequence[Mapping[str, float]],
 ) -> None:
-    """Save a body at a few times of each motion, the paths of its center from the side and from above, and the distance
-    from the target over the iterations of an optimisation.
+    """Picture of a body at a few times of each motion, of the paths of its center from the side and from above, and of
+    the distance from the target over the iterations of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -255,8 +255,8 @@ def landing(
     radius: float,
     history: Sequence[Mapping[str, float]],
 ) -> None:
-    """Save bodies and the round target they land on: the last frame from above, the course of the optimisation, and
-    every frame from the side.
+    """Picture of bodies and the round target they land on: the last frame from above, the course of the optimisation,
+    and every frame from the side.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -329,7 +329,7 @@ def field(
     truth: Mapping[str, float] | None = None,
     view: tuple[float, float] = VIEW,
 ) -> None:
-    """Save maps of fields side by side, on the surface and on a cut, with one colorbar of logarithmic scale.
+    """Maps of fields side by side, on the surface and on a cut, with one colorbar of logarithmic scale.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -406,7 +406,7 @@ SHOWN = 20_000  # points; of more, so many of them
 def cloud(
     path: str | Path, frames: Any, time_step: float, history: Sequence[Mapping[str, float]], estimate: str
 ) -> None:
-    """Save points at several times with the course of an optimisation.
+    """Picture of points at several times with the course of an optimisation.
 
     Args:
         path: The picture to write; the suffix chooses the format.
@@ -438,7 +438,7 @@ def cloud(
 
 
 def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
-    """Save moving points as a .gif in the time of `animation`, or as an .npz of small cubes; arguments and errors
+    """Moving points, saved as a .gif in the time of `animation`, or as an .npz of small cubes; arguments and errors
     as for `cloud`."""
     if Path(path).suffix == ".npz":
         save_motions(path, *_cubes(_chosen(frames)), time_step)

@@ -45,7 +45,7 @@ def render(
     apart: Sequence[float] = (0.0, 0.0, 0.0),
     ground: float | Literal["auto"] | None = "auto",
 ) -> None:
-    """Write a picture (.png, .jpg) or an animation (.webp, .gif) with light, floor and shadow.
+    """A picture (.png, .jpg) or an animation (.webp, .gif) with light, floor and shadow.
 
     It is drawn without a window, by vtk 9.5 or newer in software where there is no GPU.
 

@@ -126,7 +126,7 @@ def test_a_rollout_is_its_steps_under_every_schedule(device: str, adjoint: Any, 
 
 def test_report_tells_of_each_backward_step(device: str) -> None:
     model, inputs = scene_on(device, "batch", 4)
-    solves: list[dv.LinearSolve] = []
+    solves: list[dv.results.LinearSolve] = []
     goal = 1e-9
     adjoint = dv.GlobalAdjoint(tolerance=goal, report=solves.append)
     x = inputs.pop("x").requires_grad_()
@@ -141,7 +141,7 @@ def test_report_tells_of_each_backward_step(device: str) -> None:
 @pytest.mark.parametrize("assembled", (True, False))
 def test_a_solve_that_fails_is_never_silent(device: str, assembled: bool) -> None:
     scene = build_scene("batch")
-    solves: list[dv.LinearSolve] = []
+    solves: list[dv.results.LinearSolve] = []
     options: dict[str, Any] = {"max_iterations": 2, "report": solves.append}
     message = r"relative residual of 1e-10, got .* in scene \d after 2 iterations"
     with pytest.raises(RuntimeError, match=message):

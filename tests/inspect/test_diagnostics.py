@@ -13,7 +13,7 @@ from diffvbd.inspect.diagnose import collapse_stretch, diagnose
 from diffvbd.mesh import box, join
 from diffvbd.testing import contact_scenes, tolerance
 
-MATERIAL = {"mu": 1e5, "lam": 1.5e5}
+MATERIAL: dict[str, Any] = {"mu": 1e5, "lam": 1.5e5}
 
 
 def cube(size: float = 1.0, **options) -> dv.Model:
@@ -87,7 +87,7 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
     model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor, dv.Anchor(100.0)))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     force = torch.full_like(x, 3.0)
-    options = {"force": force, **MATERIAL}
+    options: dict[str, Any] = {"force": force, **MATERIAL}
     left = []
     for sweeps in (1, 10, 1000):
         solver = dv.VBD(1 / 60, sweeps)
@@ -95,7 +95,7 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
         left.append(diagnose(model, end, solver, previous=(x, v), warn=False, **options).unbalanced)
     assert left[0] > left[1] > left[2]
     assert left[2] < tolerance("closed_form")
-    stiff = {"mu": 1e8, "lam": 1e8}
+    stiff: dict[str, Any] = {"mu": 1e8, "lam": 1e8}
     solver = dv.VBD(1 / 60, 1)
     end, _ = dv.step(model, x, v, solver, **stiff)
     with pytest.warns(UserWarning, match="sweeps or a smaller time step, or relaxation between"):
@@ -107,7 +107,7 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_free_fall_leaves_no_force(dtype: torch.dtype) -> None:
     model = dv.Model(dv.mesh.cube(3, size=0.1, split="kuhn"), dtype=dtype)
-    given = {"mu": 1e5, "lam": 1e5}
+    given: dict[str, Any] = {"mu": 1e5, "lam": 1e5}
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     motion = dv.rollout(model, x, v, dv.VBD(0.01, 10), steps=20, **given)
     found = dv.diagnose(
@@ -190,6 +190,7 @@ def test_friction_that_has_not_converged_is_named() -> None:
     texts = [str(w.message) for w in warned]
     assert any("of the forces of body 0 unbalanced" in t for t in texts), texts
     assert any("friction has not converged" in t and "body 0" in t for t in texts), texts
+    assert bad.residuals is not None and bad.friction_residuals is not None
     assert bad.residuals.tolist()[1:] == [0.0, 0.0, 0.0]  # pinned, pinned, and falling: no more than rounding
     assert bad.friction_residuals[0] > 0.05 and not bad.friction_residuals[1:].any()
     assert "left-over share of friction" in str(bad)
@@ -197,6 +198,7 @@ def test_friction_that_has_not_converged_is_named() -> None:
     goal = tolerance("closed_form")
     done = dv.solve(model, x, v, solver, tolerance=goal, **SOFT)
     good = dv.diagnose(model, done.x, solver, previous=(x, v), **SOFT)
+    assert good.residuals is not None and good.friction_residuals is not None
     assert float(good.residuals.max()) <= goal and not any("unbalanced" in m or "friction" in m for m in good.messages)
     assert float(good.friction_residuals.max()) <= tolerance("minimum")
 
@@ -207,7 +209,8 @@ def test_bodies_without_contact_have_residuals_too() -> None:
     solver = dv.VBD(0.005, 2)
     end, _ = dv.step(model, x, 0 * x, solver, **SOFT)
     told = dv.diagnose(model, end, solver, previous=(x, 0 * x), warn=False, **SOFT)
-    assert told.residuals.shape == (2,) and (told.residuals > 0).all() and told.friction_residuals is None
+    assert told.residuals is not None and told.friction_residuals is None
+    assert told.residuals.shape == (2,) and (told.residuals > 0).all()
 
 
 @pytest.mark.parametrize("name", ["force", "gravity"])
