@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.regimes import REGIMES, forced, large_inputs
+from helpers.regimes import REGIMES, forced, large_inputs, large_solver
 from helpers.results import assert_same_bits, evaluated
 from torch import Tensor
 
@@ -27,32 +27,25 @@ NAN = float("nan")
 @pytest.mark.parametrize("dtype", (torch.float64, torch.float32), ids=("float64", "float32"))
 def test_a_model_moves_and_comes_back_the_same(dtype: torch.dtype) -> None:
     scene = build_scene("anchored")
-    here, inputs = scene.model().to(dtype=dtype), scene.inputs(dtype)
+    here, inputs, solver = scene.model().to(dtype=dtype), scene.inputs(dtype), scene.solver(3, tape="full")
     there = here.to("cuda")
     assert here.device.type == "cpu" and there.device.type == "cuda" and there.dtype == dtype
     assert all(t.device.type == "cuda" for t in vars(there).values() if isinstance(t, Tensor))
     assert "cuda" in repr(there)
     back = there.to("cpu")
-    assert_same_bits(strip(evaluated(back, inputs)), strip(evaluated(here, inputs)))
-    built = dv.Model(here.mesh, scene_density(scene), torch.from_numpy(scene.pinned), scene.energies(), dtype=dtype,
-                     device="cuda")  # fmt: skip
+
+    def found(model: dv.Model, given: dict[str, Any]) -> dict[str, Tensor]:
+        """Without the gradients that vanish."""
+        return {name: value for name, value in evaluated(model, given, solver).items() if value.any()}
+
+    assert_same_bits(found(back, inputs), found(here, inputs))
+    density, pinned = (torch.from_numpy(a) for a in (scene.arrays["density"], scene.pinned))
+    built = dv.Model(here.mesh, density, pinned, scene.energies(), dtype=dtype, device="cuda")
     moved = on_device(inputs, "cuda")
-    expected = strip(evaluated(there, moved))
-    assert_same_bits(strip(evaluated(built, moved)), expected)
-    assert_same_bits(strip(evaluated(there.to("cpu").to("cuda"), moved)), expected)
-    assert_same_bits(strip(evaluated(copy.deepcopy(there), moved)), expected)
-    assert_same_bits(
-        strip(evaluated(there.to(dtype=torch.float32).to(dtype=torch.float64).to(dtype=dtype), moved)), expected
-    )
-
-
-def scene_density(scene: Any) -> Tensor:
-    return torch.from_numpy(scene.arrays["density"])
-
-
-def strip(values: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Without the gradients that vanish."""
-    return {name: value for name, value in values.items() if value.any()}
+    expected = found(there, moved)
+    through = there.to(dtype=torch.float32).to(dtype=torch.float64).to(dtype=dtype)
+    for same in (built, there.to("cpu").to("cuda"), copy.deepcopy(there), through):
+        assert_same_bits(found(same, moved), expected)
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------
@@ -66,9 +59,8 @@ def test_a_tensor_on_another_device_raises(name: str) -> None:
     scene = build_scene("anchored")
     for place, other in (("cuda", "cpu"), ("cpu", "cuda")):
         model, inputs = scene.model(place), scene.inputs(device=place)
-        where = inputs["parameters"] if "." in name else inputs
-        where[name] = where[name].to(other)
-        with pytest.raises(ValueError, match=rf"{re.escape(name)}: expected device {place}.*got {other}"):
+        inputs[name] = inputs[name].to(other)
+        with pytest.raises(ValueError, match=rf"{name}: expected device {place}.*got {other}"):
             dv.step(model, solver=scene.solver(1), **inputs)
 
 
@@ -80,20 +72,15 @@ def test_a_bad_value_outside_debug_checks_comes_out_as_nan(name: str, regime: st
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")
     with forced(regime):
         good = dv.step(model, solver=scene.solver(2), **inputs)
-        where: dict[str, Any] = inputs["parameters"] if "." in name else inputs
-        value = where[name]
+        value = inputs[name]
         shape = (3, *value.shape) if value.dim() == 0 or value.shape[0] != 3 else value.shape
         bad = value.expand(shape).clone()
         bad[1] = NAN
-        x, _ = dv.step(model, **{**inputs, **given(name, bad, inputs)}, solver=scene.solver(2))
+        x, _ = dv.step(model, solver=scene.solver(2), **(inputs | {name: bad}))
         assert not torch.isfinite(x[1]).all()
         assert torch.isfinite(x[[0, 2]]).all()
         again = dv.step(model, solver=scene.solver(2), **inputs)
     assert torch.equal(again[0], good[0]) and torch.equal(again[1], good[1])
-
-
-def given(name: str, value: Tensor, inputs: dict[str, Any]) -> dict[str, Any]:
-    return {"parameters": {**inputs["parameters"], name: value}} if "." in name else {name: value}
 
 
 # --- streams and devices ----------------------------------------------------------------------------------------------
@@ -109,7 +96,7 @@ def test_work_is_queued_on_the_current_stream(regime: str) -> None:
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device="cuda")
 
     def run(leaves: list[Tensor]) -> list[Tensor]:
-        end, v = dv.step(model, **dict(zip(names, leaves, strict=True)), **rest, solver=scene.solver(3))
+        end, v = dv.step(model, solver=scene.solver(3), **dict(zip(names, leaves, strict=True)), **rest)
         return [end.detach(), *torch.autograd.grad((weights * (end + 0.01 * v)).sum(), leaves)]
 
     with forced(regime):
@@ -132,11 +119,12 @@ def test_work_is_queued_on_the_current_stream(regime: str) -> None:
 def test_a_second_device(regime: str | None) -> None:
     """While the first is the current one, forward and backward run where the tensors are."""
     scene = build_scene("batch", "random")
+    solver = scene.solver(3, tape="full")
     with forced(regime):
-        expected = evaluated(scene.model("cuda:0"), scene.inputs(device="cuda:0"))
-        actual = evaluated(scene.model("cuda:1"), scene.inputs(device="cuda:1"))
+        expected = evaluated(scene.model("cuda:0"), scene.inputs(device="cuda:0"), solver)
+        actual = evaluated(scene.model("cuda:1"), scene.inputs(device="cuda:1"), solver)
         assert torch.cuda.current_device() == 0
-        moved = evaluated(scene.model("cuda:0").to("cuda:1"), scene.inputs(device="cuda:1"))
+        moved = evaluated(scene.model("cuda:0").to("cuda:1"), scene.inputs(device="cuda:1"), solver)
     for name, value in expected.items():
         assert actual[name].device == torch.device("cuda:1")
         assert torch.equal(actual[name].cpu(), value.cpu()) and torch.equal(moved[name], actual[name]), name
@@ -159,36 +147,34 @@ def test_a_tape_that_does_not_fit_says_which_would() -> None:
     model = dv.Model(dv.mesh.cube(11), device="cuda")
     modulus = torch.tensor(1e4, dtype=torch.float64, device="cuda")
     small = model.rest_points[None] + 0.001
-    inputs = {"x": small, "v": 0 * small, "mu": modulus, "lam": modulus}
-    expected = evaluated(model, inputs)
+    inputs, solver = {"x": small, "v": 0 * small, "mu": modulus, "lam": modulus}, dv.VBD(0.01, 3, tape="full")
+    expected = evaluated(model, inputs, solver)
     x = model.rest_points.expand(64, -1, -1).clone().requires_grad_()
     sweeps = sweeps_that_do_not_fit(model, 64)
     used = torch.cuda.memory_allocated()
-    options: dict[str, Any] = {"mu": 1e4, "lam": 1e4}
     with pytest.raises(torch.OutOfMemoryError) as error:
-        dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, sweeps, tape="full"), **options)
+        dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, sweeps, tape="full"), mu=1e4, lam=1e4)
     message = str(error.value)
     assert re.search(r"\d.*(bytes|[KMGT]i?B)", message) and re.search("compact|recompute", message), message
     assert "tape" in message, message
     del error
     gc.collect()  # a traceback and its frames refer to each other
     assert torch.cuda.memory_allocated() <= used
-    assert_same_bits(evaluated(model, inputs), expected)
+    assert_same_bits(evaluated(model, inputs, solver), expected)
 
 
 @pytest.mark.parametrize(("cells", "lead", "tape"), ((10, (), "full"), (10, (50,), "full"), (1, (50_000,), "recompute"),
                          (10, (50,), "compact"), (31, (), "compact")))  # fmt: skip
-def test_memory_prediction(cells: int, lead: tuple[int, ...], tape: str) -> None:
-    """Peak of a step and its backward against Model.memory(), with what the arguments and gradients themselves take."""
+def test_memory_prediction(cells: int, lead: tuple[int, ...], tape: Any) -> None:
+    """Peak of a step and its backward against dv.memory(), with what the arguments and gradients themselves take."""
     model, inputs = large_inputs(cells, *lead)
-    inputs = {name: inputs[name] for name in ("x", "v", "mu", "lam", "time_step")}
-    sweeps = 30
-    predicted = model.memory(dv.VBD(0.01, sweeps, tape=tape), scenes=math.prod(lead), checkpoint_every=None)["total"]
-    leaves = {k: t.clone().requires_grad_() if isinstance(t, Tensor) else t for k, t in inputs.items()}
+    solver = large_solver(30, tape=tape)
+    predicted = dv.memory(model, solver, scenes=math.prod(lead), checkpoint_every=None)["total"]
+    leaves = {name: inputs[name].clone().requires_grad_() for name in ("x", "v", "mu", "lam")}
 
     def run() -> None:
-        end, _ = dv.step(model, **leaves, solver=scene.solver(sweeps), adjoint=dv.ReverseSweep(tape))  # type: ignore[arg-type]
-        torch.autograd.grad(end.sum(), [t for t in leaves.values() if isinstance(t, Tensor)])
+        end, _ = dv.step(model, solver=solver, **leaves)
+        torch.autograd.grad(end.sum(), list(leaves.values()))
 
     run()
     torch.cuda.synchronize()
@@ -196,5 +182,5 @@ def test_memory_prediction(cells: int, lead: tuple[int, ...], tape: str) -> None
     before = torch.cuda.memory_allocated()
     run()
     peak = torch.cuda.max_memory_allocated() - before
-    own = sum(t.numel() * t.element_size() for t in leaves.values() if isinstance(t, Tensor))
+    own = sum(t.numel() * t.element_size() for t in leaves.values())
     assert peak <= (1 + tolerance("memory")) * predicted + own, (peak, predicted, own)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 from helpers.exactness import BATCHED, check, check_shapes
-from helpers.regimes import REGIMES, forced, large_inputs
+from helpers.regimes import REGIMES, forced, large_inputs, large_solver
 from helpers.results import TAPES, assert_same_bits, evaluated
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
 from diffvbd import testing
+from diffvbd.model.system import system_of
 from diffvbd.ops import regimes
-from diffvbd.ops.regimes import regime
 from diffvbd.testing import (
     CASES,
     KINDS,
@@ -104,16 +104,18 @@ BODY = dv.StableNeoHookean()
 ODD: dict[str, tuple[Callable[[], dv.TetMesh], dict[str, Any], tuple[str, ...]]] = {  # mesh, options, regimes
     "fan for a thread": (lambda: ball(4, 7), {"energies": (BODY, BELOW)}, REGIMES),
     "fan of 98": (lambda: ball(8, 12), {"energies": (BODY, BELOW, dv.Anchor(10.0)), "pinned": [1]}, REGIMES[1:]),
-    "fan of 602": (lambda: ball(20, 30), {"energies": (BODY,), "relaxation": 1.3}, REGIMES[1:]),
+    "fan of 602": (lambda: ball(20, 30), {"energies": (BODY,)}, REGIMES[1:]),
     "bodies": (bodies, {"energies": (BODY, FLOOR), "pinned": [0]}, REGIMES),
     "isolated vertices": (cube_with_loose_vertices, {"energies": (BODY, FLOOR), "pinned": [0, 8, 9, 10]}, REGIMES),
     "one tet": (lambda: dv.TetMesh(np.eye(4)[:, 1:], [[0, 1, 2, 3]]), {"energies": (BODY,)}, REGIMES),
     "no energies": (dv.mesh.cube, {"energies": ()}, REGIMES),
     "floor alone": (dv.mesh.cube, {"energies": (FLOOR,)}, REGIMES),
-    "anchor alone": (dv.mesh.cube, {"energies": (dv.Anchor(50.0, vertices=[1, 4]),), "saturation": 0.05}, REGIMES),
+    "anchor alone": (dv.mesh.cube, {"energies": (dv.Anchor(50.0, vertices=[1, 4]),)}, REGIMES),
     "all pinned": (dv.mesh.cube, {"energies": (BODY, FLOOR), "pinned": range(8)}, REGIMES),
     "no tets": (lambda: dv.TetMesh(np.eye(3)[:2], np.zeros((0, 4), dtype=int)), {"pinned": [0, 1]}, REGIMES),
 }
+
+SOLVERS = {"fan of 602": {"relaxation": 1.3}, "anchor alone": {"saturation": 0.05}}
 
 
 def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, Any]]:
@@ -138,7 +140,7 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
         "density": torch.tensor(90.0, dtype=torch.float64),
     }
     if model.floor is not None:
-        inputs["parameters"] = {"floor_kappa": torch.tensor(3e4, dtype=torch.float64)}
+        inputs["floor_kappa"] = torch.tensor(3e4, dtype=torch.float64)
     return model, inputs
 
 
@@ -147,21 +149,22 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
 @pytest.mark.parametrize("scenes", ((), (5,)), ids=("one", "batch"))
 @pytest.mark.parametrize(("name", "regime"), [(name, r) for name, entry in ODD.items() for r in entry[2]])
 def test_odd_scenes_equal_the_cpu(name: str, regime: str, scenes: tuple[int, ...], sweeps: int) -> None:
-    assert_equal_to_the_cpu(*odd_scene(name, scenes), sweeps, regime)
+    assert_equal_to_the_cpu(*odd_scene(name, scenes), regime, sweeps, **SOLVERS.get(name, {}))
 
 
-def assert_equal_to_the_cpu(model: dv.Model, inputs: dict[str, Any], sweeps: int, regime: str) -> None:
+def assert_equal_to_the_cpu(model: dv.Model, inputs: dict[str, Any], regime: str, sweeps: int, **options: Any) -> None:
     """State and all gradients, under each tape."""
     for tape in TAPES:
-        expected = evaluated(model, inputs, sweeps, tape)
+        solver = dv.VBD(0.02, sweeps, tape=tape, **options)
+        expected = evaluated(model, inputs, solver)
         with forced(regime):
-            result = evaluated(model.to("cuda"), on_device(inputs, "cuda"), sweeps, tape)
+            result = evaluated(model.to("cuda"), on_device(inputs, "cuda"), solver)
         assert relative_error(result["x"], expected["x"]) <= tolerance("spread_factor") * tolerance("forward")
         for key, value in expected.items():
             if key.startswith("grad_"):
                 error = relative_error(result[key], value)
                 # masses of a body that falls freely hardly matter: what is left of their gradient is small differences
-                moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, sweeps)[key]
+                moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, solver)[key]
                 assert error <= testing.bar(moved), (key, tape)
 
 
@@ -190,7 +193,7 @@ def test_any_number_of_threads_per_vertex(
     x = model.rest_points + noise(3, model.num_vertices, 3, size=0.02)
     inputs = {"x": x, "v": noise(*x.shape, size=1.0), "mu": 1e4 * (1 + noise(*material, size=0.5)),
               "lam": (1e8 if what == "uneven" else 2e4) * (1 + noise(*material, size=0.5))}  # fmt: skip
-    assert_equal_to_the_cpu(model, inputs, 6, "color")
+    assert_equal_to_the_cpu(model, inputs, "color", 6)
 
 
 @pytest.mark.parametrize("regime", (None, *REGIMES))
@@ -217,9 +220,9 @@ def test_no_scenes(regime: str | None) -> None:
 def test_runs_repeat_to_the_bit(
     regime: str | None, cells: int, lead: tuple[int, ...], tape: str, dtype: torch.dtype
 ) -> None:
-    model, inputs = large_inputs(cells, *lead, dtype=dtype)
+    (model, inputs), solver = large_inputs(cells, *lead, dtype=dtype), large_solver(3, tape=tape)
     with forced(regime):
-        expected = evaluated(model, inputs, 3, tape)
+        expected = evaluated(model, inputs, solver)
         for i in range(3):
             # memory that held other numbers, and other work on the device at the same time
             torch.full((1 << 24,), float("nan"), device="cuda")
@@ -228,16 +231,16 @@ def test_runs_repeat_to_the_bit(
                 busy = torch.ones(1 << 24, device="cuda")
                 for _ in range(10 * i):
                     busy.mul_(1.5)
-            assert_same_bits(evaluated(model, inputs, 3, tape), expected)
+            assert_same_bits(evaluated(model, inputs, solver), expected)
             side.synchronize()
 
 
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("tape", TAPES)
-def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> None:
+def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: Any) -> None:
     """Its place in the batch matters as little. So does the size of that, unless another number of threads shares a
     vertex: they add up in another order, and the batches differ by rounding."""
-    model, inputs = large_inputs(2 if regime == "thread" else 4, 130)
+    (model, inputs), solver = large_inputs(2 if regime == "thread" else 4, 130), large_solver(3, tape=tape)
     inputs["lam"] = inputs["lam"] * torch.linspace(0.5, 1.5, 130, dtype=torch.float64, device="cuda")[:, None]
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device="cuda")
     names = ("x", "v", "mu", "lam")
@@ -246,7 +249,7 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
     def run(i: Any) -> tuple[Tensor, ...]:
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
         options = {**dict(zip(names, leaves, strict=True)), **shared}
-        x, v = dv.step(model, **options, solver=scene.solver(3), adjoint=dv.ReverseSweep(tape))
+        x, v = dv.step(model, solver=solver, **options)
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     batches = [range(130), range(20, 130), range(60, 101), range(62, 66), *(range(i, i + 1) for i in (0, 31, 64, 129))]
@@ -257,10 +260,10 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
                 results[batch] = [value[None] for value in run(batch[0])]
             else:
                 results[batch] = run(slice(batch.start, batch.stop))
-            launch = model.settings(inputs["time_step"], 3, len(batch)).launch
+            launch = launch_of(model, solver, len(batch))
             launches[batch] = launch[:1] if regime == "thread" else launch  # there a vertex has one thread anyway
     scales = [float(value.abs().max()) for value in results[batches[0]]]
-    scales[1] = scales[0] / inputs["time_step"]  # v is a difference of positions
+    scales[1] = scales[0] / solver.time_step  # v is a difference of positions
     bars = [tolerance("spread_factor") * tolerance("forward")] * 2 + [tolerance("adjoint")] * len(names)
     equal = set()
     for batch, part in itertools.permutations(batches, 2):
@@ -283,10 +286,15 @@ def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> Non
 # --- the choice -------------------------------------------------------------------------------------------------------
 
 
-def launches(model: dv.Model, inputs: dict[str, Any], tape: str) -> tuple[int, int]:
+def launch_of(model: dv.Model, solver: dv.VBD, scenes: int) -> tuple[int, ...]:
+    """How so many scenes are spread over the device."""
+    return system_of(model, solver).settings(solver.time_step, solver.sweeps, scenes).launch
+
+
+def launches(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD) -> tuple[int, int]:
     """Of sweeps and of reverse sweeps in one step: of each color where that is the regime."""
     with profile(activities=[ProfilerActivity.CUDA]) as seen:
-        evaluated(model, inputs, 3, tape)
+        evaluated(model, inputs, solver)
         torch.cuda.synchronize()
     of = {
         name: sum(e.count for e in seen.key_averages() if name in e.key) for name in ("sweep_forward", "sweep_reverse")
@@ -296,19 +304,19 @@ def launches(model: dv.Model, inputs: dict[str, Any], tape: str) -> tuple[int, i
 
 @pytest.mark.parametrize("tape", TAPES)
 def test_the_reverse_may_take_another_regime_than_the_sweeps(tape: str) -> None:
-    model, inputs = large_inputs(9, 80)
+    (model, inputs), solver = large_inputs(9, 80), large_solver(3, tape=tape)
     inputs.pop("rest_points")
-    assert model.settings(0.01, 3, 80).launch[:2] == (regimes.GRID, regimes.COLOR)
-    chosen = evaluated(model, inputs, 3, tape)
+    assert launch_of(model, solver, 80)[:2] == (regimes.GRID, regimes.COLOR)
+    chosen = evaluated(model, inputs, solver)
     with forced("grid"):
-        forward = evaluated(model, inputs, 3, tape)
-        few = launches(model, inputs, tape)
+        forward = evaluated(model, inputs, solver)
+        few = launches(model, inputs, solver)
     with forced("color"):
-        reverse = evaluated(model, inputs, 3, tape)
-        many = launches(model, inputs, tape)
+        reverse = evaluated(model, inputs, solver)
+        many = launches(model, inputs, solver)
     assert all(torch.equal(chosen[k], forward[k]) for k in ("x", "v"))
     assert few[0] < many[0] and few[1] < many[1]
-    assert launches(model, inputs, tape) == (few[0], many[1])
+    assert launches(model, inputs, solver) == (few[0], many[1])
     limit = tolerance("property_factor") * tolerance("adjoint")
     for key, value in reverse.items():
         assert value.any() and (key == "v" or relative_error(chosen[key], value) <= limit), key
@@ -319,22 +327,22 @@ def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: 
     """A step of an inference run equals the step of a training run to the bit, whatever the tape."""
     model, inputs = large_inputs(cells, *lead)
     inputs.pop("rest_points")
-    bare = dv.step(model, **inputs, solver=scene.solver(3))
+    bare = dv.step(model, solver=large_solver(3), **inputs)
     for tape in TAPES:
-        taped = evaluated(model, inputs, 3, tape)
+        taped = evaluated(model, inputs, large_solver(3, tape=tape))
         assert torch.equal(taped["x"], bare[0]) and torch.equal(taped["v"], bare[1]), tape
 
 
 def test_a_regime_that_cannot_run_a_scene_raises() -> None:
     model, inputs = large_inputs(10)
     with forced("thread"), pytest.raises(ValueError, match="regime"):
-        dv.step(model, **inputs, solver=scene.solver(1))
-    dv.step(model, **inputs, solver=scene.solver(1))  # outside, the choice is free again
+        dv.step(model, solver=large_solver(1), **inputs)
+    dv.step(model, solver=large_solver(1), **inputs)  # outside, the choice is free again
 
 
 @pytest.mark.parametrize("name", ("warp", "", "Thread", 3))
 def test_an_unknown_regime_raises(name: Any) -> None:
-    with pytest.raises((ValueError, TypeError), match="regime"), regime(name):
+    with pytest.raises((ValueError, TypeError), match="regime"), testing.regime(name):
         pass
 
 
@@ -349,13 +357,12 @@ def test_one_launch_and_a_launch_for_each_color_give_the_same_bits(name: str, sw
     model, found = scene.model.to("cuda"), []
     for regime in ("grid", "color"):
         with forced(regime):
-            found.append(compiled(scene, 2, sweeps, tape, model)[0])
+            found.append(compiled(scene, 2, scene.solver(sweeps, tape=tape), model)[0])
     for key, value in found[0].items():
         assert torch.equal(value, found[1][key]), key
     assert all(found[0][key].any() for key in ("x", "v", "grad_x", "grad_v"))
 
 
-# TODO62: give the solver of model: subspace=dv.CoarseSpace(every=3)
 def cubes(scenes: int) -> tuple[dv.Model, dict[str, Tensor]]:
     """A cube that falls on another one, with friction, over a floor, in scenes that differ."""
     cube = dv.mesh.cube(3, size=0.2)
@@ -370,12 +377,16 @@ def cubes(scenes: int) -> tuple[dv.Model, dict[str, Tensor]]:
     return model, {"x": x, "v": v, "mu": 1e5 * shares.expand(-1, model.num_tets).clone()}
 
 
+def solver_of_cubes(tape: Any = "auto") -> dv.VBD:
+    return dv.VBD(0.01, 5, subspace=dv.CoarseSpace(every=3), tape=tape)
+
+
 def run_of_contact(
     model: dv.Model, given: dict[str, Tensor], tape: str, scenes: int | None = None
 ) -> dict[str, Tensor]:
     """The state after a step of the first scenes, and gradients of a fixed sum of it for each scene."""
     leaves = {key: value[:scenes].clone().requires_grad_() for key, value in given.items()}
-    x, v = dv.step(model, solver=dv.VBD(0.01, 5, tape=tape), **leaves, lam=1e5)
+    x, v = dv.step(model, solver=solver_of_cubes(tape), **leaves, lam=1e5)
     weights = torch.linspace(-1, 1, x[0].numel(), dtype=x.dtype, device=x.device).view_as(x[0])
     grads = torch.autograd.grad((weights * (x + 0.01 * v)).sum(), list(leaves.values()))
     return {"x": x.detach(), "v": v.detach(), **{f"grad_{k}": g for k, g in zip(leaves, grads, strict=True)}}
@@ -399,9 +410,10 @@ def test_more_vertices_than_blocks(tape: str) -> None:
 @pytest.mark.parametrize("tape", TAPES)
 def test_some_threads_a_vertex(tape: str) -> None:
     model, given = cubes(400)
-    launch = model.settings(0.01, 5, 400).launch
+    launch = launch_of(model, solver_of_cubes(), 400)
     assert launch == (regimes.COLOR, regimes.COLOR, regimes.SOME_LANES, regimes.SOME_REVERSE_LANES)
-    assert model.settings(0.01, 5, 1).launch == (regimes.GRID, regimes.GRID, regimes.MANY_LANES, regimes.MANY_LANES)
+    launch = launch_of(model, solver_of_cubes(), 1)
+    assert launch == (regimes.GRID, regimes.GRID, regimes.MANY_LANES, regimes.MANY_LANES)
     many, one = run_of_contact(model, given, tape), run_of_contact(model, given, tape, 1)
     for key, value in one.items():
         assert value.any(), key

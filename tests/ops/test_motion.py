@@ -45,7 +45,6 @@ class Case(NamedTuple):
         """Of x, mass and move."""
         given = (self.x, self.origin, self.mass, self.move, self.held, self.held_bodies, self.order, self.ptr)
         return ops_motion.contact_motion_backward(bar, *given)
-        return x, mass, move
 
 
 def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, held: float = 0.0,

@@ -20,9 +20,6 @@ import diffvbd as dv
 from diffvbd import testing
 from diffvbd.testing import build_scene, generator, relative_error, structured, tolerance
 
-# TODO62: part of a solver in these options
-OPTIONS: dict[str, Any] = {"time_step": 1 / 60}
-
 
 @pytest.fixture
 def threads() -> Iterator[None]:
@@ -31,7 +28,6 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-# TODO62: give the solver of model: relaxation=1.2
 @pytest.fixture(scope="module")
 def large() -> tuple[dv.Model, dict[str, Any]]:
     """32,768 vertices over a floor: every color has far more blocks than a parallel region needs."""
@@ -56,17 +52,17 @@ def large() -> tuple[dv.Model, dict[str, Any]]:
         "floor_kappa": tensor(1e3),
         "floor_height": tensor([-0.01]),
     }
-    return model, inputs | OPTIONS
+    return model, inputs
 
 
 @pytest.mark.parametrize("tape", ("full", "compact"))
-def test_any_number_of_threads(large: tuple, tape: str, threads: None) -> None:
-    model, inputs = large
+def test_any_number_of_threads(large: tuple, tape: Any, threads: None) -> None:
+    (model, inputs), solver = large, dv.VBD(1 / 60, 2, relaxation=1.2, tape=tape)
     torch.set_num_threads(1)
-    expected = evaluated(model, inputs, 2, tape)
+    expected = evaluated(model, inputs, solver)
     for count in (1, 2, 4):
         torch.set_num_threads(count)
-        assert_same_bits(expected, evaluated(model, inputs, 2, tape))
+        assert_same_bits(expected, evaluated(model, inputs, solver))
 
 
 @pytest.mark.parametrize("kind", ("random", "delaunay"))
@@ -76,11 +72,11 @@ def test_batch_equals_single_scenes(device: str, one_regime: None, kind: str, th
     model, inputs = scene.model(device), scene.inputs(device=device)
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device=device)
     names = ("x", "v", "mu", "lam", "force", "prescribed")
+    shared = {name: value for name, value in inputs.items() if name not in names}
 
     def run(i: Any) -> tuple[Tensor, ...]:
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
-        given = {k: inputs[k] for k in ("gravity", "density", "rest_points", "time_step", "parameters")}
-        x, v = dv.step(model, **dict(zip(names, leaves, strict=True)), **given, solver=scene.solver(3))
+        x, v = dv.step(model, solver=scene.solver(3), **dict(zip(names, leaves, strict=True)), **shared)
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     singles = [run(i) for i in range(3)]
@@ -107,15 +103,16 @@ def test_numbering_of_vertices_is_the_users(device: str, kind: str) -> None:
     for name in ("x", "v", "force", "prescribed", "rest_points"):
         moved[name] = inputs[name][back]
     assert relative_error(renumbered.mass[rank], model.mass) <= tolerance("ulps")
-    expected = testing.reference_result(renumbered, moved, 2)
-    small = evaluated(theirs, testing.on_device(moved, device), 2, "auto")
+    solver = scene.solver(2, tape="auto")
+    expected = testing.reference_result(renumbered, moved, solver)
+    small = evaluated(theirs, testing.on_device(moved, device), solver)
     assert relative_error(small["x"], expected["x"]) <= tolerance("forward")
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)))
     ends = []
     for m, given, w in ((ours, inputs, weights), (theirs, moved, weights[back])):
         given, w = testing.on_device(given, device), w.to(device)
-        leaves = {name: a.clone().requires_grad_() for name, a in given.items() if name != "time_step"}
-        x, _ = dv.step(m, solver=dv.VBD(given["time_step"], 3000), **leaves)
+        leaves = {name: a.clone().requires_grad_() for name, a in given.items()}
+        x, _ = dv.step(m, solver=scene.solver(3000), **leaves)
         gradients = torch.autograd.grad((w * x).sum(), list(leaves.values()))
         ends.append({"end": x.detach()} | dict(zip(leaves, gradients, strict=True)))
     for name, value in ends[0].items():
@@ -184,14 +181,12 @@ def test_an_unknown_set_is_refused() -> None:
 FLOOR, FRICTION = dv.FloorBarrier(height=-0.003, kappa=1e4, dhat=2e-3), dv.Friction(0.5)
 PAIRS = dv.PairBarrier(kappa=1e4, dhat=2e-3)
 PLANE = dv.colliders.Plane((0.0, -0.003, 0.0))
-# TODO62: Anderson is gone
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {},
     "floor, friction": {"energies": (FLOOR, FRICTION)},
-    "Anderson": {"acceleration": dv.Anderson(2)},
-    "coarse": {"coarse": "auto"},
+    "coarse": {},
     "pairs": {"energies": (PAIRS,)},
-    "pairs, coarse": {"energies": (PAIRS,), "coarse": "auto"},
+    "pairs, coarse": {"energies": (PAIRS,)},
     "pairs, friction, a collider": {"energies": (PAIRS, FRICTION), "colliders": (PLANE,)},
     "pairs, floor, float32": {"energies": (PAIRS, FLOOR), "dtype": torch.float32},
 }
@@ -219,10 +214,11 @@ def run(name: str, scenes: int, device: str, fill: bool) -> list[Tensor]:
     model = dv.Model(bodies, device=device, **options)
     x = model.rest_points
     v = 3.0 * (x.mean(0) - x) / x.std() * torch.linspace(0.5, 1.0, scenes).to(x)[:, None, None]
+    solver = dv.VBD(0.005, 3, subspace="coarse" if "coarse" in name else "rigid")
     leaves = [t.clone().requires_grad_() for t in (x.expand_as(v), v, x.new_full((1, model.num_tets), 1e5))]
     now, speed, mu = leaves
     for _ in range(2):
-        now, speed = dv.step(model, now, speed, dv.VBD(0.005, 3), mu=mu, lam=1e5)
+        now, speed = dv.step(model, now, speed, solver, mu=mu, lam=1e5)
     return [now.detach(), speed.detach(), *torch.autograd.grad((now - x).square().sum(), leaves)]
 
 

@@ -13,6 +13,7 @@ from diffvbd import mesh, ops
 from diffvbd.adjoint.contact_lag import of_scene
 from diffvbd.ops import broadcast
 from diffvbd.ops import contact as ops_rigid
+from diffvbd.ops.fields import MOST_COUPLED
 from diffvbd.ops.sums import Order, of_segments, sum_segments
 from diffvbd.reference.rigid_contact import LEAST_INERTIA
 from diffvbd.step.rigid_terms import Scenes, vertex_blocks, vertex_gradient
@@ -51,7 +52,7 @@ CASES = {
     "all": ((FLOOR, PAIRS, dv.Friction(0.4)), {"anchored": True, "heights": (3,)}),
     "batched": ((FLOOR, PAIRS, dv.Friction(0.4)), {"scenes": 3}),
     # more than sixty-four: groups of three and two, and those of a stack that is too high, each alone
-    "many": ((PAIRS, dv.Friction(0.4, 0.05)), {"heights": (3, ops_rigid.MOST_COUPLED + 1, 2, 1), "scenes": 2}),
+    "many": ((PAIRS, dv.Friction(0.4, 0.05)), {"heights": (3, MOST_COUPLED + 1, 2, 1), "scenes": 2}),
     "single": ((FLOOR, PAIRS, dv.Friction(0.4)), {"dtype": torch.float32}),
     "held": ((FLOOR, PAIRS, dv.Friction(0.4)), {"heights": (3,), "closing": 4.0}),
 }
