@@ -27,23 +27,24 @@ def scene_of(*energies):
     scene = build("third", boxes((0, 0, 0), (0.03, 0.213, 0.02)), energies, jitter=3e-3)
     for name in ("anchor", "tether"):
         if any(getattr(e, "name", "") == name for e in energies):
-            scene.parameters[f"{name}.stiffness"] = torch.full((54,), 50.0, dtype=torch.float64)
+            scene.parameters[f"{name}_stiffness"] = torch.full((54,), 50.0, dtype=torch.float64)
     return scene
 
 results = {}
 for kind in (dv.Anchor, Tether):
     for more in ((), (floor,)):
-        results[kind.name, bool(more)], parts = compiled(scene_of(*more, pairs, kind(50.0)), 2, 3)
+        scene = scene_of(*more, pairs, kind(50.0))
+        results[kind.name, bool(more)], parts = compiled(scene, 2, scene.solver(3))
         assert any(len(part.pairs) for step in parts for part in step)
 for name, one in results.items():
     other = results["anchor", name[1]]
     for key, value in one.items():
         assert torch.equal(value, other[key.replace("tether", "anchor")]), (name, key)
-    assert one[f"grad_{name[0]}.stiffness"].abs().max() > 0
+    assert one[f"grad_{name[0]}_stiffness"].abs().max() > 0
 
 scene = scene_of(floor, pairs, dv.Anchor(50.0), Tether(30.0))
-result, parts = compiled(scene, 2, 3)
-for key, value in unrolled(scene, 2, 3, parts).items():
+result, parts = compiled(scene, 2, scene.solver(3))
+for key, value in unrolled(scene, 2, scene.solver(3), parts).items():
     assert value.abs().max() > 0 and relative_error(result[key], value) <= tolerance("contact_adjoint"), key
 print("a third energy and contact")
 """
@@ -63,7 +64,7 @@ def class_of(path: Path, name: str) -> str:
 def add_an_energy(root: Path) -> None:
     """The four places of docs/guides/extend.md."""
     energies = root / "csrc" / "energies"
-    header = (energies / "anchor_h").read_text(encoding="utf-8")
+    header = (energies / "anchor.h").read_text(encoding="utf-8")
     (energies / "tether.h").write_text(renamed(header), encoding="utf-8")
     edit(energies / "tether.h", "      const R k = s.h * s.h * data[i];\n",
          "      R k = R(0);\n      k += select(data[i] > R(0), s.h * s.h * data[i], R(0));\n")  # fmt: skip

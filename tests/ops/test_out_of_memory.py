@@ -7,6 +7,7 @@ import torch
 
 import diffvbd as dv
 from diffvbd.adjoint.sweep import backward_memory
+from diffvbd.model.system import system_of
 from diffvbd.ops import FULL_TAPE, NO_TAPE
 
 SWEEPS, SCENES = 2**31 - 1, 256  # more bytes than addresses
@@ -38,7 +39,7 @@ def test_a_tape_that_does_not_fit(kind: str, tape: str) -> None:
 def test_a_backward_that_does_not_fit() -> None:
     """As the backward sees it: a forward of so many sweeps would take days."""
     model = dv.Model(dv.mesh.cube(3, size=0.2))
-    settings, x = model.settings(0.01, SWEEPS), model.rest_points[None]
+    settings, x = system_of(model, dv.VBD(0.01, 1)).settings(0.01, SWEEPS), model.rest_points[None]
     made = 8 * 9 * SWEEPS * model.num_active
     for policy, text in ((NO_TAPE, f"with a tape of {made} bytes"), (FULL_TAPE, ": use fewer sweeps")):
         with pytest.raises(torch.OutOfMemoryError, match=f"^CPU out of memory in the backward of a step.*{text}"):
