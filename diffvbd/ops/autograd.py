@@ -183,7 +183,7 @@ class Differentiable:
 
 def _like(bar: Tensor | None, t: Tensor) -> Tensor:
     """An adjoint in the shape of its input."""
-    if bar is None or (bar.numel() == 0 and t.numel() > 0):
+    if bar is None or bar.numel() == 0:  # also of no scenes, where shapes may differ
         return torch.zeros_like(t)
     return sum_to(bar, t.shape)
 

@@ -132,13 +132,14 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
     inputs: dict[str, Any] = {
         "x": x,
         "v": noise(*full, size=1.0) - torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64),
-        "mu": 1e4 * (1 + noise(*scenes, model.num_tets or 1, size=0.5)),
-        "lam": torch.tensor(2e4, dtype=torch.float64),
         "force": noise(*full, size=1.0),
         "prescribed": torch.where(model.pinned[:, None].cpu(), x + noise(*full, size=0.01), torch.nan),
         "rest_points": model.rest_points + noise(model.num_vertices, 3, size=0.01),
         "density": torch.tensor(90.0, dtype=torch.float64),
     }
+    if "mu" in model.inputs:
+        inputs |= {"mu": 1e4 * (1 + noise(*scenes, model.num_tets or 1, size=0.5)),
+                   "lam": torch.tensor(2e4, dtype=torch.float64)}  # fmt: skip
     if model.floor is not None:
         inputs["floor_kappa"] = torch.tensor(3e4, dtype=torch.float64)
     return model, inputs
