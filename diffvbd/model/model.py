@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .. import ops
 from .._common.checks import check_dtype, check_held, check_kind, fail, vertex_mask
-from .._common.constants import CONTACT
+from .._common.constants import CONTACT, ELASTIC
 from .._common.context import is_captured, lasting, lasting_tensors
 from .._contact.barrier import Friction, PairBarrier
 from .._contact.colliders import Collider
@@ -22,6 +22,7 @@ from .arguments import Energy, check_isolated, checked_device, checked_energies,
 from .bodies import find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
 from .material import lumped_mass, rest_metric
+from .moving import moving_bodies
 
 
 def _copy(name: str, text: str) -> Any:
@@ -211,6 +212,9 @@ class Model:
         self._rest_points = points
         self._mass = lumped_mass(self._density[None], volume, *self._topology)[0]
         self._rest = rest
+        if self.contact is not None:  # potentials of bodies decide
+            elastic = bool(self.energy_mask & ELASTIC)
+            self._moving = moving_bodies(points, self._topology[0], self._pinned, elastic)
         data = [e.pack({k: t[None] for k, t in e.constants(points).items()}, None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
@@ -228,6 +232,8 @@ class Model:
             del self._rest
         if self.surface_of_contact is not None:
             self.surface_of_contact = self.surface_of_contact.to(device, dtype)
+        if self.contact is not None:
+            self._moving = self._moving.to(device, dtype)
         for energy in self.parametric_energies:
             self.constants(energy)
 

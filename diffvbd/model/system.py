@@ -50,8 +50,8 @@ class System(Model):
             arrays = torch.from_numpy(self.mesh.points.copy()), self._topology[0].cpu(), self._pinned.cpu()
             bodies, others = find_bodies(*arrays, self.rigid, self.floor is not None)
             self._bodies, self._other_bodies = bodies.to(self.device), others.to(self.device)
-        if self.coarse is not None or self.contact is not None:
-            self._arrange_bodies()
+        if self.coarse is not None:
+            self._arrange_coarse()
         self.corrects = self._bodies.number > 0
         self.starts_from = self._start()
 
@@ -75,19 +75,19 @@ class System(Model):
         if ops.TET_READS_X_PREV:
             fail("subspace", "no coarse space with a law of tets that reads where a step began", repr(self.coarse))
 
-    def _arrange_bodies(self) -> None:
-        """The coarse space, and the bodies whose potentials decide; in float64, on the CPU, then placed."""
+    def _arrange_coarse(self) -> None:
+        """The coarse space, in float64, on the CPU, then placed."""
+        assert self.coarse is not None
         points = torch.from_numpy(self.mesh.points.copy())
         tets, *star = (t.cpu() for t in self._topology)
         pinned, device = self._pinned.cpu(), self.device
-        if self.coarse is not None:
-            rest, volume = rest_metric(ops.tet_gather(points[None], tets, *star))
-            mass = lumped_mass(self._density.cpu().double()[None], volume, tets, *star)[0]
-            given = (points, tets, pinned, mass, rest, self._plan.cpu())
-            self.coarse_geometry, plan = plan_of(self.coarse, *given, device.type)
-            check_coupled(self.coarse_geometry, self.touches)
-            self._coarse_plan = plan.to(device, self.dtype)
-        if self.contact is not None or (self.coarse is not None and self.touches):
+        rest, volume = rest_metric(ops.tet_gather(points[None], tets, *star))
+        mass = lumped_mass(self._density.cpu().double()[None], volume, tets, *star)[0]
+        given = (points, tets, pinned, mass, rest, self._plan.cpu())
+        self.coarse_geometry, plan = plan_of(self.coarse, *given, device.type)
+        check_coupled(self.coarse_geometry, self.touches)
+        self._coarse_plan = plan.to(device, self.dtype)
+        if self.touches and self.contact is None:  # with pairs the Model has them
             moving = moving_bodies(points, tets, pinned, bool(self.energy_mask & ELASTIC))
             self._moving = moving.to(device, self.dtype)
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from .._common.constants import ELASTIC
+from .._common.context import looks_at
 from .._common.messages import page, warn
 from .model import Model
 from .system import System
@@ -33,7 +34,7 @@ def warn_of_solver(model: System) -> None:
         )
     if model.block == "paper" and model.relaxation > 1 and model.saturation is None:
         warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
-    if not model.regularization:
+    if not model.regularization or not looks_at(model._mass):
         return
     active = model._mass[~model._pinned]
     if active.numel() and model.regularization > HEAVY_REGULARIZATION * float(active.min()):

@@ -186,7 +186,7 @@ class Differentiable:
 
 def in_shape(bar: Tensor | None, t: Tensor) -> Tensor:
     """An adjoint in the shape of its input."""
-    if bar is None or bar.numel() == 0:
+    if bar is None or bar.numel() == 0:  # also of no scenes, where shapes may differ
         return torch.zeros_like(t)
     return sum_to(bar, t.shape)
 

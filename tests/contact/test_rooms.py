@@ -13,8 +13,7 @@ from diffvbd._contact.surface import ContactSurface
 from diffvbd.ops import contact as ops_detect
 from diffvbd.ops.contact import RoomsOfBodies
 from diffvbd.ops.fields import WAYS
-from diffvbd.step.contact import Motion, motion_of
-from diffvbd.step.contact import LEAST_ROOM, ROOM, rooms
+from diffvbd.step.contact import LEAST_ROOM, ROOM, Motion, motion_of, rooms
 from diffvbd.testing import generator, tolerance
 
 DHAT = 0.02
