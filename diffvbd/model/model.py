@@ -23,6 +23,9 @@ from .bodies import find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
 from .material import lumped_mass, rest_metric
 from .moving import moving_bodies
+from .solver import VBD
+
+DEFAULT = VBD(1.0, 1)  # of solvers without options of their own
 
 
 def _copy(name: str, text: str) -> Any:
@@ -102,6 +105,7 @@ class Model:
         self._measure(points)
         warn_of(mesh, pinned, mask, self.energies)
         self._place(dtype, device)
+        self._executed_by(DEFAULT)  # now, since compiled code can look it up and not build it
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:
         self.energies = energies
@@ -254,6 +258,7 @@ class Model:
             out._arrange(points, out.tets, device)
         out._measure(points)
         out._place(dtype, device)
+        out._executed_by(DEFAULT)
         return out
 
     def replace(self, **changes: Any) -> Model:

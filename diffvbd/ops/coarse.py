@@ -130,8 +130,7 @@ def mass(of_vertices: Tensor, plan: Tensor, weights: Tensor, sizes: Any) -> Tens
         cells = (w * of_vertices[:, piece.vertex][..., None]).transpose(-1, -2) @ w
         out[:, piece.cell_numbers] += cells.flatten(1)[:, piece.chosen_cells]
     filled = _once(plan, "filled", lambda: _filled(part))
-    out[:, filled] = 1
-    return out
+    return out.index_fill_(1, filled, 1)  # assignment would copy a number from the host
 
 
 def mass_backward(bar: Tensor, plan: Tensor, weights: Tensor, sizes: Any) -> Tensor:
