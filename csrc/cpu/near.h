@@ -1,5 +1,5 @@
-// The near pairs of a scene: where their corners lie in its rows, the packs of their kernels, and the account of what is
-// near.
+// The near pairs of a scene: where their corners lie in its rows, the packs of their kernels, and the account of what
+// is near.
 #pragma once
 
 #include <algorithm>
