@@ -116,9 +116,12 @@ def to_float(name: str, value: Any) -> float:
 
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    return len(shape) <= len(wanted) and all(
-        a in (1, b) for a, b in zip(reversed(shape), reversed(wanted), strict=False)
-    )
+    if len(shape) > len(wanted):
+        return False
+    for a, b in zip(reversed(shape), reversed(wanted), strict=False):  # called in every step: no generator
+        if a not in (1, b):
+            return False
+    return True
 
 
 def check_broadcast(name: str, value: Tensor, shape: tuple[int, ...], scenes: int = 0) -> Tensor:

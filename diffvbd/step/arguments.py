@@ -293,12 +293,15 @@ def acceleration_of(gravity: Any, like: Tensor) -> Tensor:
 def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
     if isinstance(value, np.ndarray):
         value = value.tolist()
-    numbers = isinstance(value, (tuple, list)) and all(isinstance(a, NUMBERS) for a in value)
-    if not numbers or any(isinstance(a, bool) for a in value):
+    if not isinstance(value, (tuple, list)):
         raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
+    floats = []
+    for a in value:
+        if not isinstance(a, NUMBERS) or isinstance(a, bool):
+            raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
+        floats.append(a if type(a) is float else to_float(name, a))
     if len(value) != 3:
         fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
-    floats = [to_float(name, a) for a in value]
     if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
         return torch.stack([torch.full((), a, dtype=like.dtype, device=like.device) for a in floats])
     return torch.tensor(floats, dtype=like.dtype, device=like.device)
