@@ -24,6 +24,10 @@ _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
 _recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.record", default=())
 
 
+class MorePairs(RuntimeError):
+    """A step of a checkpointed segment has made room for more pairs; the segment is to begin again."""
+
+
 class Finer(NamedTuple):
     """Refinement of rollouts inside dv.refine."""
 
@@ -34,6 +38,7 @@ class Finer(NamedTuple):
     mesh: bool = False  # of eight tets for each
 
 
+_in_segment: ContextVar[bool] = ContextVar("diffvbd.segment", default=False)
 _refining: ContextVar[Finer | None] = ContextVar("diffvbd.refine", default=None)
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
@@ -160,6 +165,22 @@ def unheard() -> Iterator[None]:
     finally:
         _recording.reset(recording)
         _checking.reset(checked)
+
+
+def in_segment() -> bool:
+    """Whether the steps of a checkpointed segment are made for the first time: none may run again by itself, since its
+    first attempt has saved tensors that the segment would not save in the backward."""
+    return not torch.compiler.is_compiling() and _in_segment.get()
+
+
+@contextlib.contextmanager
+def segment() -> Iterator[None]:
+    """Inside, in_segment() is True."""
+    token = _in_segment.set(True)
+    try:
+        yield
+    finally:
+        _in_segment.reset(token)
 
 
 @contextlib.contextmanager

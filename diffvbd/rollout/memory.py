@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 from .. import ops
 from .._common.checks import check_bool, check_count, fail, is_word
 from .._common.constants import KEEPS_POSITIONS
-from .._common.context import Scope, transformed
+from .._common.context import MorePairs, Scope, in_segment, segment, transformed
 from ..adjoint.routes import Adjoint, TapedSweep, Unrolled
 from ..model.model import Model
 from ..model.solver import BDF2, VBD
@@ -276,10 +276,15 @@ def _again(run: Callable[..., Segment], *args: Any) -> Segment:
     )
     if torch.compiler.is_compiling():
         return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
-    scope = Scope()
+    scope, outermost = Scope(), not in_segment()
     # A run that stops once the last tensor is saved does not reach the end of its last step, which records it.
-    with set_checkpoint_early_stop(not scope.recorders):
-        return checkpoint(_resuming(run, scope), *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+    with set_checkpoint_early_stop(not scope.recorders), segment():
+        while True:
+            try:
+                return checkpoint(_resuming(run, scope), *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+            except MorePairs:
+                if not outermost:
+                    raise
 
 
 def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segment]:

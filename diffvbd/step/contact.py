@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .. import ops
 from .._common.constants import CONTACT
-from .._common.context import checking, is_captured, not_compiled, recorders, replaced
+from .._common.context import MorePairs, checking, in_segment, is_captured, not_compiled, recorders, replaced
 from .._contact import detection as search
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
@@ -398,6 +398,8 @@ def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor,
                 raise
             # nobody has said how many there may be: again, with room for them
             model.model.surface_of_contact = replace(surface, capacity=2 * error.needed)
+            if in_segment():  # which begins again
+                raise MorePairs from None
 
 
 # --- the sweeps of a part of a step with pairs or friction, in cycles, with the coarse correcti -----------------------

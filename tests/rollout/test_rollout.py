@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from bench import bits
+from diffvbd.step import contact
 from diffvbd.testing import build_scene, relative_error, tolerance
 
 STEPS = 7
@@ -490,3 +492,24 @@ def test_what_repeats_itself_passes(schedule: Any, device: str) -> None:
     if device == "cpu":
         with pytest.raises(ValueError, match="force: expected finite values"):
             end(model, lambda k, x, v: p * torch.full_like(x, torch.inf), schedule)
+
+
+def test_a_list_of_pairs_that_grows_begins_a_checkpointed_segment_again(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first attempt of a step that finds more pairs than fit saves tensors that a backward would not save again."""
+    runs = bits.rollouts(device)["checkpoints, pairs"]
+    expected, attempt, count = runs(), contact.ContactStep.run, [0]
+
+    def too_few_once(self: Any, *given: Any) -> Tensor:
+        count[0] += 1
+        end = attempt(self, *given)
+        if count[0] == 2:  # in a segment of two steps
+            raise contact.TooManyPairs(10, "capacity")
+        return end
+
+    monkeypatch.setattr(contact.ContactStep, "run", too_few_once)
+    found = runs()
+    assert count[0] > 8 and found["grad_pair_kappa"].abs() > 0
+    for name, value in expected.items():
+        assert torch.equal(found[name].nan_to_num(), value.nan_to_num()), name
