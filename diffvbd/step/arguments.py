@@ -259,13 +259,17 @@ def _refuse_lines(model: Model, name: str, points: Tensor) -> None:
 
 def named(model: Model, error: ValueError, arguments: dict[str, Any]) -> ValueError:
     """The error of an operator, or one that names the argument where it could name only what was made of several."""
-    if str(error).startswith(("predictor", "start")):
+    if str(error).startswith(("predictor", "start", "parameters")):
         try:
             refuse_non_finite(model, arguments)
         except ValueError as found:
             return found
         except RuntimeError:  # under vmap values cannot be looked at
             pass
+        if (
+            str(error).startswith("parameters") and "floor_normal" in arguments
+        ):  # finite, and not once it is of length 1
+            fail("floor_normal", "normals of finite length > 0", "one of length 0")
     return ValueError(*error.args) if type(error) is ValueError else error
 
 
