@@ -56,7 +56,7 @@ def where_it_is(name: str, known: Iterable[str]) -> str:
         return f": it is {RENAMED[name]} now"
     if name in OWNERS:
         return f", got {OWNERS[name]}"
-    near = difflib.get_close_matches(name, (*known, *OWNERS), 1, 0.7)
+    near = difflib.get_close_matches(name, OWNERS, 1, 0.75) or difflib.get_close_matches(name, known, 1)
     return f": is {near[0]!r} meant?" if near else ""
 
 
