@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
+import functools
 import inspect
 import math
 import operator
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -14,12 +17,72 @@ from torch import Tensor
 MODEL = "the Model's"
 HELD = "numbers that {} can hold ({})"  # dtype, and whose it is
 NUMBERS = (int, float, np.floating, np.integer)  # bool, which python counts among them, is checked apart
+Kind = TypeVar("Kind", bound=type)
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+OWNERS = {  # names that are easily given to another call, and which call has them
+    **dict.fromkeys(("mesh", "pinned", "energies", "dtype", "device"), "an argument of dv.Model"),
+    **dict.fromkeys(("time_step", "sweeps", "relaxation", "subspace", "integrator", "block", "start", "tape",
+                     "saturation", "regularization"), "an argument of dv.VBD"),
+    **dict.fromkeys(("steps", "duration", "save", "observe", "checkpoint_every", "history", "checks", "progress"),
+                    "an argument of dv.rollout"),
+    **dict.fromkeys(("tolerance", "max_sweeps", "check_every", "on_failure"), "an argument of dv.solve"),
+    **dict.fromkeys(("errors", "energy", "contact"), "an argument of dv.Checks"),
+    **dict.fromkeys(("dhat", "detections", "reach", "capacity"), "an argument of dv.PairBarrier"),
+    **dict.fromkeys(("mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points"),
+                    "an input of dv.step and dv.rollout"),
+}  # fmt: skip
+RENAMED = {  # names of earlier versions
+    "coarse": 'dv.VBD(subspace="coarse")',
+    "rigid": 'dv.VBD(subspace="rigid" or None)',
+    "settings": "a dv.VBD, the argument solver",
+    "parameters": "an input of its own for each parameter, as floor_kappa=",
+    "estimate_errors": "dv.Checks(errors=True)",
+    "check_start": "dv.Checks(start=)",
+    "check_energy": "dv.Checks(energy=)",
+    "check_contact": "dv.Checks(contact=)",
+}
 
 
 def fail(name: str, expected: str, got: Any) -> NoReturn:
     first, *more = f"{got}".split("\n")  # an array may take many lines
     # what was caught before this says no more
     raise ValueError(f"{name}: expected {expected}, got {first}{' ...' if more else ''}") from None
+
+
+def where_it_is(name: str, known: Iterable[str]) -> str:
+    """The end of a message on a name that a call does not have: what has it, or the nearest name of any call."""
+    if name in RENAMED:
+        return f": it is {RENAMED[name]} now"
+    if name in OWNERS:
+        return f", got {OWNERS[name]}"
+    near = difflib.get_close_matches(name, OWNERS, 1, 0.75) or difflib.get_close_matches(name, known, 1)
+    return f": is {near[0]!r} meant?" if near else ""
+
+
+def names_checked(owner: str) -> Callable[[Function], Function]:
+    """Decorator of a function whose unknown keywords raise a TypeError that says where they belong."""
+
+    def decorated(function: Function) -> Function:
+        known = tuple(name for name in inspect.signature(function).parameters if name != "self")
+
+        @functools.wraps(function)
+        def checked(*args: Any, **given: Any) -> Any:
+            for name in given:
+                if name not in known:
+                    raise TypeError(f"{name}: expected an argument of {owner} ({', '.join(known)})"
+                                    f"{where_it_is(name, known)}")  # fmt: skip
+            return function(*args, **given)
+
+        return checked  # type: ignore[return-value]
+
+    return decorated
+
+
+def init_names_checked(kind: Kind) -> Kind:
+    """The same for the constructor of a public class."""
+    kind.__init__ = names_checked(f"dv.{kind.__name__}")(kind.__init__)  # type: ignore[misc]
+    return kind
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:
@@ -42,6 +105,15 @@ def check_dtype(value: Any) -> None:
     """Raises unless ``value`` is a dtype that kernels compute in."""
     if not isinstance(value, torch.dtype) or value not in (torch.float64, torch.float32):
         raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {value}")
+
+
+def check_save(save: Any) -> Any:
+    """Which frames a rollout saves."""
+    if is_word(save, "all", "last"):
+        return save
+    if not isinstance(save, (int, np.integer)) or isinstance(save, bool) or save <= 0:
+        fail("save", '"all", "last" or an integer > 0', repr(save))
+    return int(save)
 
 
 def check_function(name: str, function: Any, *arguments: str) -> None:

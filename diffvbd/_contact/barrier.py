@@ -26,7 +26,7 @@ class PairBarrier:
     Every pair of a point and a triangle and of two edges counts once, with d their distance, whatever features are
     closest; edges that become parallel are mollified. From a start without intersections no executed sweep lets two
     surfaces cross, at any speed and any number of sweeps: each motion leaves a plane between the sides of every pair
-    that could meet, and no vertex goes farther than pairs were looked for. What has been held up is lost as velocity
+    that could meet, and no vertex goes farther than pairs were looked for. What has been truncated is lost as velocity
     (see :func:`diffvbd.contact.status`). Two places of one body that coincide at rest (a crack, doubled vertices) are
     never a pair: they may pass through each other.
 
@@ -39,13 +39,13 @@ class PairBarrier:
             their normal force N there, by N / (N + kappa dhat / 10), lest a motion jump where a pair comes to be that
             close one step sooner.
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
-            advance in R parts; what pairs have held up tries again in the next part. None: one, and up to four in
-            steps in which bodies want to go farther beside each other than ``reach`` lets them. As long as pairs still
-            hold something up, such a step goes on, with more sweeps, up to eight parts in all (docs/contact.md). What
-            is prescribed then moves in the first part.
+            advance in R substeps; what pairs have truncated goes on in the next substep. None: one, and up to four in
+            steps in which bodies want to go farther past each other than ``reach`` lets them. As long as pairs still
+            truncate motion, such a step goes on, with more sweeps, up to eight substeps in all (docs/contact.md). What
+            is prescribed then moves in the first substep.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
-            detections, beside the motion that bodies near each other share. None: that is one mean edge of its body,
-            or 8 where a single body moves.
+            detections, relative to the motion that bodies near each other share. None: that is one mean edge of its
+            body, or 8 where a single body moves.
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
 

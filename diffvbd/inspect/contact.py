@@ -41,8 +41,8 @@ class Status:
             the CPU, without a ``capacity`` of the PairBarrier, lists are as long as they must be, up to so many.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
         hindered: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
-        cut: Vertices that pairs held up in the last sweep, or without sweeps at the start, and those of bodies that
-            were held up in the last rigid correction: they lost velocity that no force took, [scenes].
+        cut: Truncated vertices of the last sweep, or without sweeps of the start, and vertices of bodies that the last
+            rigid correction truncated: they lost velocity that no force took, [scenes].
         smallest_gap: The smallest gap that a detection found [m], or the search distance, [scenes].
     """
 

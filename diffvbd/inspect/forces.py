@@ -119,7 +119,7 @@ def forces(
     check_previous(model, previous, x, solver)
     given_inputs = given_of(model, inputs)
     start = None if previous is None else previous[0]
-    _refuse_non_finite(model, {"x": x, "previous: x": start,
+    _refuse_non_finite(model, {"x": x, "previous: x": start, **given_inputs.parameters,
                                **{name: given_inputs.loads[name] for name in COLLIDERS}})  # fmt: skip
     given = widen(
         model, x, solver, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, given_inputs.loads)
@@ -258,8 +258,8 @@ def reactions(
     loads = given_inputs.loads
     state = {} if previous is None else {"previous: x": previous[0], "previous: v": previous[1]}
     pull, force = acceleration_of(loads["gravity"], x), loads["force"]
-    _refuse_non_finite(model, {"x": x, **state, **{name: loads[name] for name in COLLIDERS}, "force": force,
-                               "gravity": pull})  # fmt: skip
+    _refuse_non_finite(model, {"x": x, **state, **given_inputs.parameters, "force": force, "gravity": pull,
+                               **{name: loads[name] for name in COLLIDERS}})  # fmt: skip
     given = widen(model, x, solver, given_inputs)
     _refuse_moduli(given.prepared.mu, given.prepared.lam)
     _refuse_below(given, {"x": x})

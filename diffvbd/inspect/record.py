@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Literal
 
 from .._common import context as scopes
-from .._common.checks import fail, is_word
+from .._common.checks import check_bool, fail, is_word
 from .._common.context import record_to
 
 
@@ -47,5 +47,6 @@ def debug_checks(enabled: bool = True) -> Iterator[None]:
     work with raise only here, because looking at them waits for the device. It holds for the thread or task that is
     inside, and for the backward of what ran there; a step under torch.compile checks while any thread is inside.
     """
+    check_bool("enabled", enabled)
     with scopes.checks(enabled):
         yield

@@ -41,11 +41,11 @@ def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
         energies = (energies,)
     out: list[Energy] = []
     if not isinstance(energies, (tuple, list)):
-        raise TypeError(f"energies: expected a sequence of energies, got {type(energies).__name__}")
+        raise TypeError(f"energies: expected a sequence of energies, got {_kind_of(energies)}")
     for energy in energies:
         if not isinstance(energy, kinds):
             names = ", ".join(k.__name__ for k in kinds)
-            raise TypeError(f"energies: expected instances of {names}, got {type(energy).__name__}")
+            raise TypeError(f"energies: expected instances of {names}, got {_kind_of(energy)}")
         if any(type(energy) is type(other) for other in out):
             fail("energies", f"one {type(energy).__name__} (several planes are one FloorBarrier)", "two")
         if isinstance(energy, VertexEnergy):
@@ -53,6 +53,10 @@ def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
             energy = energy.detached()
         out.append(energy)
     return tuple(out)
+
+
+def _kind_of(energy: Any) -> str:
+    return f"the class {energy.__name__}" if isinstance(energy, type) else type(energy).__name__
 
 
 def check_isolated(tets: Tensor, pinned: Tensor) -> None:

@@ -366,7 +366,7 @@ def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, ma
 def check_coupled(geometry: CoarseGeometry, touches: bool) -> None:
     """Beside contact, raises where the bodies of a scene have more functions than can be solved for together."""
     if touches and geometry.functions > MOST_COUPLED:
-        fail("coarse", f"at most {MOST_COUPLED} functions of all bodies beside a PairBarrier or Friction, which couple "
+        fail("subspace", f"at most {MOST_COUPLED} functions of all bodies with a PairBarrier or Friction, which couple "
              "them: use a CoarseSpace with fewer, or None", f"{geometry.functions} of {geometry.bodies}")  # fmt: skip
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from .._common.checks import input_name
+from .._common.checks import input_name, where_it_is
 from .._common.constants import ELASTIC
 from .._contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES
@@ -115,7 +114,7 @@ def sorted_inputs(model: Any, inputs: dict[str, Any], gravity: Any = None) -> Gi
 
 
 def _meant(model: Any, name: str) -> str:
-    """The nearest input of any Model, and the energy that would declare it."""
+    """The energy that would declare an input, the call that has it as an argument, or the nearest name."""
     kinds = {
         input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
     }
@@ -123,5 +122,4 @@ def _meant(model: Any, name: str) -> str:
         return ", which has no elastic law among its energies"
     if name in kinds:
         return f", which has no {kinds[name].__name__} among its energies"
-    near = difflib.get_close_matches(name, (*inputs_of(model), *kinds), 1)
-    return f": is {near[0]!r} meant?" if near else ""
+    return where_it_is(name, (*inputs_of(model), *kinds))

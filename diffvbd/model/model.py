@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._common.checks import check_dtype, check_held, check_kind, fail, vertex_mask
+from .._common.checks import (
+    check_dtype,
+    check_held,
+    check_kind,
+    fail,
+    init_names_checked,
+    vertex_mask,
+    where_it_is,
+)
 from .._common.constants import CONTACT, ELASTIC
 from .._common.context import is_captured, lasting, lasting_tensors
 from .._contact.barrier import Friction, PairBarrier
@@ -33,6 +41,7 @@ def _copy(name: str, text: str) -> Any:
     return property(lambda self: getattr(self, name).clone(), doc=text)
 
 
+@init_names_checked
 class Model:
     """A scene: a mesh with its masses, pins, energies and colliders, colored and laid out for the sweeps.
 
@@ -274,7 +283,9 @@ class Model:
         }
         if unknown := sorted(set(changes) - set(own)):
             names = ", ".join(sorted(own))
-            raise TypeError(f"replace: expected arguments of Model ({names}), got {', '.join(unknown)}")
+            raise TypeError(
+                f"{unknown[0]}: expected an argument of Model.replace ({names}){where_it_is(unknown[0], own)}"
+            )
         return Model(self.mesh, **own | changes)
 
     def __getstate__(self) -> dict[str, Any]:

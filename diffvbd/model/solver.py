@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from .._common.checks import check_count, check_number, check_positive, fail, is_word
+from .._common.checks import check_count, check_number, check_positive, fail, init_names_checked, is_word
 from .coarse import CoarseSpace
 
 PAPER_SATURATION = 0.1  # [m]
@@ -55,6 +55,7 @@ def check_integrator(integrator: Any) -> Integrator:
     return integrator
 
 
+@init_names_checked
 @dataclass(frozen=True)
 class VBD:
     """Vertex Block Descent: time step, sweeps, and what a step does besides plain sweeps.
@@ -130,6 +131,8 @@ class VBD:
         if self.saturation is not None:
             keep("saturation", check_positive("saturation", self.saturation, "m"))
         keep("regularization", check_number("regularization", self.regularization))
+        if self.prediction is not None and not hasattr(self.prediction, "told"):
+            raise TypeError(f"prediction: expected None, got {type(self.prediction).__name__}: dv.advise sets it")
         if self.coarse is not None and self.block != "exact":
             fail("subspace", 'no coarse space with block="paper"', repr(self.subspace))
         if self.coarse is not None and self.saturation is not None:

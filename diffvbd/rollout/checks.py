@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._common.checks import check_bool
+from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
 from .._common.context import is_captured, looks_at, may_copy, replaced
 from .._common.messages import is_silent, page, percent, warn
@@ -39,6 +39,7 @@ from ..step.residual import (
 from ..step.stability import FAR, fault_of, reach_of, size_of
 
 
+@init_names_checked
 @dataclass(frozen=True)
 class Checks:
     """Checks of a rollout. Each warns (UserWarning), every time, in one sentence that says what to do.
@@ -478,7 +479,7 @@ def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Ten
     left = unbalanced_friction(model, before, x, prepared, given)
     if cut > CUT:
         warn(
-            f"contact: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
+            f"contact: pairs truncated {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
             f"{percent(CUT)}); " + what_helps(model),
         )

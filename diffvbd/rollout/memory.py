@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
-from .._common.checks import check_bool, check_count, fail, is_word
+from .._common.checks import check_bool, check_count, check_save, fail, is_word, names_checked
 from .._common.constants import KEEPS_POSITIONS
 from .._common.context import MorePairs, Scope, in_segment, segment, transformed
 from ..adjoint.routes import Adjoint, TapedSweep, Unrolled
@@ -24,6 +24,7 @@ from ..step.contact import sweeps_of_parts
 from ..step.integrators import solves_of
 
 
+@names_checked("dv.memory")
 def memory(
     model: Model,
     solver: VBD,
@@ -80,10 +81,11 @@ def memory(
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
-    if is_word(save, "all", "last"):
+    save = check_save(save)
+    if isinstance(save, str):
         frames = steps + 1 if save == "all" else 1
     else:
-        frames = steps // check_count("save", save, 1) + 2
+        frames = steps // save + 2
     generator = torch.get_rng_state().numel()
     if schedule is None:
         kept = steps * per_step + max(0, steps - 1) * between

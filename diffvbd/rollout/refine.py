@@ -39,7 +39,7 @@ class GradientTest:
     Attributes:
         finer: From that of each finer run, by name.
         differences: From central differences of 1 % and 10 % of the parameter, along the gradient, by that share;
-            without those that could not be had, as of a parameter that is 0, or where the loss raises ValueError.
+            without those that cannot be taken: of a parameter that is 0, or where the loss raises ValueError.
     """
 
     finer: dict[str, float]
@@ -189,9 +189,9 @@ def refine(
 
     Raises:
         ValueError, TypeError: ``loss`` runs no rollout or does not return a scalar; ``before`` is not finite or not
-            above the loss; ``gradient`` has what is no parameter of the loss; ``mesh`` beside an Anchor.
+            above the loss; ``gradient`` has what is no parameter of the loss; ``mesh`` with an Anchor.
         NotImplementedError: ``loss`` calls step or solve, which are not refined, continues a BDF2 history that is not
-            its own, asks for estimate_errors, or prescribes positions of stages.
+            its own, has ``Checks(errors=True)``, or prescribes positions of stages.
     """
     if not callable(loss):
         raise TypeError(f"loss: expected a function without arguments, got {type(loss).__name__}")
@@ -237,7 +237,7 @@ class _Runs:
 
     def _differentiated(self, value: Any) -> tuple[Tensor, ...]:
         if not isinstance(value, Tensor) or not value.requires_grad:
-            fail("loss", "a scalar with a graph, beside gradient", "one without")
+            fail("loss", "a scalar with a graph where gradient is given", "one without")
         found = torch.autograd.grad(value.sum(), self.parameters, allow_unused=True)
         for number, gradient in enumerate(found):
             if gradient is None:
@@ -455,7 +455,7 @@ class Halved(NamedTuple):
 def halved(model: Model) -> Halved:
     """Raises ValueError for a Model with an Anchor, which holds single vertices."""
     if any(isinstance(e, Anchor) for e in model.energies):
-        fail("mesh", "False beside an Anchor, which holds single vertices", "True")
+        fail("mesh", "False with an Anchor, which holds single vertices", "True")
     return model.derived("halved", lambda: _halved(model))
 
 

@@ -9,11 +9,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from .._common.checks import check_bool, check_count, check_function, check_kind, check_positive, fail, is_word
+from .._common.checks import check_bool, check_count, check_function, check_kind, check_positive, check_save, fail
 from .._common.context import looks_at, recorders, refinement, replaced
 from .._common.messages import is_own
 from ..adjoint.routes import Adjoint, check_adjoint
@@ -92,6 +91,7 @@ def rollout(
         NotImplementedError: ``Checks(errors=True)`` with contact or friction; another ``checkpoint_every`` than
             ``"auto"`` and ``None`` inside torch.func transforms.
     """
+    check_kind("model", model, Model)
     check_kind("solver", solver, VBD)
     steps, solver = _resolved(steps, duration, solver)
     options = {"save": save, "observe": observe, "checkpoint_every": checkpoint_every, "adjoint": adjoint,
@@ -116,7 +116,7 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
              checkpoint_every: Any, adjoint: Adjoint | None, history: History | None, checks: Checks | None,
              progress: bool) -> Trajectory:  # fmt: skip
     """A rollout of so many steps of the solver's length."""
-    save, checks = _checked_save(save), check_checks(checks, model)
+    save, checks = check_save(save), check_checks(checks, model)
     if observe is not None:
         check_function("observe", observe, "step", "x", "v")
     check_bool("progress", progress)
@@ -233,14 +233,6 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
 
 
 # --- values of each step ----------------------------------------------------------------------------------------------
-
-
-def _checked_save(save: Any) -> Any:
-    if is_word(save, "all", "last"):
-        return save
-    if not isinstance(save, (int, np.integer)) or isinstance(save, bool) or save <= 0:
-        fail("save", '"all", "last" or an integer > 0', repr(save))
-    return int(save)
 
 
 def _check_values(inputs: Given, steps: int) -> None:

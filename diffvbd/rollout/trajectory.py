@@ -98,7 +98,7 @@ class Trajectory:
         x, v: Positions [m] and velocities [m/s] of the saved frames, shape [frames, ..., V, 3].
         steps: Step number of each frame (0: the initial state); the last frame is the final state.
         observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
-        errors: With ``estimate_errors`` those of each step, its tensors of shape [steps, ..., bodies]; else None.
+        errors: With ``Checks(errors=True)`` those of each step, its tensors of shape [steps, ..., bodies]; else None.
         history: With BDF2() that of the last frame, for a rollout that continues; else None.
     """
 

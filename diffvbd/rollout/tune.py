@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._common.checks import check_count, check_kind, check_number, check_positive, check_time_step, fail
+from .._common.checks import check_bool, check_count, check_kind, check_number, check_positive, check_time_step, fail
 from .._common.context import record_to, refined, refuse_transforms
 from .._common.messages import log_progress, percent, silence
 from .._contact.barrier import PairBarrier
@@ -262,7 +262,7 @@ class TrialRuns:
             return
         found = torch.autograd.grad(value, leaves, allow_unused=True) if value.requires_grad else (None, None)
         if all(gradient is None for gradient in found):
-            fail("quantity", "a function that torch can differentiate, beside gradient=True", "one without a graph")
+            fail("quantity", "a function that torch can differentiate, with gradient=True", "one without a graph")
 
     def run(self, settings: VBD, steps: int, quarter: int | None = None, start: TrialRun | None = None) -> TrialRun:
         """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
@@ -457,8 +457,8 @@ def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
     the arguments."""
     refuse_transforms("dv.advise and dv.error_budget, which look at values")
     sorted_inputs(model, given)
-    if not isinstance(gradient, bool):
-        raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
+    check_bool("gradient", gradient)
+    check_bool("progress", progress)
     if gradient and torch.is_inference_mode_enabled():
         fail("gradient", "False inside torch.inference_mode(), which records nothing", "True")
     if quantity is not None and not callable(quantity):
@@ -952,7 +952,7 @@ def advise(
 
 FINER = 4  # times the steps of the finest run
 ENOUGH = 0.1  # of what more sweeps have changed so far: below it they have converged
-DETECTIONS = 8  # in each step of the run that is held up least
+DETECTIONS = 8  # in each step of the run that is truncated least
 
 
 @dataclass(frozen=True)
@@ -984,7 +984,7 @@ class ErrorBudget:
         solver: Whose error it is.
         shares: One for each cause, the largest first, then "all but mesh" together, which need not be their sum.
         duration: Of the motion that was looked at [s].
-        cut: The largest share of vertices that pairs held up in a step [-]; None without pairs.
+        cut: The largest share of vertices that pairs truncated in a step [-]; None without pairs.
         friction: The share of the friction that the last step left unbalanced [-]; None without friction.
         reached: Whether all runs that others are compared with have steps that balance their forces, to 1 %. Where one
             has not, its note says so, and what is compared with it says little.
@@ -1015,7 +1015,7 @@ class ErrorBudget:
                 for s in self.shares]  # fmt: skip
         lines = [f"{self.solver}, {self.duration:.3g} s of motion", *aligned([header, *rows])]
         if self.cut is not None:
-            lines.append(f"pairs held up at most {percent(self.cut)} of the vertices in a step")
+            lines.append(f"pairs truncated at most {percent(self.cut)} of the vertices in a step")
         if self.friction is not None:
             lines.append(f"{percent(self.friction)} of the friction is not balanced in the last step")
         return "\n".join(lines)
@@ -1040,7 +1040,7 @@ def error_budget(
 
     sweeps: the same steps with sweeps until more change nothing and their forces balance. time step: those against
     SDIRK2 with four times the steps. precision: the same run in double precision. contact: the converged steps with
-    more detections in each, where pairs have held up motion.
+    more detections in each, where pairs have truncated motion.
     mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
 
     Args:
@@ -1141,8 +1141,8 @@ class _Budget:
         self.shares.append(self._share("precision", single, done, seconds, "the same in float64"))
 
     def _contact(self, converged: TrialRun, cut: float | None) -> None:
-        """Detections share the sweeps of a step: only where each has enough do they tell what pairs have held up."""
-        model, seconds, done, note = self.trials.model, 0.0, converged, "pairs held up nothing"
+        """Detections share the sweeps of a step: only where each has enough do they tell what pairs have truncated."""
+        model, seconds, done, note = self.trials.model, 0.0, converged, "pairs truncated nothing"
         if cut is None:
             return
         if cut > 0:
@@ -1154,8 +1154,8 @@ class _Budget:
         self.shares.append(self._share("contact", converged, done, seconds, note))
 
     def _contact_of(self) -> tuple[float | None, float | None]:
-        """The largest share of vertices that pairs held up in a step, and of friction left unbalanced by the last one;
-        None where there are no pairs, no friction, or it cannot be told."""
+        """The largest share of vertices that pairs truncated in a step, and of friction left unbalanced by the last
+        one; None where there are no pairs, no friction, or it cannot be told."""
         p, model = self.trials, self.trials.model
         if not model.touches:
             return None, None
@@ -1231,7 +1231,7 @@ def finer_mesh(p: TrialRuns) -> TrialRuns:
     given = dict(p.given)
     for name in given:
         if given[name] is not None and name not in (*MODULI, "density", "gravity", "colliders", "colliders_before"):
-            fail(name, "None beside mesh=True, which has other vertices", type(given[name]).__name__)
+            fail(name, "None with mesh=True, which has other vertices", type(given[name]).__name__)
     fine = halved(p.model)
     for name in (*MODULI, "density"):
         given[name] = _of_parts(given.get(name), p.model.num_tets)

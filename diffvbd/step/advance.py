@@ -106,7 +106,8 @@ def swept(
                     found.append(lengths_of(model, corrections))
             return end
     except ValueError as error:
-        raise named(model, error, given) from None  # the frames of operators say nothing to who gave the argument
+        # the frames of operators say nothing to who gave the argument
+        raise named(model, error, {**given, **prepared.parameters}) from None
 
 
 def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:

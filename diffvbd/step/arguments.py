@@ -259,14 +259,24 @@ def _refuse_lines(model: Model, name: str, points: Tensor) -> None:
 
 def named(model: Model, error: ValueError, arguments: dict[str, Any]) -> ValueError:
     """The error of an operator, or one that names the argument where it could name only what was made of several."""
-    if str(error).startswith(("predictor", "start")):
+    if str(error).startswith(("predictor", "start", "parameters")) or " in record " in str(error):
         try:
             refuse_non_finite(model, arguments)
+            _refuse_record(str(error), arguments)
         except ValueError as found:
             return found
         except RuntimeError:  # under vmap values cannot be looked at
             pass
     return ValueError(*error.args) if type(error) is ValueError else error
+
+
+def _refuse_record(message: str, given: dict[str, Any]) -> None:
+    """Raises for the input of an energy that an operator refuses with all numbers of its plane or vertex."""
+    name, _, rest = message.partition(": expected ")
+    if name == "parameters" and "floor_normal" in given:  # finite as given, and not once its length has been made 1
+        fail("floor_normal", "normals of finite length > 0", "one of length 0")
+    if isinstance(value := given.get(name), Tensor):
+        name_value(name, rest.partition(", got")[0], value, value >= 0 if rest.startswith(">=") else value > 0)
 
 
 def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:

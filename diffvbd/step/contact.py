@@ -347,29 +347,29 @@ class ContactStep:
         if needed > self.capacity:
             raise TooManyPairs(
                 -(-needed // scenes),
-                f"capacity: {needed} pairs in part {r} of the step do not fit {self.capacity} "
+                f"capacity: {needed} pairs in substep {r} of the step do not fit {self.capacity} "
                 f"({-(-self.capacity // scenes)} per scene): "
                 f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})",
             )
         if touching:
             self._refuse_what_is_not_finite()
             if pair < 0:
-                raise RuntimeError(LOST.format(f"before part {r} of the step"))
+                raise RuntimeError(LOST.format(f"before substep {r} of the step"))
             scene, corners = surface.corners_of(pair)
             vertices = self.x_prev.shape[1]
             named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"
             owners = surface.owners_of(corners[0], corners[3])
             raise ValueError(
                 f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap "
-                + (f"in part {r} of the step" if r else "at the start of the step")
+                + (f"in substep {r} of the step" if r else "at the start of the step")
                 + f", one of the corner points {corners} of {owners} in scene {scene}: "
                 + advice_to_part(self.x_prev, self.origin, self.barrier.dhat)
             )
         if hindered:
             raise ValueError(
-                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} "
-                f"of {self.parts} that it would bring too close: spread a long way over more steps (per_step), give "
-                "PairBarrier a larger number of detections, or use a smaller time_step"
+                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in substep "
+                f"{r} of {self.parts} that it would bring too close: spread a long way over more steps (per_step), "
+                "give PairBarrier a larger number of detections, or use a smaller time_step"
             )
 
     def _refuse_what_is_not_finite(self) -> None:

@@ -73,7 +73,7 @@ def check_history(integrator: Integrator, history: Any, x: Tensor, time_step: An
     if history is None:
         return
     if not isinstance(integrator, BDF2):
-        fail("history", f"None beside {type(integrator).__name__}(), which has none", type(history).__name__)
+        fail("history", f"None with {type(integrator).__name__}(), which has none", type(history).__name__)
     if not isinstance(history, History):
         raise TypeError(f"history: expected what a step with BDF2() returns, got {type(history).__name__}")
     flags = torch.empty(x.shape[:-1], dtype=torch.bool, device=x.device)

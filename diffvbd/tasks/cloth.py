@@ -27,7 +27,7 @@ def few_sweeps() -> Iterator[None]:
     cloth is coarse, and thick as the full one. Target and fit take the same steps, so the fit still has an exact
     solution."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "(contact|pair_barrier): pairs", UserWarning)
+        warnings.filterwarnings("ignore", "contact: pairs", UserWarning)
         warnings.filterwarnings("ignore", "sweeps: .* (too few for tets|has gained|may be off by)", UserWarning)
         warnings.filterwarnings("ignore", "mesh: tets .* bend", UserWarning)
         yield

@@ -191,7 +191,7 @@ def test_prescribed_motion_above_a_bound(device: str, value_checks: None, detect
     end, _ = dv.step(model, x, v, prescribed=x + up, **step)
     assert dv.contact.status(model).hindered == 0 and apart(model, end)
     with pytest.raises(ValueError, match=r"prescribed or colliders: expected motion that leaves .* got \d+ pairs .*"
-                                         rf"in part \d of {detections} .*detections"):  # fmt: skip
+                                         rf"in substep \d of {detections} .*detections"):  # fmt: skip
         dv.step(model, x, v, prescribed=x + 2 * up, **step)
     assert dv.contact.status(model).hindered > 0
 
@@ -212,7 +212,7 @@ def test_a_collider_above_its_bound_raises_and_in_smaller_parts_does_not(device:
         options: dict[str, Any] = {"gravity": WEIGHTLESS, **MATERIAL, "solver": dv.VBD(0.01, 4)}
         options |= {"colliders": before + up, "colliders_before": before}
         if detections == 1:
-            with pytest.raises(ValueError, match=r"prescribed or colliders: .* got \d+ pairs in part 0 of 1"):
+            with pytest.raises(ValueError, match=r"prescribed or colliders: .* got \d+ pairs in substep 0 of 1"):
                 dv.step(model, x, torch.zeros_like(x), **options)
         else:
             end, _ = dv.step(model, x, torch.zeros_like(x), **options)

@@ -89,7 +89,7 @@ def test_smaller_tapes_give_the_same_gradients(name: str, tape: str, device: str
 
 def test_the_scenes_meet_every_kind_of_contact() -> None:
     """Point-triangle, edge-edge and point-plane pairs; closest points on faces, edges and corners; vertices that are
-    held up and vertices that are not; mollified pairs of edges."""
+    truncated and vertices that are not; mollified pairs of edges."""
     kinds, features, cut, free, mollified = set(), set(), 0, 0, 0
     for name in SCENES:
         scene = scene_of(name)

@@ -272,7 +272,7 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
         )
     ),
     ("energies", {"energies": ("neo",)}, "str"),
-    ("energies", {"energies": (dv.StableNeoHookean,)}, "type"),
+    ("energies", {"energies": (dv.StableNeoHookean,)}, "the class StableNeoHookean"),
     ("energies", {"energies": None}, "None"),
     ("energies", {"energies": (dv.StableNeoHookean(), dv.StableNeoHookean())}, "two"),
     ("energies", {"energies": (dv.FloorBarrier(), dv.FloorBarrier(1.0))}, "two"),

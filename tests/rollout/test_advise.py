@@ -174,8 +174,8 @@ def test_a_bounce_that_steps_resolve() -> None:
         (lambda x, v: (x > 0).sum(), False, "floating scalar, got torch.int64"),
         (lambda x, v: (x > 0).any(), False, "floating scalar, got torch.bool"),
         (lambda x, v: math.nan * x.sum(), False, "finite value after the first step, got nan"),
-        (lambda x, v: x.detach().sum(), True, "beside gradient=True, got one without a graph"),
-        (lambda x, v: torch.ones((), requires_grad=True), True, "beside gradient=True, got one without a graph"),
+        (lambda x, v: x.detach().sum(), True, "with gradient=True, got one without a graph"),
+        (lambda x, v: torch.ones((), requires_grad=True), True, "with gradient=True, got one without a graph"),
     ],
 )
 @pytest.mark.parametrize("judge", ["advise", "budget"])

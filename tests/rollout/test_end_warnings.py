@@ -264,7 +264,7 @@ def test_a_wrong_argument_is_named() -> None:
         dv.rollout(model, x, v, steps=1, **SOFT, checks=dv.Checks(energy=1))  # pyright: ignore[reportArgumentType]
 
 
-# --- pairs that hold up, friction that has not converged --------------------------------------------------------------
+# --- pairs that truncate, friction that has not converged ------------------------------------------------------------
 
 
 FAST: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "solver": dv.VBD(0.002, 3)}
@@ -288,10 +288,10 @@ def sliding(**friction: float) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
 
 def test_motion_that_pairs_held_up_is_warned_of() -> None:
     model, x, v = thrown()
-    with pytest.warns(UserWarning, match=r"contact: pairs held up .* larger reach") as found:
+    with pytest.warns(UserWarning, match=r"contact: pairs truncated .* larger reach") as found:
         dv.rollout(model, x, v, steps=1, **FAST, checks=dv.Checks(contact=True))
     assert found[0].filename == __file__
-    assert sum("pairs held up" in str(w.message) for w in found) == 1
+    assert sum("pairs truncated" in str(w.message) for w in found) == 1
     assert cut_share(system_of(model, FAST["solver"])) > CUT
 
 
@@ -320,7 +320,7 @@ def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
                 )
                 ends.append((end.x[-1].detach(), torch.autograd.grad(end.x[-1].square().sum(), start)[0]))
 
-            assert sum("pairs held up" in text for text in messages(run)) == int(check)
+            assert sum("pairs truncated" in text for text in messages(run)) == int(check)
     for end, slope in ends[1:]:
         assert torch.equal(end, ends[0][0]) and torch.equal(slope, ends[0][1]) and slope.any()
 

@@ -82,7 +82,7 @@ def test_contact_and_friction() -> None:
     assert {"sweeps", "time step", "contact", "all but mesh"} == set(shares(budget))
     assert budget.cut is not None and 0 <= budget.cut <= 1
     assert budget.friction is not None and budget.friction >= 0
-    assert "of the friction" in str(budget) and "held up" in str(budget)
+    assert "of the friction" in str(budget) and "truncated" in str(budget)
     assert 0 < budget.total < 1
 
 
@@ -97,7 +97,7 @@ def test_contact_and_friction() -> None:
         ({"gradient": 1}, TypeError, "gradient: expected a bool, got int"),
         ({"mesh": "yes"}, TypeError, "mesh: expected a bool, got str"),
         ({"steps": 3}, TypeError, "steps: expected an input of this Model"),
-        ({"mesh": True, "force": torch.zeros(28, 3, dtype=torch.float64)}, ValueError, "force: expected None beside"),
+        ({"mesh": True, "force": torch.zeros(28, 3, dtype=torch.float64)}, ValueError, "force: expected None with"),
     ],
 )
 def test_bad_input(given, error, text) -> None:

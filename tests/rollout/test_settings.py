@@ -1,6 +1,8 @@
 """What a solver is refused for, and the number of its steps over a duration."""
 
 import dataclasses
+import math
+import re
 
 import pytest
 import torch
@@ -51,6 +53,74 @@ def test_what_does_not_go_together_raises(given, error, text) -> None:
 def test_a_solver_is_checked_where_it_is_made(given, error, text) -> None:
     with pytest.raises(error, match=text):
         dv.VBD(**{"time_step": 0.01, "sweeps": 5} | given)
+
+
+FLOOR = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1.0, kappa=1e3, dhat=0.02))
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "where"),
+    [
+        ("Model", "time_step", "got an argument of dv.VBD"),
+        ("Model", "relaxation", "got an argument of dv.VBD"),
+        ("Model", "mu", "got an input of dv.step and dv.rollout"),
+        ("Model", "densty", "is 'density' meant"),
+        ("VBD", "coarse", 'it is dv.VBD(subspace="coarse") now'),
+        ("VBD", "gravity", "got an input of dv.step and dv.rollout"),
+        ("VBD", "detections", "got an argument of dv.PairBarrier"),
+        ("Checks", "estimate_errors", "it is dv.Checks(errors=True) now"),
+        ("memory", "sweeps", "got an argument of dv.VBD"),
+        ("step", "steps", "got an argument of dv.rollout"),
+        ("step", "settings", "it is a dv.VBD, the argument solver now"),
+        ("step", "floor_barrier.height", "is 'floor_height' meant"),
+        ("rollout", "time_step", "got an argument of dv.VBD"),
+        ("rollout", "parameters", "it is an input of its own for each parameter, as floor_kappa= now"),
+        ("rollout", "check_start", "it is dv.Checks(start=) now"),
+        ("rollout", "stepss", "is 'steps' meant"),
+        ("solve", "coarse", 'it is dv.VBD(subspace="coarse") now'),
+        ("advise", "sweeps", "got an argument of dv.VBD"),
+    ],
+)
+def test_a_name_that_a_call_does_not_have_raises_and_says_what_has_it(call: str, name: str, where: str) -> None:
+    model, solver = dv.Model(dv.mesh.cube(), energies=FLOOR), dv.VBD(0.01, 5)
+    state = (model.rest_points, torch.zeros_like(model.rest_points))
+    calls = {
+        "Model": lambda **given: dv.Model(model.mesh, **given),
+        "VBD": lambda **given: dv.VBD(0.01, 5, **given),
+        "Checks": dv.Checks,
+        "memory": lambda **given: dv.memory(model, solver, **given),
+        "step": lambda **given: dv.step(model, *state, solver, **MATERIAL, **given),
+        "rollout": lambda **given: dv.rollout(model, *state, solver, steps=1, **MATERIAL, **given),
+        "solve": lambda **given: dv.solve(model, *state, solver, **MATERIAL, **given),
+        "advise": lambda **given: dv.advise(model, *state, duration=0.1, **MATERIAL, **given),
+    }
+    with pytest.raises(TypeError, match=rf"^{re.escape(name)}: expected an (argument|input) of .*{re.escape(where)}"):
+        calls[call](**{name: 1})
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "text"),
+    [
+        (lambda m, x: dv.rollout(None, x, x, dv.VBD(0.01, 5), steps=1), TypeError, "model: expected a diffvbd.Model"),
+        (lambda m, x: dv.step(m, x, 0 * x, dv.VBD(0.01, 5), floor_height=math.nan, **MATERIAL), ValueError,
+         "floor_height: expected finite values, got nan"),
+        (lambda m, x: dv.step(m, x, 0 * x, dv.VBD(0.01, 5), floor_kappa=-1.0, **MATERIAL), ValueError,
+         "floor_kappa: expected >= 0 N/m, got -1 at"),
+        (lambda m, x: dv.step(m, x, 0 * x, dv.VBD(0.01, 5), floor_normal=0 * x[0], **MATERIAL), ValueError,
+         "floor_normal: expected normals of finite length > 0"),
+        (lambda m, x: dv.contact.forces(m, x, floor_height=math.nan), ValueError, "floor_height: expected finite"),
+        (lambda m, x: dv.advise(m, x, 0 * x, duration=0.1, progress=3, **MATERIAL), TypeError,
+         "progress: expected a bool, got int"),
+        (lambda m, x: dv.memory(m, dv.VBD(0.01, 5), save="first"), ValueError, 'save: expected "all", "last"'),
+        (lambda m, x: dv.debug_checks("no").__enter__(), TypeError, "enabled: expected a bool, got str"),
+        (lambda m, x: dv.VBD(0.01, 5, prediction=3), TypeError, "prediction: expected None, got int"),
+        (lambda m, x: dv.Model(m.mesh, energies=(dv.StableNeoHookean,)), TypeError, "got the class StableNeoHookean"),
+    ],
+)  # fmt: skip
+def test_bad_values_raise_by_the_name_of_their_argument(call, error, text) -> None:
+    model = dv.Model(dv.mesh.cube(), energies=FLOOR)
+    with pytest.raises(error, match=text):
+        call(model, model.rest_points)
 
 
 @pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf"), "1", None])

@@ -345,7 +345,7 @@ def test_bad_integrators() -> None:
 @pytest.mark.parametrize(
     ("integrator", "options", "match"),
     [
-        (dv.SDIRK2(), {"history": (1, 2)}, "history: expected None beside SDIRK2"),
+        (dv.SDIRK2(), {"history": (1, 2)}, "history: expected None with SDIRK2"),
         (dv.BDF2(), {"history": (1, 2)}, "history: expected what a step with BDF2"),
         (dv.BDF2(), {"history": dv.results.History(*[torch.zeros(1)] * 3, 0.01)}, "history.moved: expected shape"),
         (dv.ImplicitEuler(), {"prescribed": (torch.zeros(3), torch.zeros(3))}, "prescribed: expected"),
