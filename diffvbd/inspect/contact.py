@@ -41,8 +41,9 @@ class Status:
             the CPU, without a ``capacity`` of the PairBarrier, lists are as long as they must be, up to so many.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
         hindered: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
-        cut: Truncated vertices of the last sweep, or without sweeps of the start, and vertices of bodies that the last
-            rigid correction truncated: they lost velocity that no force took, [scenes].
+        cut: Truncated vertices, [scenes]: those that contact stopped on their way in the last sweep (at the start of
+            the step if there are no sweeps) or with their body in the last rigid correction. They lost velocity that
+            no force took.
         smallest_gap: The smallest gap that a detection found [m], or the search distance, [scenes].
     """
 
@@ -81,9 +82,9 @@ def status(model: Model) -> Status:
 
 
 def reserve(model: Model, pairs: int) -> None:
-    """Room of a Model for ``pairs`` pairs per scene, more or less than it had, from its next step on. A captured
-    graph keeps the room that it was captured with. Without a ``capacity`` of the PairBarrier an eager step still takes
-    more where it needs more.
+    """Capacity of the lists of a Model for ``pairs`` pairs per scene, from its next step on. A captured graph keeps the
+    capacity that it was captured with. Without a ``capacity`` of the PairBarrier an eager step still takes more where
+    it needs more.
 
     Raises:
         ValueError, TypeError: If the Model has no PairBarrier, or for a number < 1.

@@ -99,13 +99,13 @@ def listed(ids: IntArray, noun: str) -> str:
     return f"{len(ids)} {noun}{'' if len(ids) == 1 else 's'}: {shown}"
 
 
-def count(name: str, value: Any, least: int) -> int:
-    """`value` as an int of at least `least`."""
+def count(name: str, value: Any, least: int, noun: str = "") -> int:
+    """`value` as an int of at least `least`; ``noun`` says of what."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"{name}: expected an integer, got {value!r}")
     if not least <= value <= MOST:
         bound = f"at least {least}" if value < least else f"at most {MOST}"
-        raise ValueError(f"{name}: expected {bound}, got {value}")
+        raise ValueError(f"{name}: expected {bound}{noun and ' '}{noun}, got {value}")
     return int(value)
 
 

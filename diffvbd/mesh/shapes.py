@@ -35,7 +35,8 @@ def box(n: int | Sequence[int] = 2, size: float | Sequence[float] = 1.0, split: 
     """Box with one corner at the origin.
 
     Args:
-        n: Vertices per axis, at least 2: one number or (nx, ny, nz). Vertex (i, j, k) has index (i ny + j) nz + k.
+        n: Vertices (not cells) per axis, at least 2: one number or (nx, ny, nz). Vertex (i, j, k) has index
+            (i ny + j) nz + k.
         size: Edge lengths [m]: one number or (x, y, z).
         split: "five" cuts each cell into 5 tets, mirrored from cell to cell; "kuhn" into 6 equal ones, all cells alike,
             whose diagonals point one way: a bar bends sideways by 11, 3 and 1 % of its sag with 3, 5 and 7 vertices
@@ -44,7 +45,7 @@ def box(n: int | Sequence[int] = 2, size: float | Sequence[float] = 1.0, split: 
     Raises:
         TypeError, ValueError: a count that is no integer or below 2, a size that is not positive, an unknown split.
     """
-    counts = [count("n", k, 2) for k in (n if isinstance(n, (Sequence, np.ndarray)) else (n, n, n))]
+    counts = [count("n", k, 2, "vertices") for k in (n if isinstance(n, (Sequence, np.ndarray)) else (n, n, n))]
     if len(counts) != 3:
         raise ValueError(f"n: expected one number or three, got {len(counts)}")
     lengths = _lengths("size", size if np.ndim(size) else [size] * 3, 3)
@@ -69,13 +70,13 @@ def beam(
     nx: int = 21, ny: int = 7, nz: int = 7, size: Sequence[float] = (0.5, 0.2, 0.2), split: Split = "five"
 ) -> TetMesh:
     """Beam along x: a box of nx, ny, nz vertices per axis. Arguments and errors as for `box`."""
-    counts = [count(name, n, 2) for name, n in (("nx", nx), ("ny", ny), ("nz", nz))]
+    counts = [count(name, n, 2, "vertices") for name, n in (("nx", nx), ("ny", ny), ("nz", nz))]
     return box(counts, size, split)
 
 
 def cube(n: int = 2, size: float = 1.0, split: Split = "five") -> TetMesh:
     """Cube with n vertices per axis; `cube()` has 8 vertices and 5 tets. Arguments and errors as for `box`."""
-    return box(count("n", n, 2), positive("size", size), split)
+    return box(count("n", n, 2, "vertices"), positive("size", size), split)
 
 
 def shell(points: Any, triangles: Any, thickness: float) -> TetMesh:

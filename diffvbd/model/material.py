@@ -133,7 +133,7 @@ def moduli_of(model: Any, lead: tuple[int, ...], mu: Any, lam: Any, young: Any, 
         return mu, lam
     for name, value in (("mu", mu), ("lam", lam)):
         if value is not None:
-            raise TypeError(f"{name}: expected None with young and poisson, got {type(value).__name__}")
+            raise TypeError(f"{name}: expected mu and lam, or young and poisson, got a mixture of both")
     pair = {"young": young, "poisson": poisson}
     for name, value in pair.items():
         if value is None:

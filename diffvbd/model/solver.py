@@ -71,7 +71,7 @@ class VBD:
             potential is least, before and after the sweeps, so that it rests, falls and spins right at any number of
             sweeps (pairs and friction have a correction of their own). ``"coarse"`` or a :class:`diffvbd.CoarseSpace`:
             between the sweeps also smooth deformations of each body, for what is stiff, long, thin or finely meshed.
-            None: plain sweeps.
+            None: plain sweeps, apart from the correction of pairs and friction.
         integrator: :class:`diffvbd.ImplicitEuler`, :class:`diffvbd.SDIRK2` or :class:`diffvbd.BDF2`.
         block: ``"exact"`` uses the exact 3x3 block of a vertex (lam + mu along dJ/dx_i): with it every update minimises
             the incremental potential in its vertex. ``"paper"`` uses lam there, which guarantees descent only where

@@ -271,7 +271,7 @@ def test_bad_meshes_are_named(points, tets, body, error, says):
 @pytest.mark.parametrize(
     ("call", "error", "says"),
     [
-        (lambda: dm.beam(1, 3, 3), ValueError, "nx: expected at least 2, got 1"),
+        (lambda: dm.beam(1, 3, 3), ValueError, "nx: expected at least 2 vertices, got 1"),
         (lambda: dm.cube(2.0), TypeError, "n: expected an integer, got 2.0"),
         (lambda: dm.cube(size=-1), ValueError, "size: expected a positive length, got -1"),
         (lambda: dm.box((2, 2)), ValueError, "n: expected one number or three, got 2"),
