@@ -61,6 +61,7 @@ CPU_SOURCES = [
 
 # -ffp-contract=off: the same bits from every instruction set. -fno-math-errno: sqrt is one instruction.
 FLAGS = ["-O3", "-g0", "-fno-math-errno", "-ffp-contract=off", "-Wno-psabi", "-Wno-ignored-attributes"]
+FLAGS += ["-Wno-attributes"]  # torch hides its Tensor, so GCC warns of each struct with one
 if INSTRUCTION_SETS == ["baseline"]:
     FLAGS += ["-DDIFFVBD_NO_CLONES"]
 if QUICK:

@@ -24,7 +24,7 @@ struct EnergyList {
 using VertexEnergies = EnergyList<FloorBarrier, Anchor>;
 constexpr int kVertexEnergies = VertexEnergies::size;
 // Bits of a mask: the elastic block, contact, then the energies of the list, so that a new one moves no other bit.
-// Twins stand in diffvbd/mask.py.
+// Twins stand in diffvbd/_common/constants.py.
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
 constexpr int kElastic = kExactBlock | kPaperBlock;
 constexpr int kContact = 4;

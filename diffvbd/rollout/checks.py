@@ -15,7 +15,6 @@ from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
 from .._common.context import is_captured, looks_at, may_copy, replaced
 from .._common.messages import is_silent, page, percent, warn
-from ..energies import Anchor
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import Integrator
@@ -351,7 +350,7 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
         or not model.energy_mask & ELASTIC
     ):
         return None
-    if any(isinstance(e, Anchor) for e in model.energies):  # springs
+    if any(e is not model.floor for e in model.vertex_energies):  # springs, and what a user adds, store energy, too
         return None
     if asked is None:
         if x.is_cuda or not looks_at(x) or steps < LEAST_STEPS:

@@ -15,7 +15,6 @@ from .._common.checks import check_positive, fail, to_float
 from .._common.constants import ELASTIC
 from .._common.context import Finer, record_to, refined
 from .._common.messages import percent
-from ..energies import Anchor
 from ..mesh import subdivide
 from ..model.inputs import MODULI
 from ..model.model import Model
@@ -453,9 +452,10 @@ class Halved(NamedTuple):
 
 
 def halved(model: Model) -> Halved:
-    """Raises ValueError for a Model with an Anchor, which holds single vertices."""
-    if any(isinstance(e, Anchor) for e in model.energies):
-        fail("mesh", "False with an Anchor, which holds single vertices", "True")
+    """Raises ValueError for a Model with an energy that has data of each vertex, such as an Anchor."""
+    for energy in model.vertex_energies:
+        if energy.per_vertex:
+            fail("mesh", f"False: the {type(energy).__name__} acts on vertices, which a finer mesh has not", "True")
     return model.derived("halved", lambda: _halved(model))
 
 
