@@ -98,9 +98,10 @@ class VertexEnergy:
     def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         """h^2 dE/dx [kg m] of every vertex, from the packed ``data``; what GlobalAdjoint differentiates.
 
-        data: Of each vertex [1 | B, V n]. Of a scene [1 | B, n], or repeated for each vertex [B, V, n], so that it is
-            differentiated in a fixed order. n is count().
-        x, x_prev: State and start of the step [m], relative to origin where there is one, [B, V, 3].
+        Args:
+            data: Of each vertex [1 | B, V n]. Of a scene [1 | B, n], or repeated for each vertex [B, V, n], so that it
+                is differentiated in a fixed order. n is count().
+            x, x_prev: State and start of the step [m], relative to origin where there is one, [B, V, 3].
         """
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
