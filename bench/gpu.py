@@ -204,7 +204,7 @@ def _grid_row(card: Card, mesh: dv.TetMesh, sweeps: int) -> Row:
     if 2 * GRID_STEPS * step_ms > 15e3 or not card.cuda:
         return {**row, "note": f"peak of {GRID_STEPS} steps not measured"}
     row["rollout_peak"] = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "auto", "auto"))
-    predicted = model.memory(dv.VBD(0.01, sweeps, tape="full"), steps=GRID_STEPS, checkpoint_every=None)
+    predicted = dv.memory(model, dv.VBD(0.01, sweeps, tape="full"), steps=GRID_STEPS, checkpoint_every=None)
     if predicted["total"] < room(card):
         own = card.allocated() - before - scene.bytes
         peak = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None))

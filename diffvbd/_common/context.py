@@ -1,4 +1,4 @@
-"""State inside a ``with``, for the thread or task that is in it: debug_checks(), contact.record() and refine().
+"""State inside a ``with``, for the thread or task that is in it: debug_checks(), record() and refine().
 
 Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
 guards, and so sees what any thread is inside of.
@@ -103,7 +103,7 @@ def not_compiled(function: F) -> F:
 
 
 def recorders(kind: str = "contact") -> tuple[list[Any], ...]:
-    """The lists that contact.record(), or coarse.record(), has given."""
+    """The lists that record("contact"), or record("subspace"), has given."""
     given = _recorders if torch.compiler.is_compiling() else _recording.get()
     return tuple(found for of, found in given if of == kind)
 

@@ -490,7 +490,7 @@ def of_going(part: SweptPart, going: Tensor) -> SweptPart:
 
 
 def record_parts(model: System, x: Tensor, parts: Sequence[SweptPart]) -> None:
-    """For coarse.record(): what the parts of a step that ends at x have done."""
+    """For record("subspace"): what the parts of a step that ends at x have done."""
     if model.coarse is not None:
         for found in recorders("subspace"):
             lengths = [part.lengths for part in parts if part.lengths is not None]
