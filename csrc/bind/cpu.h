@@ -36,16 +36,6 @@ class Device {
   Tensor operator()(Ints sizes, bool zeroed) const { return zeroed ? zeros(sizes) : empty(sizes); }
   Tensor like_x() const { return torch::stable::empty_like(like_); }
 
-  // Calls act(body, team) or act(scene, vertex) for all of them.
-  template <class Act>
-  void bodies(const Act& act) const {
-    for_bodies(act.in.scene, act);
-  }
-  template <class Act>
-  void vertices(const Act& act) const {
-    for_vertices(act.in.scene, act);
-  }
-
  private:
   const Tensor& like_;
 };

@@ -116,16 +116,6 @@ class Device {
     return value;
   }
 
-  // Calls act(body, team) or act(scene, vertex) for all of them.
-  template <class Act>
-  void bodies(const Act& act) const {
-    cuda::check(cuda::act_on_bodies(act, stream()), "work on bodies");
-  }
-  template <class Act>
-  void vertices(const Act& act) const {
-    cuda::check(cuda::act_on_vertices(act, stream()), "work on vertices");
-  }
-
  private:
   torch::stable::accelerator::DeviceGuard guard_;
   const Tensor& like_;

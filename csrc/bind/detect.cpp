@@ -1,5 +1,9 @@
-// Operators that search: pairs of primitives, intersections of surfaces, islands of bodies.
-#include "detect.h"
+// Operators that search: pairs of primitives, intersections of surfaces.
+#include "../contact/detection.h"
+
+#include <cmath>
+
+#include "backend.h"
 
 namespace diffvbd {
 namespace {
@@ -107,21 +111,6 @@ DIFFVBD_OPERATOR(Out<3>, contact_intersections, In x, In origin, In collider, In
     DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::intersections_workspace_bytes<T>(in, capacity));)
     DIFFVBD_RUN(device, find_intersections<T>, in, out DIFFVBD_ON_CUDA(, work.data_ptr()));
     return Out<3>(pairs, counts, first);
-  });
-}
-
-// The smallest body of the island that each body is in [B, bodies] int32, or -1 (contact/islands.h).
-DIFFVBD_OPERATOR(Tensor, contact_islands, In x, In origin, In move, In mass, In collider, In collider_next, In planes,
-                 In body, In body_order, In body_ptr, In held, In radius, In room, int64_t mesh_bodies, double dhat,
-                 bool any_direction) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    const auto in = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
-                                     held, radius, room, mesh_bodies, dhat, any_direction);
-    Tensor island = device.empty({in.scenes, in.mesh_bodies}, ScalarType::Int);
-    DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::islands_workspace_bytes<T>(in));)
-    DIFFVBD_RUN(device, find_islands<T>, in, data<int32_t>(island) DIFFVBD_ON_CUDA(, work.data_ptr()));
-    return island;
   });
 }
 

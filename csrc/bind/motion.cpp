@@ -1,10 +1,8 @@
-// Operators on how bodies want to move, and how far they may: rigid motions, rooms, what contact bears.
+// Operators on how bodies want to move, and how far they may: rigid motions and trust-region radii.
 #include "../contact/motion.h"
 
-#include "../contact/residual_acceleration.h"
 #include "../contact/trust_region.h"
 #include "contact.h"
-#include "detect.h"
 
 namespace diffvbd {
 namespace {
@@ -39,87 +37,47 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In f
     return Out<3>(rigid, ways, sums);
   });
 }
-DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In mass, In move, In held, In held_bodies,
-                 In order, In ptr) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
-    const Reader<T> read(x);
-    in.pinned_bodies = read.flags("held_bodies", held_bodies, in.bodies);
-    Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
-    const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
-                                         data<T>(mass_bar)};
-    DIFFVBD_RUN(device, reverse_motion<T>, in, out);
-    return Out<3>(x_bar, mass_bar, move_bar);
-  });
-}
-
-// The ways of `move`, of free bodies without what stretches them, see contact/coast.h. It asks for no origin, which all
-// vertices of a body have in common.
-DIFFVBD_OPERATOR(Tensor, contact_coast, In x, In mass, In move, In held, In held_bodies, In order, In ptr,
-                 double chord) {
-  const Device device(x);
-  require(chord != 0, "diffvbd::contact_coast: expected chord other than 0");
-  return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, device.empty({0}), mass, move, held, order, ptr);
-    in.pinned_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
-    Tensor coasted = device.like_x();
-    DIFFVBD_RUN(device, extrapolate<T>, in, chord, data<T>(coasted));
-    return coasted;
-  });
-}
-DIFFVBD_OPERATOR(Out<3>, contact_coast_backward, In bar, In x, In mass, In move, In held, In held_bodies, In order,
-                 In ptr, double chord) {
-  const Device device(x);
-  require(chord != 0, "diffvbd::contact_coast: expected chord other than 0");
-  return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, device.empty({0}), mass, move, held, order, ptr);
-    const Reader<T> read(x);
-    in.pinned_bodies = read.flags("held_bodies", held_bodies, in.bodies);
-    Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
-    const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
-                                         data<T>(mass_bar)};
-    DIFFVBD_RUN(device, reverse_extrapolate<T>, in, chord, out);
-    return Out<3>(x_bar, mass_bar, move_bar);
-  });
-}
-
-// How far bodies may go until pairs are found again, see contact/rooms.h: their islands [B, bodies] int32, rooms and
-// rooms of their own [B, bodies + 1], and how far they want to go over the most room [B, bodies].
-DIFFVBD_OPERATOR(Out<4>, contact_rooms, In x, In origin, In mass, In move, In held, In order, In ptr, In rigid, In ways,
-                 In sums, In floor, In collider, In collider_next, In planes, In body, In radius, In most,
-                 In most_alone, In most_own, In least_own, double dhat, double share, double least, bool any_direction,
-                 bool self_contact) {
+// Islands of bodies [B, bodies] int32, their translations [B, bodies, 3], trust-region and deformation radii [B,
+// bodies + 1] and how far bodies want to move over the largest radius [B, bodies], see contact/trust_region.h. held
+// [N]; floor: planes in the data of FloorBarrier, or empty.
+DIFFVBD_OPERATOR(Out<5>, contact_rooms, In x, In origin, In mass, In move, In held, In order, In ptr, In ways, In sums,
+                 In floor, In collider, In collider_next, In planes, In body, In radius, In most, In most_alone,
+                 In most_own, In least_own, double dhat, double share, double least, bool self_contact) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     contact::RadiusInputs<T> in{};
     in.motion = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
-    const int64_t b = read.b, bodies = in.motion.bodies, rows = b * bodies;
-    const int64_t count = planes.size(0) + planes_of(floor);
-    const Tensor island = device.empty({b, bodies}, ScalarType::Int), room = device.empty({b, bodies + 1}),
-                 own_room = device.empty({b, bodies + 1}), over = device.empty({b, bodies}),
-                 memory = device.empty({b * (count * contact::kPlaneScalars + 1 + 3 * bodies)});
-    in.islands = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, order, ptr, held,
-                                  radius, room, bodies, dhat, any_direction);
-    in.rigid = read.vectors("rigid", rigid);
+    const int64_t b = read.b, bodies = in.motion.bodies, rows = b * bodies, n = body.numel(), colliders = n - read.v;
+    require(read.v <= n && b * n <= std::numeric_limits<int32_t>::max(),
+            "contact: expected body of shape [N], N >= vertices, and at most 2^31 corner points in all scenes");
+    const Tensor island = device.empty({b, bodies}, ScalarType::Int), u = device.empty({b, bodies, 3}),
+                 room = device.empty({b, bodies + 1}), own_room = device.empty({b, bodies + 1}),
+                 over = device.empty({b, bodies}), memory = device.empty({b * (1 + bodies)});
+    contact::IslandInputs<T>& of = in.islands;
+    of.x = in.motion.x, of.move = in.motion.move, of.origin = read.vectors_or_null("origin", origin);
+    of.mass = in.motion.mass.data, of.mass_scene = in.motion.mass.scene;
+    of.collider = read.like("collider", collider, 3 * b * colliders);
+    of.collider_next = read.like("collider_next", collider_next, 3 * b * colliders);
+    of.planes = read.index("planes", planes, 3 * planes.size(0)), of.body = read.index("body", body, n);
+    of.body_order = in.motion.order, of.body_ptr = in.motion.ptr;
+    of.pinned = read.flags("held", held, n), of.radius = read.like("radius", radius, n);
+    of.scenes = b, of.vertices = in.motion.vertices, of.corners = static_cast<int32_t>(n);
+    of.num_planes = static_cast<int32_t>(planes.size(0)), of.mesh_bodies = in.motion.bodies;
+    of.half = static_cast<T>(dhat / 2), of.floor = floor_of(read, floor), of.floor_planes = planes_of(floor);
     in.displacements = read.like("ways", ways, contact::kDisplacements * rows),
     in.sums = read.like("sums", sums, 4 * rows);
     in.most = read.like("most", most, bodies), in.most_alone = read.like("most_alone", most_alone, bodies);
     in.most_own = read.like("most_own", most_own, bodies), in.least_own = read.like("least_own", least_own, bodies);
-    in.floor_planes = planes_of(floor), in.floor = floor_of(read, floor);
     in.fraction = static_cast<T>(share), in.least = static_cast<T>(least);
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
     contact::RadiusWork<T> work{};
-    T* at = data<T>(memory);
-    const auto take = [&](T*& pointer, int64_t size) { pointer = at, at += size; };
-    take(work.planes, b * in.planes() * contact::kPlaneScalars), take(work.pushed, b);
-    take(work.stopped, rows), take(work.bent, rows), take(work.most, rows);
-    work.island = data<int32_t>(island);
-    work.trust_radius = data<T>(room), work.deformation_radius = data<T>(own_room), work.over = data<T>(over);
-    DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(in.islands));)
+    work.pushed = data<T>(memory), work.most = work.pushed + b;
+    work.island = data<int32_t>(island), work.u = data<T>(u), work.over = data<T>(over);
+    work.trust_radius = data<T>(room), work.deformation_radius = data<T>(own_room);
+    DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(of));)
     DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
-    return Out<4>(island, room, own_room, over);
+    return Out<5>(island, u, room, own_room, over);
   });
 }
 
@@ -148,60 +106,6 @@ DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move,
     const Tensor wishes = device.empty({in.scenes, in.bodies}), most = device.empty({in.scenes});
     DIFFVBD_RUN(device, sweep_radii<T>, in, data<T>(wishes), data<T>(most), data<T>(out));
     return out;
-  });
-}
-
-template <class T>
-contact::ResidualInputs<T> unsupported_inputs(const Tensor& x, const Tensor& origin, const Tensor& lift,
-                                              const Tensor& force, const Tensor& mass, const Tensor& planes,
-                                              const Tensor& held_bodies, const Tensor& order, const Tensor& ptr,
-                                              double time_step) {
-  const Reader<T> read(x);
-  contact::ResidualInputs<T> in{};
-  read.by_body(in.scene, order, ptr);
-  in.scene.x = read.positions();
-  in.scene.x_prev = {in.scene.x, 3 * read.v};  // a floor's damping, which reads it, is not asked for
-  in.scene.mass = read.batch("mass", mass, read.v);
-  in.scene.origin = read.batch_or_null("origin", origin, 3 * read.v);
-  in.scene.time_step = time_step;
-  in.pinned_bodies = read.flags("held_bodies", held_bodies, in.scene.bodies);
-  in.h2_a = read.batch("lift", lift, 3 * read.v);
-  require(force.dim() == 3 && force.size(1) >= read.v, "diffvbd::contact_unsupported: expected force of corner points");
-  in.corners = force.size(1);
-  in.force = read.like("force", force, 3 * read.b * in.corners);
-  in.floor = floor_of(read, planes), in.planes = planes_of(planes);
-  return in;
-}
-
-// What is left of lift once forces have borne their part of each body's acceleration, see contact/unsupported.h; origin
-// and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by body
-// [scenes, bodies, 7 planes] where wanted.
-DIFFVBD_OPERATOR(Tensor, contact_unsupported, In x, In origin, In lift, In force, In mass, In planes, In held_bodies,
-                 In body_order, In body_ptr, double time_step) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    const auto in =
-        unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
-    Tensor out = device.like_x();
-    DIFFVBD_RUN(device, residual_acceleration<T>, in, data<T>(out));
-    return out;
-  });
-}
-DIFFVBD_OPERATOR(Out<5>, contact_unsupported_backward, In bar, In x, In origin, In lift, In force, In mass, In planes,
-                 In held_bodies, In body_order, In body_ptr, double time_step, bool wants_planes) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    const auto in =
-        unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
-    const int64_t b = in.scene.scenes, v = in.scene.vertices;
-    const Tensor x_bar = device.empty({in.planes > 0 ? b : 0, v, 3}), lift_bar = device.like_x(),
-                 force_bar = device.zeros({b, in.corners, 3}), mass_bar = device.empty({b, v});
-    const Tensor planes_bar =
-        device.zeros({wants_planes ? b : 0, in.scene.bodies, int64_t{in.planes} * contact::kPlaneScalars});
-    const contact::ResidualAdjoints<T> out{data_or_null<T>(x_bar), data<T>(lift_bar), data<T>(force_bar),
-                                           data<T>(mass_bar), data_or_null<T>(planes_bar)};
-    DIFFVBD_RUN(device, residual_acceleration_backward<T>, in, Reader<T>(x).vectors("bar", bar), out);
-    return Out<5>(x_bar, lift_bar, force_bar, mass_bar, planes_bar);
   });
 }
 

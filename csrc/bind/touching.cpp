@@ -36,7 +36,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
   gate.scenes = b;
   gate.vertices = static_cast<int32_t>(v), gate.corners = static_cast<int32_t>(corners);
   gate.bodies = static_cast<int32_t>(bodies);
-  gate.whole = true;
+  gate.unit_of = gate.body, gate.units_of_scene = gate.bodies;
   if (t.lag.numel() > 0) {
     in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, t.x, b * corners);
     in.lag = read.like("lag", t.lag, t.lag_pairs.size(0) * contact::kLagScalars);

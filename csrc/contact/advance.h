@@ -11,26 +11,21 @@ template <class T>
 struct AdvanceInputs {
   const T *x, *move;                  // [B, V, 3]  positions at the detection; wanted displacement
   const T* u;                         // [B, bodies, 3]  translation of each body's island; or null
-  const T* center;                    // [B, V, 3]  center of the trust region, less u
+  const T* center;                    // [B, V, 3]  positions at which gaps were taken, less u
   const T* origin;                    // [B, V, 3] or null
   const T *collider, *collider_next;  // [B, Vc, 3]
   const bool* pinned;                 // [N]
   const int32_t* body;                // [N]
   PairList listed;
   const T* constants;
-  const T* trust_radius;                             // [B, V]
-  const T *deformation_center, *deformation_radius;  // the same relative to the rigid motion of the body; or null
+  const int32_t* unit_of;  // [V]  the unit of a vertex, of its scene: vertices of one unit have one fraction
+  const T* trust_radius;   // [B, V]  of stay()
   int64_t scenes;
-  int32_t vertices, corners, bodies;
+  int32_t vertices, corners, bodies, units_of_scene;
   bool careful;  // the motion does not minimise the barrier
-  bool whole;    // all vertices of a body have one fraction
 
-  // Units have a fraction each: vertices, or bodies.
-  DIFFVBD_FN int64_t units() const { return scenes * (whole ? bodies : vertices); }
-  DIFFVBD_FN int64_t unit(int64_t scene, int32_t v) const {
-    return whole ? scene * bodies + body[v] : scene * vertices + v;
-  }
-  DIFFVBD_FN int64_t scene_of_unit(int64_t unit) const { return unit / (whole ? bodies : vertices); }
+  DIFFVBD_FN int64_t units() const { return scenes * units_of_scene; }
+  DIFFVBD_FN int64_t unit(int64_t scene, int32_t v) const { return scene * units_of_scene + unit_of[v]; }
 };
 
 // A vertex's displacement since gaps were taken, now and after the trial.
@@ -117,7 +112,6 @@ DIFFVBD_FN T guard_of_size(T size) {
 constexpr int kMoves = 3;     // in sequence, each of what the moves before have left
 constexpr int kRounds = 16;   // rounds of halving in each
 constexpr int kPatience = 8;  // rounds after which what fails does not move
-constexpr double kLeastTrial = 1.0 / 64;
 constexpr double kRoundedSquare = 4e-6;  // of squares of lengths: more than rounding makes of them
 
 // Whether a point of a collider is at its end already: planes always are.
@@ -346,26 +340,16 @@ DIFFVBD_FN T total(T done, T now) {
   return now == T(1) ? T(1) : done + now * (T(1) - done);
 }
 
-// Whether a vertex is within its radii after a fraction of its displacement.
-template <class T>
-DIFFVBD_FN bool is_within_radii(const AdvanceInputs<T>& in, int64_t scene, int32_t v, T fraction) {
-  const int64_t row = scene * in.vertices + v;
-  const Vec3<T> end = vector_at(in.x + 3 * row) + fraction * displacement_of(in, scene, v);
-  const auto within = [&](const T* center, const T* trust_radius) {
-    const Vec3<T> off = end - vector_at(center + 3 * row);
-    return dot(off, off) <= trust_radius[row] * trust_radius[row];
-  };
-  return within(in.center, in.trust_radius) &&
-         (!in.deformation_radius || within(in.deformation_center, in.deformation_radius));
-}
-
-// Marks the body of a vertex that leaves its radii by the trial; returns whether it stays. Rounds as in test_pair().
-// The trial of a single vertex is within its radii: begin_move().
+// Marks the unit of a vertex that leaves its trust region by the trial; returns whether it stays. Rounds as in
+// test_pair().
 template <class T>
 DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v, int round) {
-  const int64_t unit = in.unit(scene, v);
+  const int64_t unit = in.unit(scene, v), row = scene * in.vertices + v;
   if (in.pinned[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
-  if (is_within_radii(in, scene, v, total(s.fraction[unit], s.now[unit]))) return true;
+  const T fraction = total(s.fraction[unit], s.now[unit]);
+  const Vec3<T> end = vector_at(in.x + 3 * row) + fraction * displacement_of(in, scene, v),
+                off = end - vector_at(in.center + 3 * row);
+  if (dot(off, off) <= in.trust_radius[row] * in.trust_radius[row]) return true;
   mark(s.blocked + unit);
   return false;
 }
@@ -387,21 +371,14 @@ DIFFVBD_FN bool retreat(const AdvanceState<T>& s, int64_t unit, int round) {
 }
 
 template <class T>
-DIFFVBD_FN void begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
+DIFFVBD_FN void begin_move(const AdvanceState<T>& s, int64_t unit) {
   if (s.first) s.fraction[unit] = T(0);
-  T now = T(1);
-  if (!in.whole) {  // balls: at a smaller fraction it is no farther out than at this one or now
-    const int64_t scene = in.scene_of_unit(unit);
-    const auto v = static_cast<int32_t>(unit - scene * in.vertices);
-    while (!in.pinned[v] && T(0) < now && !is_within_radii(in, scene, v, total(s.fraction[unit], now)))
-      now = next_trial(now);
-  }
-  s.now[unit] = now, s.blocked[unit] = s.stamp[unit] = 0;
+  s.now[unit] = T(1), s.blocked[unit] = s.stamp[unit] = 0;
 }
 // A scene without an admissible trial stays in this move.
 template <class T>
 DIFFVBD_FN void give_up(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
-  if (s.failed[in.scene_of_unit(unit)]) s.now[unit] = T(0);
+  if (s.failed[unit / in.units_of_scene]) s.now[unit] = T(0);
 }
 template <class T>
 DIFFVBD_FN void end_move(const AdvanceState<T>& s, int64_t unit) {

@@ -5,7 +5,6 @@
 
 #include <cstdint>
 
-#include "above_floor.h"
 #include "islands.h"
 #include "motion.h"
 #include "passes.h"
@@ -13,20 +12,19 @@
 namespace diffvbd::contact {
 
 constexpr int kRadiusRounds = 3;  // rounds of radii relative to islands, and islands by these radii
+constexpr double kGrid = 0.125;      // of dhat: cells that the translation of an island is rounded to
+constexpr double kMostCells = 1e15;  // integers hold them
 constexpr double kSpare = 2;      // of dhat, added to what a body asks for: others may push it
 
 template <class T>
 struct RadiusInputs {
   MotionInputs<T> motion;
   IslandInputs<T> islands;                            // without the radius
-  const T *rigid, *displacements, *sums;              // of find_motion
-  Batched<const T> floor;                             // [1 | B, 7 planes] or null
+  const T *displacements, *sums;                      // of find_motion
   const T *most, *most_alone, *most_own, *least_own;  // [bodies] [m] bounds of the radii: see ContactSurface
-  int32_t floor_planes;
   T fraction, least, dhat;  // of a displacement, and added to it [m]
   bool self_contact;
 
-  DIFFVBD_FN int32_t planes() const { return islands.num_planes + floor_planes; }
   DIFFVBD_FN T displacement(DisplacementKind which, int64_t place) const {
     return displacements[which * motion.scenes * motion.bodies + place];
   }
@@ -35,35 +33,16 @@ struct RadiusInputs {
 // Memory of the rounds. Radii have a last column, the largest of the scene.
 template <class T>
 struct RadiusWork {
-  T *planes, *pushed;                           // [B, planes, 7]; [B]: longest displacement of a collider's point
-  T *stopped, *bent, *most;                     // [B, bodies]
-  int32_t* island;                              // [B, bodies]
-  T *trust_radius, *deformation_radius, *over;  // [B, bodies + 1] twice, [B, bodies]: results
+  T* pushed;                             // [B]  longest displacement of a collider's point
+  T* most;                               // [B, bodies]
+  int32_t* island;                       // [B, bodies]  results from here on
+  T *u, *over;                           // [B, bodies, 3], [B, bodies]
+  T *trust_radius, *deformation_radius;  // [B, bodies + 1]
 };
-
-// Plane colliders, then the planes of the floor, as the floor has them.
-template <class T>
-DIFFVBD_FN void write_plane(const RadiusInputs<T>& in, int64_t scene, int32_t k, T* to) {
-  const int32_t colliders = in.islands.num_planes;
-  if (k >= colliders) {
-    const T* from = in.floor.data + scene * in.floor.scene + kPlaneScalars * (k - colliders);
-    for (int i = 0; i < kPlaneScalars; ++i) to[i] = from[i];
-    return;
-  }
-  const auto at = [&](int corner) {
-    const int64_t point = in.islands.planes[3 * k + corner] - in.islands.vertices;
-    return wide_at(in.islands.collider_next + 3 * (scene * in.islands.colliders() + point));
-  };
-  const Vector a = at(0), across = cross(at(1) - a, at(2) - a);
-  const Vector n = (1 / larger(length(across), double(std::numeric_limits<T>::min()))) * across;
-  put(to, n), to[3] = T(dot(n, a));
-  to[4] = T(0), to[5] = in.dhat, to[6] = T(0);
-}
 
 template <class T, class Team>
 DIFFVBD_FN void prepare_scene(const RadiusInputs<T>& in, int64_t scene, const Team& team, const RadiusWork<T>& work) {
-  const int32_t planes = in.planes(), points = in.islands.colliders();
-  team.each(planes, [&](int32_t k) { write_plane(in, scene, k, work.planes + kPlaneScalars * (scene * planes + k)); });
+  const int32_t points = in.islands.colliders();
   double pushed[1];
   team.template most<1>(points, pushed, [&](int32_t j, double* of) {
     const int64_t row = 3 * (scene * points + j);
@@ -74,15 +53,15 @@ DIFFVBD_FN void prepare_scene(const RadiusInputs<T>& in, int64_t scene, const Te
 
 // The radius that a body asks for which moves so far relative to its island.
 template <class T>
-DIFFVBD_FN T asked(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T relative) {
+DIFFVBD_FN T asked(const RadiusInputs<T>& in, int64_t place, T relative) {
   // the sweeps may take back all of the gravity move and of the bending
   const T gravity = T(2) * in.displacement(kGravity, place) + in.least;
-  return in.fraction * relative + in.displacement(kBends, place) + gravity + work.stopped[place];
+  return in.fraction * relative + in.displacement(kBends, place) + gravity;
 }
 // The radius that it gets. Prescribed vertices are not limited: their pairs are listed however far they go.
 template <class T>
 DIFFVBD_FN T trust_radius_of(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t place, T relative, T most) {
-  const T wished = asked(in, work, place, relative) + T(kSpare) * in.dhat;
+  const T wished = asked(in, place, relative) + T(kSpare) * in.dhat;
   const T trust_radius = larger(smaller(wished, most), in.displacement(kDriven, place));
   return trust_radius + work.pushed[place / in.motion.bodies];
 }
@@ -91,31 +70,12 @@ DIFFVBD_FN T& radius_at(const RadiusInputs<T>& in, T* trust_radii, int64_t scene
   return trust_radii[scene * (in.motion.bodies + 1) + body];
 }
 
-// How far planes stop a body, which the sweeps resolve; and the radius that it asks for if it touches nothing.
-template <class T, class Team>
-DIFFVBD_FN void wish_of_body(const RadiusInputs<T>& in, const MovingBody<T>& b, const Team& team,
-                             const RadiusWork<T>& work) {
-  const int32_t planes = in.planes();
-  double far[2] = {0, in.displacement(kApart, b.place())};
-  if (planes > 0) {
-    const T* own = work.planes + kPlaneScalars * (b.scene * planes);
-    const auto at = [&](int32_t i) { return b.position(i); };
-    const auto rigid = [&](int32_t i) { return b.of(in.rigid, i); };
-    const auto displacement = [&](int32_t i) { return b.displacement(i); };
-    const auto counts = [&](int32_t i) { return b.is_free(i); };
-    const AboveFloor free = above_floor(team, b.size(), own, planes, at, displacement, counts);
-    const AboveFloor whole = above_floor(team, b.size(), own, planes, at, rigid, counts);
-    team.template most<2>(b.size(), far, [&](int32_t i, double* of) {
-      of[0] = b.is_free(i) ? length(b.displacement(i) - free.left(b.displacement(i))) : 0.0;
-      of[1] = b.is_free(i) ? length(b.displacement(i) - whole.left(rigid(i))) : 0.0;
-    });
-  }
-  if (!team.leads()) return;
-  const int64_t place = b.place();
-  work.stopped[place] = smaller(T(far[0]), in.most_own[b.body]);
-  work.bent[place] = T(far[1]);
+// The radius that a body asks for if it touches nothing.
+template <class T>
+DIFFVBD_FN void wish_of_body(const RadiusInputs<T>& in, int64_t scene, int32_t body, const RadiusWork<T>& work) {
+  const int64_t place = scene * in.motion.bodies + body;
   const T bends = in.displacement(kBends, place);
-  radius_at(in, work.trust_radius, b.scene, b.body) = trust_radius_of(in, work, place, bends, in.most_alone[b.body]);
+  radius_at(in, work.trust_radius, scene, body) = trust_radius_of(in, work, place, bends, in.most_alone[body]);
 }
 
 // Whether a body asks for more than the bound of one with neighbours.
@@ -123,7 +83,7 @@ template <class T>
 DIFFVBD_FN bool wants_more(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t scene, int32_t body) {
   const int64_t place = scene * in.motion.bodies + body;
   const T wanted =
-      asked(in, work, place, in.displacement(kBends, place)) + in.fraction * in.displacement(kStretched, place);
+      asked(in, place, in.displacement(kBends, place)) + in.fraction * in.displacement(kStretched, place);
   return !(wanted <= in.most[body]);
 }
 
@@ -140,18 +100,38 @@ DIFFVBD_FN void radius_among_others(const RadiusInputs<T>& in, const RadiusWork<
       trust_radius_of(in, work, place, in.displacement(kBends, place), work.most[place]);
 }
 
-// The radius relative to a moving island.
+// The translation of a body's island: the mean of the wanted displacements, rounded to a grid and so discrete.
 template <class T, class Team>
-DIFFVBD_FN void radius_beside_island(const RadiusInputs<T>& in, const MovingBody<T>& b, const Team& team,
+DIFFVBD_FN Vector island_translation(const RadiusInputs<T>& in, const MovingBody<T>& b, const Team& team,
                                      const RadiusWork<T>& work) {
-  const int64_t place = b.place(), first = b.scene * in.motion.bodies;
-  const int32_t own = work.island[place];
-  double sum[4], far[1];
+  const int64_t first = b.scene * in.motion.bodies;
+  const int32_t own = work.island[b.place()];
+  double sum[4];
   team.template sum<4>(own < 0 ? 0 : in.motion.bodies, sum, [&](int32_t k, double* to) {
     if (work.island[first + k] != own) return;
     for (int i = 0; i < 4; ++i) to[i] += in.sums[4 * (first + k) + i];
   });
-  const Vector u = (1 / larger(sum[3], double(std::numeric_limits<T>::min()))) * vector_at(sum);
+  const double mass = larger(sum[3], double(std::numeric_limits<T>::min())), grid = kGrid * double(in.dhat);
+  const auto rounded = [&](double momentum) {
+    const double cells = momentum / mass / grid;
+    return absolute(cells) < kMostCells ? grid * double(static_cast<int64_t>(cells)) : 0.0;  // NaN: 0
+  };
+  return {rounded(sum[0]), rounded(sum[1]), rounded(sum[2])};
+}
+template <class T, class Team>
+DIFFVBD_FN void write_translation(const RadiusInputs<T>& in, const MovingBody<T>& b, const Team& team,
+                                  const RadiusWork<T>& work) {
+  const Vector u = island_translation(in, b, team, work);
+  if (team.leads()) put(work.u + 3 * b.place(), u);
+}
+
+// The radius relative to a moving island.
+template <class T, class Team>
+DIFFVBD_FN void radius_beside_island(const RadiusInputs<T>& in, const MovingBody<T>& b, const Team& team,
+                                     const RadiusWork<T>& work) {
+  const int64_t place = b.place();
+  const Vector u = island_translation(in, b, team, work);
+  double far[1];
   team.template most<1>(b.size(), far,
                         [&](int32_t i, double* of) { of[0] = b.is_free(i) ? length(b.displacement(i) - u) : 0.0; });
   if (!team.leads()) return;
@@ -159,13 +139,13 @@ DIFFVBD_FN void radius_beside_island(const RadiusInputs<T>& in, const MovingBody
   T& trust_radius = radius_at(in, work.trust_radius, b.scene, b.body);
   trust_radius = larger(trust_radius, trust_radius_of(in, work, place, relative, most));
   const T displacement = relative + in.fraction * stretched,
-          wanted = asked(in, work, place, relative) + in.fraction * stretched;
+          wanted = asked(in, place, relative) + in.fraction * stretched;
   // up to 2, which makes two substeps; a longer displacement more
   work.over[place] = larger(displacement / most, smaller(wanted / most, T(2)));
   T deformation_radius = T(0);
   if (in.self_contact) {
     deformation_radius =
-        (in.fraction + T(1)) * (work.bent[place] + stretched) + T(2) * in.displacement(kGravity, place) + in.least;
+        (in.fraction + T(1)) * (in.displacement(kApart, place) + stretched) + T(2) * in.displacement(kGravity, place) + in.least;
     deformation_radius =
         larger(smaller(deformation_radius, in.most_own[b.body]), smaller(trust_radius, in.least_own[b.body]));
     deformation_radius = larger(deformation_radius, in.displacement(kDriven, place));

@@ -83,7 +83,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
     std::fill(far.begin(), far.end(), 0);
     std::fill(failed.begin(), failed.end(), 0);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
-    for_each(units, [&](int64_t i) { begin_move(in, s, i); });
+    for_each(units, [&](int64_t i) { begin_move(s, i); });
     for (int round = 0; round < kRounds; ++round) {
       const bool begins = round == 0, last = round + 1 == kRounds;
       const auto fails = [&](int64_t scene, bool passes) {
@@ -109,11 +109,8 @@ int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
       } else {
         found = failing([&](int64_t row) { return stamp[unit(row)] == round; }, passes);
       }
-      const int64_t left = count(in.whole ? rows : 0, kGrain, [&](int64_t i) {
-        return fails(i / in.vertices, stay(in, s, i / in.vertices, vertex(i), last ? 0 : round));
-      });
-      clean = round == 0 && found + left == 0;
-      if (found + left == 0 || last) break;
+      clean = round == 0 && found == 0;
+      if (found == 0 || last) break;
       if (count(units, kGrain, [&](int64_t i) { return retreat(s, i, round); }) == 0) break;
     }
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);

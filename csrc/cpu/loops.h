@@ -10,7 +10,6 @@
 #include "../contact/friction.h"
 #include "../contact/islands.h"
 #include "../contact/passes.h"
-#include "../contact/residual_acceleration.h"
 #include "../contact/trust_region.h"
 #include "../subspace/begin.h"
 #include "../subspace/coarse.h"
@@ -150,19 +149,6 @@ void energy_increase(const coarse::IncreaseInputs<T>& in, double* out) {
 // --- contact
 // ----------------------------------------------------------------------------------------------------------
 
-template <class T>
-void residual_acceleration(const contact::ResidualInputs<T>& in, T* out) {
-  for_bodies(in.scene,
-             [&](const rigid::Body<T>& b, const Threads& team) { contact::residual_acceleration(in, b, team, out); });
-}
-template <class T>
-void residual_acceleration_backward(const contact::ResidualInputs<T>& in, const T* bar,
-                                    const contact::ResidualAdjoints<T>& out) {
-  for_bodies(in.scene, [&](const rigid::Body<T>& b, const Threads& team) {
-    contact::reverse_residual_acceleration(in, b, team, bar, out);
-  });
-}
-
 // wishes [B, bodies] and most [B]: memory
 template <class T>
 void sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* trust_radii) {
@@ -174,67 +160,6 @@ void sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T*
   for (int64_t s = 0; s < in.scenes; ++s) most[s] = contact::most_of_scene(in, wishes, s, 0, 1);
   for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
     trust_radii[scene * in.vertices + v] = contact::sweep_radius(in, most[scene], scene, v);
-  });
-}
-
-template <class T>
-void body_sums(const contact::TranslationInputs<T>& in, T* sums) {
-  for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
-    const contact::Mean<T> mean =
-        contact::mean_of_body(in, row / in.bodies, static_cast<int32_t>(row % in.bodies), 0, 1);
-    const T values[] = {mean.sum.x, mean.sum.y, mean.sum.z, mean.mass};
-    std::copy_n(values, 4, sums + 4 * row);
-  }
-}
-// sums [B, bodies, 4]: memory
-template <class T>
-void translation(const contact::TranslationInputs<T>& in, T* sums, T* out) {
-  body_sums(in, sums);
-  for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
-    const int64_t scene = row / in.bodies, body = row % in.bodies, first = in.island[row];
-    T* to = out + 3 * row;
-    if (first >= 0 && first < body) {  // that of its island's first body
-      std::copy_n(out + 3 * (scene * in.bodies + first), 3, to);
-      continue;
-    }
-    const auto u = contact::translation_of(in, sums, scene, static_cast<int32_t>(body));
-    to[0] = u.x, to[1] = u.y, to[2] = u.z;
-  }
-}
-// zeroed [B, bodies, 6 and more], x_bar and planes_bar are zero
-template <class T>
-void translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed, T* move_bar,
-                          T* mass_bar, T* x_bar, T* planes_bar) {
-  const int64_t rows = in.scenes * in.bodies, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
-  body_sums(in, sums);
-  T *rate = zeroed, *mean = zeroed + 3 * rows;
-  for (int64_t row = 0; row < rows; ++row) {
-    contact::reverse_island(in, sums, u_bar, row / in.bodies, static_cast<int32_t>(row % in.bodies), rate, mean, x_bar,
-                            planes_bar + row / in.bodies * scalars);
-  }
-  for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
-    contact::reverse_vertex_mean(in, rate, mean, scene, v, move_bar, mass_bar);
-  });
-}
-
-// own [B, bodies, planes]: memory
-template <class T>
-void support_vertices(const contact::SupportVertexInputs<T>& in, int32_t* own, int32_t* out) {
-  const auto each = [&](auto&& f) {
-    int64_t i = 0;
-    for (int64_t b = 0; b < in.scenes; ++b) {
-      for (int32_t body = 0; body < in.bodies; ++body) {
-        for (int32_t plane = 0; plane < in.num_planes; ++plane) f(i++, b, body, plane);
-      }
-    }
-  };
-  each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
-    own[i] = contact::support_vertex_of_body(in, b, body, plane, 0, 1).vertex;
-  });
-  each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
-    const int32_t first = in.island[b * in.bodies + body];
-    out[i] = first >= 0 && first < body ? out[i - int64_t{body - first} * in.num_planes]  // that of its first body
-                                        : contact::support_vertex_of_island(in, own, b, body, plane);
   });
 }
 

@@ -68,12 +68,12 @@ class SceneIslands {
     std::fill(islands_.begin(), islands_.end(), nothing<T>());
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) islands_[label_[i]].add(bodies_[i]);
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
-      box_[i] = swept(in_, bodies_[i].bounds, translation(islands_[label_[i]]), in_.margin(scene_, i));
+      box_[i] = swept(bodies_[i].bounds, translation(islands_[label_[i]]), in_.margin(scene_, i));
     }
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
       bool blocked = false;
       for (const Bounds<T>& collider : colliders_) blocked = blocked || overlap(box_[i], collider);
-      for (int32_t l = 0; l < in_.num_planes; ++l) blocked = blocked || reaches_plane(in_, scene_, l, box_[i]);
+      blocked = blocked || reaches_any_plane(in_, scene_, box_[i]);
       if (blocked) bodies_[i].blocked = islands_[label_[i]].blocked = true;
     }
   }
@@ -158,23 +158,6 @@ void find_motion(const MotionInputs<T>& in, T* rigid, T* displacements, T* sums)
 }
 
 template <class T>
-void reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a) {
-  for_bodies<MovingBody>(in, [&](const MovingBody<T>& b, const Threads& team) { contact::reverse_motion(b, team, a); });
-}
-
-template <class T>
-void extrapolate(const MotionInputs<T>& in, double lookback, T* extrapolated) {
-  for_bodies<MovingBody>(
-      in, [&](const MovingBody<T>& b, const Threads& team) { contact::extrapolate(b, team, lookback, extrapolated); });
-}
-
-template <class T>
-void reverse_extrapolate(const MotionInputs<T>& in, double lookback, const MotionAdjoints<T>& a) {
-  for_bodies<MovingBody>(
-      in, [&](const MovingBody<T>& b, const Threads& team) { contact::reverse_extrapolate(b, team, lookback, a); });
-}
-
-template <class T>
 void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
   const int64_t scenes = in.motion.scenes;
   const auto each = [&](const auto& f) {
@@ -185,8 +168,7 @@ void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
   const Threads one(false);
   in.islands.trust_radius = work.trust_radius;
   for (int64_t scene = 0; scene < scenes; ++scene) prepare_scene(in, scene, one, work);
-  for_bodies<MovingBody>(in.motion,
-                         [&](const MovingBody<T>& b, const Threads& team) { wish_of_body(in, b, team, work); });
+  each([&](int64_t scene, int32_t body) { wish_of_body(in, scene, body, work); });
   bool looks = false;
   each([&](int64_t scene, int32_t body) { looks = looks || wants_more(in, work, scene, body); });
   if (looks) find_islands(in.islands, work.island);
@@ -197,6 +179,8 @@ void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
         in.motion, [&](const MovingBody<T>& b, const Threads& team) { radius_beside_island(in, b, team, work); });
     find_islands(in.islands, work.island);
   }
+  for_bodies<MovingBody>(
+      in.motion, [&](const MovingBody<T>& b, const Threads& team) { write_translation(in, b, team, work); });
   for (int64_t scene = 0; scene < scenes; ++scene) finish_radii(in, scene, one, work);
 }
 
@@ -204,9 +188,6 @@ void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
   template void find_islands<T>(const IslandInputs<T>&, int32_t*);                                                \
   template void segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, T*); \
   template void find_motion<T>(const MotionInputs<T>&, T*, T*, T*);                                               \
-  template void reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&);                              \
-  template void extrapolate<T>(const MotionInputs<T>&, double, T*);                                               \
-  template void reverse_extrapolate<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&);                 \
   template void find_trust_radii<T>(RadiusInputs<T>, const RadiusWork<T>&);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

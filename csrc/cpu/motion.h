@@ -10,15 +10,6 @@ namespace diffvbd {
 // Results as contact/motion.h has them.
 template <class T>
 void find_motion(const contact::MotionInputs<T>& in, T* rigid, T* displacements, T* sums);
-template <class T>
-void reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a);
-
-// Results as in contact/motion.h; a.rigid: the adjoint of `extrapolated`.
-template <class T>
-void extrapolate(const contact::MotionInputs<T>& in, double lookback, T* extrapolated);
-template <class T>
-void reverse_extrapolate(const contact::MotionInputs<T>& in, double lookback, const contact::MotionAdjoints<T>& a);
-
 // Fills all that `work` points to.
 template <class T>
 void find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work);

@@ -129,12 +129,9 @@ struct NearPairs {
 template <class T, class Team, class Pairs>
 __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceState<T> s, Motion<T>* motions,
                                const Range& scenes, const Pairs& pairs, unsigned long long* infeasible) {
-  const int64_t of_scene = in.units() / in.scenes;
   const Range rows = {scenes.begin * in.vertices, scenes.end * in.vertices};
-  const Range units = {scenes.begin * of_scene, scenes.end * of_scene};
   s.motion = motions;
-  // Motions of the vertices whose fraction this round lowers; of all in round 0. Single vertices compute theirs when
-  // they retreat.
+  // Motions of the vertices whose fraction the last round has lowered; of all in round 0.
   const auto look = [&](int round) {
     team.each(rows, [&](int64_t i) {
       const int64_t scene = i / in.vertices;
@@ -146,7 +143,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     team.each(scenes, [&](int64_t i) { s.failed[i] = 0; });
-    team.each(units, [&](int64_t i) { begin_move(in, s, i); });
+    team.each(rows, [&](int64_t i) { begin_move(s, i); });
     team.sync();
     look(0);
     pairs.begin_move(team, in, s);
@@ -158,23 +155,15 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
         if (last) mark(s.failed + scene);
         found = true;
       };
-      if (round > 0 && in.whole) look(round);
+      if (round > 0) look(round);
       pairs.each_failing(team, in, s, last ? 0 : round, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5]); });
-      team.each(in.whole ? rows : Range{}, [&](int64_t i) {
-        const int64_t scene = i / in.vertices;
-        if (!stay(in, s, scene, static_cast<int32_t>(i - scene * in.vertices), last ? 0 : round)) note(scene);
-      });
       const bool passed = !team.any(found);
       clean = round == 0 && passed;
       if (passed || last) break;
-      team.each(units, [&](int64_t i) {
-        if (!retreat(s, i, round)) return;
-        less = true;
-        if (!in.whole) motions[i] = motion_of(in, s, i / in.vertices, static_cast<int32_t>(i % in.vertices));
-      });
+      team.each(rows, [&](int64_t i) { less = retreat(s, i, round) || less; });
       if (!team.any(less)) break;
     }
-    team.each(units, [&](int64_t i) { give_up(in, s, i); });
+    team.each(rows, [&](int64_t i) { give_up(in, s, i); });
     if (s.first && !clean) {
       team.sync();
       look(0);
@@ -182,7 +171,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
       team.sync();
     }
     bool open = false;
-    team.each(units, [&](int64_t i) {
+    team.each(rows, [&](int64_t i) {
       end_move(s, i);
       open = open || s.fraction[i] < T(1);
     });

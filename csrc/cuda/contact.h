@@ -5,7 +5,6 @@
 
 #include <cstddef>
 
-#include "../contact/above_floor.h"
 #include "../contact/advance.h"
 #include "../contact/detection.h"
 #include "../contact/friction.h"
@@ -14,8 +13,6 @@
 #include "../contact/motion.h"
 #include "../contact/pair_list.h"
 #include "../contact/passes.h"
-#include "../contact/residual_acceleration.h"
-#include "../contact/start.h"
 #include "../contact/trust_region.h"
 
 namespace diffvbd::cuda {
@@ -89,54 +86,15 @@ template <class T>
 cudaError_t compact_list(const contact::CompactInputs<T>& in, const contact::CompactList<T>& out, void* workspace,
                          cudaStream_t stream);
 
-// own, out: [B, bodies, planes]
-template <class T>
-cudaError_t support_vertices(const contact::SupportVertexInputs<T>& in, int32_t* own, int32_t* out,
-                             cudaStream_t stream);
-
 template <class T>
 cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream);
-template <class T>
-cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a,
-                           cudaStream_t stream);
-
-template <class T>
-cudaError_t extrapolate(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
-template <class T>
-cudaError_t reverse_extrapolate(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
-                                cudaStream_t stream);
-
 // islands: memory of islands_workspace_bytes().
 template <class T>
 cudaError_t find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work, void* islands,
                              cudaStream_t stream);
 
-// Calls act(body, team) for all bodies of all scenes, a block each.
-template <class Act>
-cudaError_t act_on_bodies(const Act& act, cudaStream_t stream);
-// Calls act(scene, vertex) for all vertices of all scenes.
-template <class Act>
-cudaError_t act_on_vertices(const Act& act, cudaStream_t stream);
-
-// u [B, bodies, 3]; sums [B, bodies, 4]: workspace
-template <class T>
-cudaError_t translation(const contact::TranslationInputs<T>& in, T* sums, T* u, cudaStream_t stream);
-
-// zeroed [B bodies (3 + 3 + 7 planes)]: zero workspace for rate, mean and adjoints of the planes by island. x_bar is
-// zero at first.
-template <class T>
-cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed,
-                                 T* move_bar, T* mass_bar, T* x_bar, T* planes_bar, cudaStream_t stream);
-
 // radii [B, V]; wishes [B, bodies], most [B]: workspace
 template <class T>
 cudaError_t sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream);
-
-// out [B, V, 3]
-template <class T>
-cudaError_t residual_acceleration(const contact::ResidualInputs<T>& in, T* out, cudaStream_t stream);
-template <class T>
-cudaError_t residual_acceleration_backward(const contact::ResidualInputs<T>& in, const T* bar,
-                                           const contact::ResidualAdjoints<T>& out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

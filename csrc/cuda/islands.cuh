@@ -71,7 +71,7 @@ __device__ BodySum<T> body_of(const IslandWork<T>& work, int64_t i) {
 template <class T>
 __device__ void sweep_body(const IslandInputs<T>& in, const IslandWork<T>& work, int64_t i, int32_t label) {
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
-  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + label]),
+  const Bounds<T> box = swept(work.bodies[i].bounds, translation(work.islands[first + label]),
                               in.margin(scene, static_cast<int32_t>(i - first)));
   work.boxes[i] = box;
   bool blocked = false;
@@ -80,7 +80,7 @@ __device__ void sweep_body(const IslandInputs<T>& in, const IslandWork<T>& work,
     const auto at = [&](int k) { return value_of<T>(bits[k]); };
     blocked = overlap(box, Bounds<T>{{at(0), at(1), at(2)}, {at(3), at(4), at(5)}});
   }
-  for (int32_t l = 0; l < in.num_planes && !blocked; ++l) blocked = reaches_plane(in, scene, l, box);
+  blocked = blocked || reaches_any_plane(in, scene, box);
   if (blocked) work.stays[i] = true;
 }
 

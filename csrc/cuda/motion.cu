@@ -31,40 +31,20 @@ struct Find {
   }
 };
 template <class T>
-struct Reverse {
-  MotionAdjoints<T> a;
-  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::reverse_motion(b, team, a);
-  }
-};
-template <class T>
-struct Extrapolate {
-  double chord;
-  T* coasted;
-  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::extrapolate(b, team, chord, coasted);
-  }
-};
-template <class T>
-struct ReverseExtrapolate {
-  double chord;
-  MotionAdjoints<T> a;
-  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::reverse_extrapolate(b, team, chord, a);
-  }
-};
-template <class T>
-struct WantedRadius {
-  RadiusInputs<T> in;
-  RadiusWork<T> work;
-  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const { wish_of_body(in, b, team, work); }
-};
-template <class T>
 struct IslandRadius {
   RadiusInputs<T> in;
   RadiusWork<T> work;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
     radius_beside_island(in, b, team, work);
+  }
+};
+
+template <class T>
+struct IslandTranslation {
+  RadiusInputs<T> in;
+  RadiusWork<T> work;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
+    write_translation(in, b, team, work);
   }
 };
 
@@ -80,13 +60,15 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// A thread for each body.
-template <class T>
+// A thread for each body: the radii that bodies ask for, or those among others.
+template <class T, bool first>
 __global__ void __launch_bounds__(kThreads)
-    others_kernel(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work) {
+    radii_kernel(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work) {
   const int64_t place = own_item(kThreads), bodies = in.motion.bodies;
   if (place >= in.motion.scenes * bodies) return;
-  radius_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
+  const int64_t scene = place / bodies;
+  const auto body = static_cast<int32_t>(place % bodies);
+  first ? wish_of_body(in, scene, body, work) : radius_among_others(in, work, scene, body, true);
 }
 
 // All radii of a small scene, by a block with a warp for each of its bodies in turn. It ends once no radius changes.
@@ -108,7 +90,8 @@ __global__ void __launch_bounds__(kThreads)
   const auto room = [&](int32_t body) { return radius_at(in, work.trust_radius, scene, body); };
   prepare_scene(in, scene, team, work);
   __syncthreads();
-  for_each_body([&](const MovingBody<T>& b, const auto& by) { wish_of_body(in, b, by, work); });
+  islands.each(in.motion.bodies, [&](int32_t body) { wish_of_body(in, scene, body, work); });
+  __syncthreads();
   islands.bound();
   bool changes = true;
   for (int round = -1;; ++round) {  // -1: radii among other bodies; then next to islands
@@ -131,6 +114,7 @@ __global__ void __launch_bounds__(kThreads)
     changes = __syncthreads_or(changes);
     if (0 <= round && !changes) break;
   }
+  for_each_body([&](const MovingBody<T>& b, const auto& by) { write_translation(in, b, by, work); });
   finish_radii(in, scene, team, work);
 }
 
@@ -139,22 +123,6 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 cudaError_t find_motion(const MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream) {
   return for_bodies(in, Find<T>{rigid, ways, sums}, stream);
-}
-
-template <class T>
-cudaError_t reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a, cudaStream_t stream) {
-  return for_bodies(in, Reverse<T>{a}, stream);
-}
-
-template <class T>
-cudaError_t extrapolate(const MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream) {
-  return for_bodies(in, Extrapolate<T>{chord, coasted}, stream);
-}
-
-template <class T>
-cudaError_t reverse_extrapolate(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a,
-                                cudaStream_t stream) {
-  return for_bodies(in, ReverseExtrapolate<T>{chord, a}, stream);
 }
 
 template <class T>
@@ -171,23 +139,22 @@ cudaError_t find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work, void
   }
   each_scene<T, true><<<scenes, kThreads, 0, stream>>>(in, work);
   if (bodies > 0) {
-    if (const auto error = for_bodies(in.motion, WantedRadius<T>{in, work}, stream)) return error;
+    const unsigned blocks = blocks_for(bodies, kThreads);
+    radii_kernel<T, true><<<blocks, kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
-    others_kernel<T><<<blocks_for(bodies, kThreads), kThreads, 0, stream>>>(in, work);
+    radii_kernel<T, false><<<blocks, kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     for (int round = 0; round < kRadiusRounds; ++round) {
       if (const auto error = for_bodies(in.motion, IslandRadius<T>{in, work}, stream)) return error;
       if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     }
+    if (const auto error = for_bodies(in.motion, IslandTranslation<T>{in, work}, stream)) return error;
   }
   each_scene<T, false><<<scenes, kThreads, 0, stream>>>(in, work);
   return cudaGetLastError();
 }
 
 DIFFVBD_INSTANTIATE(find_motion)
-DIFFVBD_INSTANTIATE(reverse_motion)
-DIFFVBD_INSTANTIATE(extrapolate)
-DIFFVBD_INSTANTIATE(reverse_extrapolate)
 DIFFVBD_INSTANTIATE(find_trust_radii)
 
 }  // namespace diffvbd::cuda

@@ -1,4 +1,4 @@
-"""Detection as a step asks for it: which pairs are near, which vertices lowest."""
+"""Detection as a step asks for it: which pairs are near."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from torch import Tensor
 
 from .._contact.barrier import PairBarrier
 from .._contact.surface import ContactSurface
-from ..ops import contact as contact_lag
 from ..ops import contact as ops_contact
 
 
@@ -52,8 +51,3 @@ def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: Contact
             x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius, s.triangles, s.edges,
             s.points, s.planes, s.body, s.held, s.bodies, self_contact, between_bodies, capacity,
         )  # fmt: skip
-
-
-def lowest(x: Tensor, origin: Tensor, data: Tensor, island: Tensor, surface: ContactSurface) -> Tensor:
-    """Lowest vertex of each body's island above each plane [B, bodies, planes] int32; ``data`` as FloorBarrier.pack."""
-    return contact_lag.lowest(x, origin, data, surface.body_order, surface.body_ptr, island)

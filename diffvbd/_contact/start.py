@@ -1,118 +1,105 @@
-"""Start of a substep with contact: translations of islands, what the floor lets through, how far all may go
-at once."""
+"""The start of a substep with contact: each free body goes a fraction of its displacement as a whole (docs/method.md,
+section 12)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from .._common.constants import FILTER_ETA
 from .._contact.surface import ContactSurface
 from ..ops import contact as ops_contact
-from ..ops.contact import Decided, PartBodies, Whole, ways_above_floor
-from ..ops.fields import ASKS
+from ..ops.fields import PLANE_SCALARS
+
+SHORT = 0.99  # fraction of a displacement below which a vertex is truncated
+LEAST = 6  # the smallest fraction is 2^-6, and then 0
+FAR = 1e15  # [m] trust-region radius without pairs
 
 
 class PartStart(NamedTuple):
-    """Start of the sweeps of a substep."""
+    """Start of the sweeps of a substep; all but x is index data."""
 
     x: Tensor  # [B, V, 3] [m]
-    center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start
-    room: Tensor  # [B, V]  how far from there it may go [m]
-    own: tuple  # the same beside the rigid motion of its body; empty where bodies have no pairs of their own
-    frames: Tensor | None  # [B, bodies]: share that pairs let each body go of its rigid motion above the floor
-    short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
+    center: Tensor  # [B, V, 3]  center of the trust region of each vertex [m]
+    room: Tensor  # [B, V]  its radius [m]
+    own: tuple  # center and radius of the deformation; empty where bodies have no pairs of their own
+    short: Tensor  # [B, V] bool: pairs or radii have truncated the displacement
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
-    shares: tuple[Tensor, Tensor]  # how much of each of its two ways a vertex went, [B, V] each
+    shares: Tensor  # [B, V]  fraction of its displacement that each vertex went
 
 
-def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
-                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
-                         rigid: Tensor, stretch: Tensor, raises: Callable[[Tensor, Tensor], Tensor], own_pairs: bool,
-                         falls: bool) -> PartStart:  # fmt: skip
-    """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
-    by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one that a floor stops does not
-    go it; one of which pairs hold some up, or that with self-contact takes much of the room in which the sweeps may
-    take it back, goes it only where that does not raise its potential.
+def start_between(x: Tensor, move: Tensor, was: Tensor, now: Tensor, planes: Tensor | None, origin: Tensor,
+                  detection: Any, surface: ContactSurface, rigid: Tensor, own_pairs: bool) -> PartStart:  # fmt: skip
+    """``x + u + f (move - u)``, differentiable in x and move. The fraction f is the largest of 1, 1/2, ..., 1/64 and 0
+    that keeps pairs, floors and radii: one for each free body, one for each vertex of a body that is pinned.
 
     Args:
-        x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
-        was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
-        planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
-        origin: [B, V, 3] or empty.  detection: of the step.
-        rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable.
-        stretch: By how much the straight ways of that stretch each body, and what sweeps need to take it back
-            [B, bodies] [m].
-        raises: Of two states [B, V, 3], which vertices are of a body whose potential is higher in the second [B, V].
-        own_pairs: Whether bodies have pairs of their own, and rooms for them.
-        falls: Whether ``fall`` may be other than zero.
+        x, move: [B, V, 3] [m].  was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
+        planes: Data of the FloorBarrier [1 | B, 7 planes], or None.  origin: [B, V, 3] or empty.
+        detection: Of the substep: pairs, islands and their translations u, radii.
+        rigid: Rigid motion of each body, as a displacement [B, V, 3] [m].
+        own_pairs: Whether bodies have pairs of their own, and deformation radii for them.
     """
-    none = x.new_empty((0,))
-    floor = none if planes is None else planes.contiguous()
-    order, ptr = surface.body_order, surface.body_ptr
-    x, move, fall, rigid = (t.contiguous() for t in (x, move, fall, rigid))
-    was, now = was.detach(), now.detach()
-    u = ops_contact.island_translation(move, mass.contiguous(), x, floor, origin, surface.held, surface.body, order,
-                                       ptr, detection.island, detection.lowest)  # fmt: skip
-    left, stopped = ops_contact.ways_above_floor(x, u, rigid, floor, origin, surface.held, order, ptr)
-    bodies = PartBodies(surface.held, surface.held_bodies, surface.body, order, ptr)
-    listed = detection.listed
-    listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
-    own_room = detection.own_room if own_pairs else none
-    stuck: list[Tensor] = []
-
-    def advance(at: Tensor, way: Tensor, by: Tensor, center: Tensor, **options: Any) -> Tensor:
-        """Shares of a way; colliders and what is prescribed go in the first."""
-        share, hindered = ops_contact.advance(at, way, by, center, origin, now if stuck else was, now,
-                                                    surface.held, surface.body, room, listed, **options)  # fmt: skip
-        stuck.append(hindered)
-        return share
-
-    def any_asks(state: Tensor) -> bool:
-        return state.is_cuda or (state.numel() > 0 and int(state.max()) == ASKS)  # on CUDA to know would mean to wait
-
     with torch.no_grad():
-        # bodies first, each as a whole
-        limit, ways, center, room, own_rooms = ops_contact.frames(
-            x, move, u, rigid, left, stretch, detection.room, own_room, bodies
-        )
-        frames, still = limit * advance(x, ways, u, x, whole=True), torch.zeros_like(u)
-        whole = Whole(x, move, u, left, frames, floor, origin, bodies)
-        # then vertices toward their wishes
-        base, target, way, state = ops_contact.bends(whole, limit, stopped, own_room)
-        own = (base, own_rooms) if own_pairs else ()
-        if own_pairs and any_asks(state):
-            way, state = ops_contact.hold(way, state, raises(base, target))
-        share = advance(base, way, still, center, own=own)
-        to, state = ops_contact.held_up(base, way, share, state, bodies)
-        if any_asks(state):
-            way, state = ops_contact.hold(way, state, raises(base, to))
-            if any_asks(state):
-                stuck.pop()  # once more, with those at rest: what let the others pass may have been their motion
-                share = advance(base, way, still, center, own=own)
-        # then all by their fall
-        share, at, way = ops_contact.falls(whole, fall, share, state)
-        shares = share, advance(at, way, still, center, own=own) if falls else torch.ones_like(share)
-    decided = Decided(frames, shares, stopped, origin, bodies)
-    start, short = ops_contact.part_start(x, move, fall, u, left, floor, decided)
-    return PartStart(start, center, room, own, frames, short, sum(stuck[1:], stuck[0]), shares)
+        body, held, unit = surface.body[: x.shape[1]], surface.held[: x.shape[1]], surface.unit
+        u, at, way = detection.u[:, body], x.detach(), move.detach()
+        room = detection.room[:, body]
+        relative = way - u
+        ratio = room / _length(relative)
+        if own_pairs:
+            own_room = detection.own_room[:, body]
+            ratio = torch.minimum(ratio, own_room / _length(way - rigid))
+        within = _of_units(_fraction(ratio), held, unit)
+        above = _of_units(_fraction(_above(planes, at + u, relative, origin)), held, unit)
+        first = torch.minimum(within, above)
+        listed = detection.listed[:4]
+        wanted = torch.where(held[:, None], way, u + first[..., None] * relative).contiguous()
+        passed, stuck = ops_contact.advance(at, wanted, detection.u, at, origin, was.detach(), now.detach(),
+                                            surface.held, surface.body, unit, listed)  # fmt: skip
+        share = first * passed
+        short = (torch.minimum(within, passed) < SHORT) & ~held
+        own = (at + u + share[..., None] * (rigid - u), own_room) if own_pairs else ()
+    return PartStart(_started(x, move, u, share, held), at + u, room, own, short, stuck, share)
 
 
-# --- displacements of whole bodies as floors limit them, differentiable -----------------------------------------------
+def start_above(x: Tensor, move: Tensor, planes: Tensor | None, origin: Tensor, held: Tensor, unit: Tensor
+                ) -> PartStart:  # fmt: skip
+    """The same without pairs: nothing but the floor limits motion."""
+    with torch.no_grad():
+        share = _of_units(_fraction(_above(planes, x.detach(), move.detach(), origin)), held, unit)
+        free, zero = torch.full_like(share, FAR), torch.zeros_like(share, dtype=torch.bool)
+    start = _started(x, move, torch.zeros_like(x), share, held)
+    return PartStart(start, x.detach(), free, (), zero, zero.new_zeros((1,), dtype=torch.int64), share)
 
 
-def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
-                ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Displacements of whole bodies as a floor limits them, less u [B, V, 3] [m], and which bodies it stops [B,
-    bodies]: they are shifted along its normals until no vertex closes more than a part of its gap, which leaves sliding
-    and turning as they are. Differentiable, evenly where several vertices decide. docs/method.md, section 12.
+def _started(x: Tensor, move: Tensor, u: Tensor, share: Tensor, held: Tensor) -> Tensor:
+    return x + torch.where(held[:, None], move, u + share[..., None] * (move - u))
 
-    Args:
-        x, way: [B, V, 3] [m].  u: [B, bodies, 3] [m], part of the way, which the floor lets pass; or empty.
-        planes: Data of a FloorBarrier [1 | B, 7 planes], or empty.  origin: [B, V, 3] [m] or empty.
-        held: [V] bool, whether something else moves a vertex.
-        order, ptr: Vertices by body [V], and the first of each [bodies + 1], int32.
-    """
-    return ways_above_floor(x.contiguous(), u, way.contiguous(), planes.contiguous(), origin, held, order, ptr)
+
+def _length(a: Tensor) -> Tensor:
+    return a.square().sum(-1).sqrt().clamp(min=torch.finfo(a.dtype).tiny)
+
+
+def _above(planes: Tensor | None, x: Tensor, move: Tensor, origin: Tensor) -> Tensor:
+    """Fraction of its displacement after which a vertex has closed FILTER_ETA of its gap to a plane of the floor."""
+    if planes is None:
+        return torch.ones_like(x[..., 0])
+    plane = planes.detach().reshape(planes.shape[0], 1, -1, PLANE_SCALARS)
+    normal = plane[:, 0, :, :3].mT
+    gap = ((x if origin.numel() == 0 else x + origin) @ normal - plane[..., 3]).clamp(min=0)
+    toward = -(move @ normal)
+    return torch.where(toward > 0, FILTER_ETA * gap / toward, torch.inf).amin(-1)
+
+
+def _fraction(ratio: Tensor) -> Tensor:
+    """The largest of 1, 1/2, ..., 2^-LEAST and 0 that is no larger; 0 of what is no number."""
+    halved = torch.nan_to_num(-torch.log2(ratio).floor(), nan=LEAST + 1.0).clamp(0, LEAST + 1)
+    return torch.where(halved > LEAST, 0.0, torch.ldexp(torch.ones_like(ratio), -halved))
+
+
+def _of_units(fraction: Tensor, held: Tensor, unit: Tensor) -> Tensor:
+    """The smallest fraction of the vertices of each unit that are not held [B, V]."""
+    fraction, index = torch.where(held, 1.0, fraction), unit.long().expand(fraction.shape)
+    return torch.ones_like(fraction).scatter_reduce(1, index, fraction, "amin").gather(1, index)

@@ -41,6 +41,7 @@ class ContactSurface:
     plane_points: Tensor  # [N] bool: spans a plane
     body_order: Tensor  # [V] int32: vertices by body
     body_ptr: Tensor  # [bodies + 1] int32
+    unit: Tensor  # [V] int32: the vertex whose step fraction each has, one for a free body; itself on a pinned one
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
     most_room: Tensor  # [bodies] [m]: that any vertex is given beside its island
@@ -138,6 +139,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         plane_points=torch.from_numpy(np.concatenate(flat)),
         body_order=torch.from_numpy(order.astype(np.int32)),
         body_ptr=torch.from_numpy(np.searchsorted(label[order], np.arange(bodies + 1)).astype(np.int32)),
+        unit=units(torch.from_numpy(label), held_bodies),
         bodies=bodies,
         rows=tuple(rows),
         most_room=most_room,
@@ -146,6 +148,13 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         least_own_room=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
+
+
+def units(body: Tensor, held_bodies: Tensor) -> Tensor:
+    """The first vertex of each vertex's body where no vertex of that is pinned, else itself; int32 [V]."""
+    own = torch.arange(len(body), device=body.device)
+    first = torch.full((len(held_bodies),), len(body), device=body.device).scatter_reduce(0, body, own, "amin")
+    return torch.where(held_bodies[body], own, first[body]).to(torch.int32)
 
 
 def check_colliders(colliders: Any) -> tuple[Collider, ...]:

@@ -14,13 +14,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .._common.constants import FILTER_ETA
 from .._common.context import is_captured
 from ..energies import VERTEX_ENERGIES
 from .autograd import Bars, Differentiable, sum_to
 from .fields import TouchingFields
 from .load import direct as raw
-from .sums import segment_sum
 
 # --- searches ---------------------------------------------------------------------------------------------------------
 
@@ -112,25 +110,6 @@ def contact_intersections(x: Tensor, origin: Tensor, collider: Tensor, rest: Ten
     )  # fmt: skip
 
 
-def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, collider: Tensor, collider_next: Tensor,
-                    planes: Tensor, body: Tensor, body_order: Tensor, body_ptr: Tensor, held: Tensor, radius: Tensor,
-                    room: Tensor, mesh_bodies: int, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
-    """Smallest body of the island of bodies in contact that each body is in [B, NB] int32, or -1.
-
-    An island moves by the mass-weighted mean of ``move`` over its vertices that are not held. Bodies whose boxes, swept
-    by that and grown by room and dhat / 2, overlap are of one island. -1: the island holds a held vertex or may reach
-    a collider, and must stay. Not differentiable; results repeat to the bit.
-
-    Args:
-        x, origin, collider, collider_next, planes, body, held, radius, room, dhat: As for :func:`contact_detect`.
-        move, mass: [B, V, 3] where each vertex wants to go [m], [1 | B, V] [kg].
-        any_direction: Whether a floor may turn a translation into any direction, by which it does not become longer.
-        body_order, body_ptr: [V] vertices sorted by body, [NB + 1] the first of each body.
-    """
-    return raw.contact_islands(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
-                                held, radius, room, mesh_bodies, dhat, any_direction)  # fmt: skip
-
-
 # --- motions and rooms of bodies --------------------------------------------------------------------------------------
 
 
@@ -159,35 +138,11 @@ def contact_motion(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, fall: 
     return Ways(*raw.contact_motion(x, origin, mass, move, fall, held, held_bodies, order, ptr))
 
 
-def contact_motion_backward(bar: Tensor, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, held: Tensor,
-                            held_bodies: Tensor, order: Tensor, ptr: Tensor
-                            ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Adjoints of x [B, V, 3], of mass [B, V] and of move [B, V, 3], from that of the rigid motion."""
-    return raw.contact_motion_backward(bar, x, origin, mass, move, held, held_bodies, order, ptr)
-
-
-def contact_coast(x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor, order: Tensor, ptr: Tensor,
-                  chord: float) -> Tensor:  # fmt: skip
-    """``move`` [B, V, 3] [m], of free bodies without the stretch of straight lines: their shape goes on by what is not
-    a turn, and the turn is one of the whole body.
-
-    Args:
-        x: [B, V, 3] [m].  mass: [1 | B, V] [kg].  move, held, held_bodies, order, ptr: As for :func:`contact_motion`.
-        chord: How far back along its way a vertex is taken to have been, over that way.
-    """
-    return raw.contact_coast(x, mass, move, held, held_bodies, order, ptr, chord)
-
-
-def contact_coast_backward(bar: Tensor, x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor,
-                           order: Tensor, ptr: Tensor, chord: float) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Adjoints of x [B, V, 3], of mass [B, V] and of move [B, V, 3]."""
-    return raw.contact_coast_backward(bar, x, mass, move, held, held_bodies, order, ptr, chord)
-
-
 class RoomsOfBodies(NamedTuple):
     """How far the vertices of bodies may go until pairs are found again. Index data."""
 
-    island: Tensor  # of each body [B, NB] int32, see contact_islands
+    island: Tensor  # smallest body of the island of each body [B, NB] int32; -1: a held vertex or collider stops it
+    u: Tensor  # translation of each body's island, rounded to a grid [B, NB, 3] [m]
     room: Tensor  # beside the island's translation, and the largest of the scene [B, NB + 1] [m]
     own_room: Tensor  # beside the rigid motion of their own body, [B, NB + 1] [m]
     over: Tensor  # how far they want to go, or up to 2 what they ask for, over the most room they get [B, NB]
@@ -196,22 +151,23 @@ class RoomsOfBodies(NamedTuple):
 def contact_rooms(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, held: Tensor, order: Tensor, ptr: Tensor,
                   ways: Ways, floor: Tensor, collider: Tensor, collider_next: Tensor, planes: Tensor, body: Tensor,
                   radius: Tensor, most: Tensor, most_alone: Tensor, most_own: Tensor, least_own: Tensor, dhat: float,
-                  share: float, least: float, any_direction: bool, self_contact: bool) -> RoomsOfBodies:  # fmt: skip
+                  share: float, least: float, self_contact: bool) -> RoomsOfBodies:  # fmt: skip
     """Rooms follow from where a body wants to go: pairs that could meet within them are listed, and what does not want
-    to move relative to its neighbours lists few. Not differentiable; results repeat to the bit.
+    to move relative to its neighbours lists few. Bodies whose boxes, swept by the translation of their island and grown
+    by room and dhat / 2, overlap are of one island. Not differentiable; results repeat to the bit.
 
     Args:
         x, origin, mass, move, held, order, ptr: As for :func:`contact_motion`, held [N].  ways: What that returned.
         floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
-        collider, collider_next, planes, body, radius, any_direction: As for contact_islands.
+        collider, collider_next, planes, body, radius: As for :func:`contact_detect`.
         most, most_alone, most_own, least_own: Bounds of the rooms of each body [NB] [m], see ContactSurface.
         dhat: [m].  share, least: What a room is over a body's way beside its island, and beside that [m].
         self_contact: Whether bodies have pairs, and so rooms, of their own.
     """
     return RoomsOfBodies(
         *raw.contact_rooms(
-            x, origin, mass, move, held, order, ptr, *ways, floor, collider, collider_next, planes, body, radius, most,
-            most_alone, most_own, least_own, dhat, share, least, any_direction, self_contact,
+            x, origin, mass, move, held, order, ptr, ways.longest, ways.sums, floor, collider, collider_next, planes,
+            body, radius, most, most_alone, most_own, least_own, dhat, share, least, self_contact,
         )
     )  # fmt: skip
 
@@ -241,24 +197,21 @@ def sweep_rooms(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, fall: Ten
 
 
 def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
-            held: Tensor, body: Tensor, room: Tensor, listed: Sequence[Tensor], careful: bool = True,
-            whole: bool = False, own: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Share of ``move - u`` that each vertex may go at once with all others [B, V], or each body [B, bodies]; how many
+            held: Tensor, body: Tensor, unit: Tensor, listed: Sequence[Tensor], careful: bool = True
+            ) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Step fraction 1, 1/2, ... or 0 of ``move - u`` that each vertex may go at once with all others [B, V]; how many
     pairs hinder what is prescribed, int64 [1]. Not differentiable.
 
     Args:
         x, move: [B, V, 3], state and wanted motion [m].  u: Translation of each body's island [B, bodies, 3] [m].
-        center, room: [B, V, 3] and [B, V]: how far from where a vertex may go [m].
+        center: [B, V, 3], where the gaps of the pairs were taken, less u [m].
+        unit: [V] int32, the vertex whose fraction each vertex has.
         listed: pairs, constants, ptr, entry of :func:`contact_detect`.
         careful: Whether the motion does not minimise the barrier.
-        whole: Whether all vertices of a body go the same share.
-        own: As center and room, beside the rigid motion of the vertex's body; empty where bodies have no own pairs.
     """
-    none = x.new_empty((0,))
-    return raw.contact_advance(
-        x, move, u, center, origin, collider, collider_next, held, body, room, *(own or (none, none)), *listed, careful,
-        whole,
-    )  # fmt: skip
+    found, infeasible = raw.contact_advance(x, move, u, center, origin, collider, collider_next, held, body, unit,
+                                            *listed, careful)  # fmt: skip
+    return found[:, unit], infeasible
 
 
 def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor
@@ -280,100 +233,6 @@ def keep(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, .
     their indices, int64, and their list. exact: as long as they are many, which the CPU alone can say; else in room for
     all, with -1 where there is none."""
     return raw.contact_keep(rows, *listed, exact)
-
-
-class PartBodies(NamedTuple):
-    """The bodies of a scene, as these operators take them."""
-
-    held: Tensor  # [V] bool, and perhaps of colliders
-    held_bodies: Tensor  # [bodies] bool: a vertex of it is held
-    body: Tensor  # [V] int32, and perhaps of colliders
-    order: Tensor  # [V] int32, vertices by body
-    ptr: Tensor  # [bodies + 1] int32
-
-
-class Whole(NamedTuple):
-    """Where bodies go as wholes, and what a floor takes from all ways."""
-
-    x: Tensor  # [B, V, 3] [m]
-    move: Tensor  # [B, V, 3] [m], where each vertex wants to go from there
-    u: Tensor  # [B, bodies, 3] [m], translation of its island
-    left: Tensor  # [B, V, 3] [m], what a floor leaves of the way of its body beside that
-    frames: Tensor  # [B, bodies], share of that way
-    planes: Tensor  # [1 | B, 7 planes] data of a FloorBarrier, or empty
-    origin: Tensor  # [B, V, 3] [m], or empty
-    bodies: PartBodies
-
-
-def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
-                ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Displacements of whole bodies as a floor limits them, less u [B, V, 3] [m], and which bodies it stops [B,
-    bodies].
-
-    Args:
-        x, way: [B, V, 3] [m].  u: [B, bodies, 3] [m], part of the way, which the floor lets pass; or empty.
-        planes, origin: As of Whole.  held: [V] bool, whether something else moves a vertex.
-        order, ptr: Vertices by body [V], and the first of each [bodies + 1], int32.
-    """
-    return raw.contact_above_floor(x, u, way, planes, origin, held, order, ptr)
-
-
-def frames(x: Tensor, move: Tensor, u: Tensor, way: Tensor, left: Tensor, stretch: Tensor, room: Tensor,
-           own_room: Tensor, bodies: PartBodies) -> tuple[Tensor, ...]:  # fmt: skip
-    """As far as rooms let bodies go as wholes. Not differentiable.
-
-    Args:
-        x, move, u, left: As of Whole.  way: Rigid motions of bodies [B, V, 3] [m].
-        stretch: By how much the straight ways of that stretch each body [B, bodies] [m].
-        room, own_room: Of bodies, and of all [B, bodies + 1] [m]; own_room may be empty.
-
-    Returns:
-        limit [B, bodies], share of ``left``; the ways that vertices go with it, and from where they have their rooms
-        [B, V, 3] [m]; rooms and own rooms of vertices [B, V] [m].
-    """
-    return raw.contact_frames(x, move, u, way, left, stretch, room, own_room, *bodies)
-
-
-def bends(at: Whole, limit: Tensor, stopped: Tensor, own_room: Tensor) -> tuple[Tensor, ...]:
-    """Where bodies have come as wholes, where vertices want to be, their ways there [B, V, 3] [m], and their state
-    [B, V] uint8: 0 goes, 1 rests, ASKS. Not differentiable.
-
-    limit [B, bodies], stopped [B, bodies] bool: of frames() and above_floor().  own_room: [B, bodies + 1] [m] or empty.
-    """
-    return raw.contact_bends(*at[:5], limit, stopped, own_room, *at[5:7], *at.bodies, FILTER_ETA)
-
-
-def hold(way: Tensor, state: Tensor, rises: Tensor) -> tuple[Tensor, Tensor]:
-    """Ways and state once those that ask are told whether their potential ``rises`` [B, V] bool: then they rest, and
-    their state remains. Not differentiable."""
-    return raw.contact_hold(way, state, rises)
-
-
-def held_up(base: Tensor, way: Tensor, share: Tensor, state: Tensor, bodies: PartBodies) -> tuple[Tensor, Tensor]:
-    """Where vertices come by shares [B, V] of their ways [B, V, 3], and their state: those ask of whose body pairs hold
-    some up. Not differentiable."""
-    return raw.contact_held_up(base, way, share, state, *bodies)
-
-
-def falls(at: Whole, fall: Tensor, share: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Shares [B, V], 0 of those that rest, where vertices come by them, and their ways from there by ``fall``
-    [B, V, 3] [m], of which a floor takes what would come too close. Not differentiable."""
-    return raw.contact_falls(*at[:2], fall, *at[2:5], share, state, *at[5:7], *at.bodies, FILTER_ETA)
-
-
-def start(at: Whole, fall: Tensor, share: Tensor, last_share: Tensor, stopped: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the part starts [B, V, 3] [m], by shares [B, V] of the way toward the wish and of the fall; and of which
-    vertices that are not stopped pairs have held up more than a hundredth of a way [B, V] bool."""
-    return raw.contact_start(*at[:2], fall, *at[2:5], share, last_share, stopped, *at[5:7], *at.bodies, FILTER_ETA)
-
-
-# --- what sweeps keep of the start of a step --------------------------------------------------------------------------
-
-
-def lowest(x: Tensor, origin: Tensor, planes: Tensor, body_order: Tensor, body_ptr: Tensor, island: Tensor
-           ) -> Tensor:  # fmt: skip
-    """Lowest vertex above each plane, of the island that each body is in, [B, bodies, planes] int32."""
-    return raw.contact_lowest(x, origin, planes, body_order, body_ptr, island)
 
 
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------
@@ -531,103 +390,9 @@ def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
 # --- what is differentiable -------------------------------------------------------------------------------------------
 
 
-def _of_planes(own: Tensor, planes: Tensor) -> Tensor | None:
-    """Adjoints of planes [1 | B, 7 planes] from what each body or vertex adds, ``own`` [B, n, 7 planes]."""
-    return sum_to(own, (own.shape[0], 1, own.shape[2]))[:, 0] if planes.numel() else None
-
-
 def _split(points: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """The adjoints of vertices and of colliders, from those of corner points."""
     return points[:, : x.shape[1]], points[:, x.shape[1] :]
-
-
-def _translation_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    move, mass, x, planes, origin = saved
-    return raw.contact_translation_backward(bars[0], move, mass, x, origin, planes, *rest)
-
-
-# Translation of each body's island [B, bodies, 3] [m], of move, mass, x, planes, origin; held, body, body_order,
-# body_ptr, island, lowest. Without a floor planes and lowest are empty.
-island_translation = Differentiable(
-    lambda move, mass, x, planes, origin, *index: raw.contact_translation(move, mass, x, origin, planes, *index),
-    _translation_reverse, arguments=11, inputs=4, tensors=5,
-)  # fmt: skip
-
-
-def _above_floor_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    planes = saved[3]
-    x, u, way, own = raw.contact_above_floor_backward(bars[0], *saved, needs[3] and planes.numel() > 0)
-    return x, u, way, _of_planes(own, planes)
-
-
-# above_floor(), differentiable in x, u, way and planes.
-ways_above_floor = Differentiable(above_floor, _above_floor_reverse, arguments=8, inputs=4, tensors=8)
-
-
-class Decided(NamedTuple):
-    """What is decided at the start of a part, not differentiated."""
-
-    frames: Tensor  # [B, bodies]
-    shares: tuple[Tensor, Tensor]  # [B, V]
-    stopped: Tensor  # [B, bodies] bool
-    origin: Tensor  # [B, V, 3] [m], or empty
-    bodies: PartBodies
-
-
-def _start(x: Tensor, move: Tensor, fall: Tensor, u: Tensor, left: Tensor, planes: Tensor, decided: Decided
-           ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    at = Whole(x, move, u, left, decided.frames, planes, decided.origin, decided.bodies)
-    return start(at, fall, *decided.shares, decided.stopped)
-
-
-def _start_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    (x, move, fall, u, left, planes), (decided,) = saved, rest
-    x, move, fall, u, left, own = raw.contact_start_backward(
-        bars[0], x, move, fall, u, left, decided.frames, *decided.shares, planes, decided.origin, *decided.bodies,
-        FILTER_ETA, needs[5] and planes.numel() > 0,
-    )  # fmt: skip
-    u = segment_sum(u, decided.bodies.order, decided.bodies.ptr)
-    return x, move, fall, u, left, _of_planes(own, planes)
-
-
-# start(), of x, move, fall, u, left, planes; Decided.
-part_start = Differentiable(_start, _start_reverse, arguments=7, inputs=6)
-
-
-def _motion_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    x, mass, move, origin = saved
-    return raw.contact_motion_backward(bars[0], x, origin, mass, move, *rest)
-
-
-# x, mass, move, origin; held, held_bodies, body_order, body_ptr, fall: Ways, differentiable in the rigid motion.
-rigid_motion = Differentiable(
-    lambda x, mass, move, origin, *index: raw.contact_motion(x, origin, mass, move, index[-1], *index[:-1]),
-    _motion_reverse, arguments=9, inputs=3, tensors=4, rest=lambda inputs: inputs[4:-1],
-)  # fmt: skip
-
-# contact_coast(), of x, mass, move; held, held_bodies, body_order, body_ptr, chord.
-coasting = Differentiable(
-    raw.contact_coast, lambda bars, saved, rest, needs: raw.contact_coast_backward(bars[0], *saved, *rest),
-    arguments=8, inputs=3,
-)  # fmt: skip
-
-
-def _unsupported_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    x, lift, force, mass, planes, origin = saved
-    *out, own = raw.contact_unsupported_backward(bars[0], x, origin, lift, force, mass, planes, *rest, needs[4])
-    return (*out, _of_planes(own, planes) if needs[4] else None)
-
-
-# What is left of lift [B, V, 3] [m] once forces have borne their part of each body's acceleration, of x, lift, force,
-# mass, planes, origin; held_bodies, body_order, body_ptr, time_step. Sums over a body make its own acceleration a and
-# that of the forces f. Contact takes the share s of f, between 0 and 1, that leaves least of a + s f, and none of a
-# body that is held. lift [1 | B, V, 3]: h^2 times the acceleration [m]; force [B, N, 3]: of pairs at corner points;
-# planes may be empty.
-lift_left = Differentiable(
-    lambda x, lift, force, mass, planes, origin, *rest: raw.contact_unsupported(x, origin, lift, force, mass, planes,
-                                                                                *rest),
-    _unsupported_reverse, arguments=10, inputs=5, tensors=6,
-)  # fmt: skip
 
 
 def _lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:

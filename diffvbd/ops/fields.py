@@ -24,7 +24,6 @@ PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS, CROSSING_ROW = (
 UNKNOWNS, FEW, MOST_COUPLED, GROUP_MEMORY = (
     _C[name] for name in ("unknowns", "few", "most_coupled", "group_memory")
 )  # of bodies that touch
-ASKS = _C["asks"]  # state of a vertex that rests unless the potential of its body lets it go
 STARTS = {"inertia": _C["start_inertia"], "predictor": _C["start_predictor"], "auto": _C["start_lower"]}
 START_LOWER = STARTS["auto"]
 CORRECTED, TILE, NO_MOVE, FRACTIONS, WORKSPACE_BUDGET, ROUNDINGS, DECREASE, RESTING_MOTION = (

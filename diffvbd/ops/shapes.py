@@ -24,7 +24,6 @@ from .fields import (
     NEAR_ROW,
     NEAR_VALUES,
     PAIR_ROW,
-    PLANE_SCALARS,
     REST_ROW,
     REST_SCALARS,
     START_LOWER,
@@ -178,20 +177,8 @@ def _contact_keep(a: Any) -> Any:
 
 def _contact_rooms(a: Any) -> Any:
     b, n = a.x.shape[0], _bodies(a)
-    return new(a.x, b, n, dtype=INT), new(a.x, b, n + 1), new(a.x, b, n + 1), new(a.x, b, n)
-
-
-def _contact_unsupported_backward(a: Any) -> Any:
-    b, v = a.x.shape[:2]
-    scalars = a.planes.numel() // a.planes.shape[0] if a.planes.numel() else 0
-    return (new(a.x, b if scalars else 0, v, 3), torch.empty_like(a.x), torch.empty_like(a.force), new(a.x, b, v),
-            new(a.x, b if a.wants_planes else 0, a.held_bodies.shape[0], scalars))  # fmt: skip
-
-
-def _contact_above_floor_backward(a: Any) -> Any:
-    b, n = a.x.shape[0], _bodies(a)
-    return (torch.empty_like(a.x), new(a.x, b if a.u.numel() else 0, n, 3), torch.empty_like(a.x),
-            new(a.x, b, n, _of_planes(a.planes, a.wants_planes)))  # fmt: skip
+    return (new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1),
+            new(a.x, b, n))  # fmt: skip
 
 
 def _contact_rigid_system(a: Any) -> Any:
@@ -254,21 +241,11 @@ TABLE: dict[str, Row] = {
     "contact_detect": _contact_detect,
     "contact_intersections": lambda a: (new(a.x, a.capacity, CROSSING_ROW, dtype=INT),
                                         new(a.x, a.x.shape[0], 2, dtype=LONG), new(a.x, a.x.shape[0], 2, 2, dtype=INT)),
-    "contact_islands": lambda a: new(a.x, a.x.shape[0], a.mesh_bodies, dtype=INT),
     "contact_motion": lambda a: (torch.empty_like(a.x), new(a.x, len(WAYS), a.x.shape[0], _bodies(a)),
                                  new(a.x, a.x.shape[0], _bodies(a), 4)),
-    "contact_motion_backward": lambda a: (torch.empty_like(a.x), new(a.x, *a.x.shape[:2]), torch.empty_like(a.x)),
-    "contact_coast": lambda a: torch.empty_like(a.x),
-    "contact_coast_backward": lambda a: (torch.empty_like(a.x), new(a.x, *a.x.shape[:2]), torch.empty_like(a.x)),
     "contact_rooms": _contact_rooms,
     "contact_sweep_rooms": lambda a: new(a.x, *a.x.shape[:2]),
-    "contact_unsupported": lambda a: torch.empty_like(a.x),
-    "contact_unsupported_backward": _contact_unsupported_backward,
-    "contact_lowest": lambda a: new(a.x, *a.island.shape, a.planes.shape[-1] // PLANE_SCALARS, dtype=INT),
-    "contact_translation": lambda a: new(a.x, *a.island.shape, 3),
-    "contact_translation_backward": lambda a: (torch.empty_like(a.move), new(a.x, *a.x.shape[:2]),
-                                               torch.empty_like(a.x), new(a.x, a.x.shape[0], _of_planes(a.planes))),
-    "contact_advance": lambda a: (new(a.x, *(a.u if a.whole else a.x).shape[:2]), new(a.x, 1, dtype=LONG)),
+    "contact_advance": lambda a: (new(a.x, *a.x.shape[:2]), new(a.x, 1, dtype=LONG)),
     "contact_narrow": lambda a: torch.empty_like(a.constants),
     "contact_keep": _contact_keep,
     "contact_lag": lambda a: new(a.x, a.pairs.shape[0], LAG_SCALARS),
@@ -276,17 +253,6 @@ TABLE: dict[str, Row] = {
     "contact_rubbing": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), _points(a.x, a.collider)),
     "contact_rubbing_backward": lambda a: (_points(a.x, a.collider), *(new(a.x, a.x.shape[0] if t.numel() else 0)
                                                                        for t in (a.kappa, a.friction, a.damping))),
-    "contact_above_floor": lambda a: (torch.empty_like(a.x), new(a.x, a.x.shape[0], _bodies(a), dtype=BOOL)),
-    "contact_above_floor_backward": _contact_above_floor_backward,
-    "contact_frames": lambda a: (torch.empty_like(a.stretch), *same(a.x, 2), new(a.x, *a.x.shape[:2]),
-                                 new(a.x, a.x.shape[0] if a.own_room.numel() else 0, a.x.shape[1])),
-    "contact_bends": lambda a: (*same(a.x, 3), new(a.x, *a.x.shape[:2], dtype=BYTE)),
-    "contact_hold": lambda a: (torch.empty_like(a.way), torch.empty_like(a.state)),
-    "contact_held_up": lambda a: (torch.empty_like(a.base), torch.empty_like(a.state)),
-    "contact_falls": lambda a: (torch.empty_like(a.share), *same(a.x, 2)),
-    "contact_start": lambda a: (torch.empty_like(a.x), torch.empty_like(a.share, dtype=BOOL)),
-    "contact_start_backward": lambda a: (*same(a.x, 5),
-                                         new(a.x, *a.x.shape[:2], _of_planes(a.planes, a.wants_planes))),
     "contact_rigid_system": _contact_rigid_system,
     "contact_rigid_move": _contact_rigid_move,
     "contact_rigid_backward": _contact_rigid_backward,

@@ -6,12 +6,10 @@ from __future__ import annotations
 import functools
 import math
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,8 +19,8 @@ from .._common.context import MorePairs, checking, in_segment, is_captured, not_
 from .._contact import detection as search
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
-from .._contact.start import PartStart, above_floor, start_between_planes
-from .._contact.surface import LEAST_CAPACITY, ContactSurface
+from .._contact.start import PartStart, start_above, start_between
+from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
 from ..adjoint.contact import Pairs, no_pairs, rubbing, some_of
 from ..adjoint.potential import RiseParts, of_vertices, rise_parts
 from ..adjoint.sweep import no_transforms, sweep
@@ -33,14 +31,13 @@ from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
-from ..ops.contact import RoomsOfBodies, contact_rooms, lift_left, sweep_rooms
+from ..ops.contact import RoomsOfBodies, contact_rooms, sweep_rooms
 from ..ops.fields import WAYS
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
 from .contact_corrections import Corrections, Scenes, Trials, bodies_of, corrected, corrected_after, is_cut, touching
 from .predict import Begun
 
-FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
@@ -65,9 +62,6 @@ class ContactStep:
             plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=())
             with torch.no_grad():
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
-        floor = model.floor
-        oblique = floor is not None and bool((np.count_nonzero(floor.normal, axis=-1) > 1).any())
-        self.any_direction = oblique or "floor_normal" in prepared.parameters
         self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
         self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_kappa")
@@ -94,16 +88,15 @@ class ContactStep:
         normal = broadcast(normal, (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
-    def _rub(self, listed: Pairs, collider: Tensor) -> Tensor:
-        """Notes friction and damping of the pairs at the start of the step, where there are any; returns the forces of
-        pairs on corner points [B, N, 3] [N]."""
+    def _rub(self, listed: Pairs, collider: Tensor) -> None:
+        """Notes friction and damping of the pairs at the start of the step, where there are any."""
+        if not self._rubs:
+            return
         none = self.kappa.new_empty
         friction = self._parameter("friction") if self.model.friction is not None else none((0,))
         damping = self._parameter("pair_damping") if self._damps else none((0,))
-        lag, push = rubbing(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
-        if self._rubs:
-            self.lagged, self.lag = listed, lag
-        return push
+        self.lag, _ = rubbing(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
+        self.lagged = listed
 
     @property
     def _damps(self) -> bool:
@@ -154,20 +147,17 @@ class ContactStep:
             self._refuse_what_is_not_finite()
             refuse_intersections(self.model, self.x_prev, self.origin, self.before)
         pinned, pins = self.model._pinned[:, None], self.model.num_active < self.model.num_vertices
-        lift = broadcast(self.begun.lift, self.begun.y.shape)
-        lift = torch.where(pinned, 0.0, lift) if pins else lift
-        x = self.x_prev
-        bodies = surface.held, surface.held_bodies, surface.body_order, surface.body_ptr
-        way = self.prepared.ways(functools.partial(coasting, x, self.fields.mass, self.begun.y - x - lift, *bodies))
+        x, y = self.x_prev, self.begun.y
+        acceleration = broadcast(self.begun.lift, y.shape)
+        acceleration = torch.where(pinned, 0.0, acceleration) if pins else acceleration
+        way, resting = self._wanted(acceleration)
         left, met = way, Met()
         stages, r = self.parts or 1, 0  # of what is prescribed
         planned, going = self.parts, None
         while r < (self.parts or 1):
             was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
-            # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
             move = torch.where(pinned, way / stages, left) if pins and stages > 1 else left
-            fall = lift if r == 0 else torch.zeros_like(lift)
-            motion = motion_of(surface, x, self.origin, self.fields.mass, move, fall)
+            motion = motion_of(surface, x, self.origin, self.fields.mass, move, acceleration)
             within = self._rooms(x, was, now, motion)
             if planned is None:
                 self.parts = planned = 1 if is_captured(x) else parts_of(within.over)
@@ -179,19 +169,9 @@ class ContactStep:
             if self._reads(x):  # before any work
                 self._check(r, met.counts[r].tolist(), met)
             if r == 0:
-                pushing = self._pushing(detection.listed)
-                push = self._rub(pushing, was)
-                fall = lift = unsupported(self.model, x, self.origin, push, self.fields.mass, lift, self.floor_data,
-                                          settings.numbers.time_step)  # fmt: skip
-            falls, resting = r == 0 and self.model.starts_from == "predictor", None
-            if falls and pins and self.model.start == "auto":
-                resting = rests(self.model, (self.x_prev + way).detach(), lift.detach(), self._raises)
-            if resting is not None:
-                fall = lift = torch.where(resting[..., None], 0.0, lift)
-            fall = fall if falls else torch.zeros_like(fall)  # corrections do it
-            start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, motion.rigid, ROOM * motion.stretched, self._raises,
-                                         barrier.self_contact, falls)  # fmt: skip
+                self._rub(self._pushing(detection.listed), was)
+            start = start_between(x, move, was, now, self.floor_data, self.origin, detection, surface, motion.rigid,
+                                  barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
@@ -221,7 +201,7 @@ class ContactStep:
                 held = held & going[..., 0]
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=tuple(taken), limits=limits,
-                                    kept=kept, frames=start.frames, lengths=lengths, sweeps=sweeps, going=going,
+                                    kept=kept, lengths=lengths, sweeps=sweeps, going=going,
                                     resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
@@ -231,7 +211,7 @@ class ContactStep:
                 going = asked[:, None, None] if going is None else going & asked[:, None, None]
                 self.parts += int(going.any())
             if r < self.parts:
-                left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
+                left = torch.where(start.short[..., None], y - x, 0.0)
         x = self._judged(x, met)
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
             found.extend(met.found)
@@ -246,16 +226,28 @@ class ContactStep:
         """Scenes with an inverted tet, bool [B]."""
         return inside_out(self.model.tets, x if self.begun.origin is None else x.detach() + self.origin).any(-1)
 
-    def _raises(self, x: Tensor, to: Tensor) -> Tensor:
-        """Vertices of bodies whose own potential is higher at ``to`` than at x [B, V], bool."""
-        return self.potential_parts.raises(x.detach().contiguous(), to.detach())
+    def _wanted(self, acceleration: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Displacement that each vertex starts with, ``h v`` [B, V, 3] [m], and the vertices of partly pinned bodies
+        that go without gravity's, bool [B, V]. A free body's correction adds ``acceleration`` = h^2 a; a body with pins
+        adds it here unless its own potential would rise: elasticity bears a body at rest."""
+        surface, way = self.surface, self.begun.y - self.x_prev - acceleration
+        if surface is None or surface.partly_held is None or self.model.starts_from != "predictor":
+            return way, None
+        resting = ~surface.partly_held.expand(way.shape[:2])
+        if self.model.start == "auto":
+            with torch.no_grad():
+                at = self.x_prev + way
+                resting = resting | self.potential_parts.raises(at, at + acceleration)
+        return way + torch.where(resting[..., None], 0.0, acceleration), resting
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
-        x = start_on_floor(self.model, self.begun, self.floor_data, self.fields.mass, self.prepared)
-        room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
-        whole = torch.ones_like(room)
-        start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(), (whole, whole))
+        x, none = self.x_prev, no_pairs(self.x_prev, math.prod(self.x_prev.shape[:2]))
+        free, held, body = bodies_of(self.model)[2:]
+        body = body[: x.shape[1]].long()
+        start = start_above(x, self.begun.y - x - broadcast(self.begun.lift, x.shape), self.floor_data, self.origin,
+                            held, units(body, ~free))  # fmt: skip
+        x = torch.where(free[body, None], start.x, self.begun.x_start)
         x = corrected(self, x, self.colliders, start, none).x
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
@@ -285,21 +277,17 @@ class ContactStep:
 
     def _rooms(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> RoomsOfBodies:
         assert self.surface is not None and self.barrier is not None
-        return rooms(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now, self.floor_data,
-                     self.any_direction)  # fmt: skip
+        return rooms(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now, self.floor_data)
 
     @torch.no_grad()
     def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: RoomsOfBodies) -> Detection:
-        surface, barrier, island = self.surface, self.barrier, within.island
+        surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         x, room, own_room = x.detach(), within.room, within.own_room
         *index, corners, values, counts, smallest = search.detect(
             x, self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, room, own_room
         )
-        lowest = island.new_empty((0,))
-        if self.floor_data is not None:
-            lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
-        return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room, own_room)
+        return Detection(Pairs(*index), corners, values, counts, smallest, within.u, room, own_room)
 
     def _record(self, met: Met) -> Tensor:
         """Notes what became of the step; its counts [parts, 4]."""
@@ -513,15 +501,12 @@ class Detection(NamedTuple):
         near_values: Its weights, normal and gap [m], [B, N, 8].
         counts: int64 [4]: pairs that the list needs, pairs that touch, key of one of those or -1, 0.
         smallest: Smallest gap of each scene, or how far was looked [m], [B].
-        island: Smallest body of those that each body moves with, int [B, bodies]; -1: it stays, being held or near a
-            collider.
-        lowest: Lowest vertex of each body's island above each plane of the floor, int [B, bodies, planes]; else empty.
+        u: Translation of each body's island, rounded to a grid [B, bodies, 3] [m].
         room: How far the vertices of each body may go beside its island, and the largest [m], [B, bodies + 1].
         own_room: The same beside the rigid motion of the body [m].
-        shares: How much of its two ways each vertex begins the part with, [B, V] each.
+        shares: Step fraction of each vertex at the start [B, V].
         corrections: Shares of the rigid corrections before and after the sweeps, [B, bodies] each.
         limits: By how often each update was halved, uint8 [B, K, V]; 8: it was not made.
-        frames: Share of the rigid motion that each body begins the part with, [B, bodies].
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
         kept: Rows of the listed pairs that sweeps can reach; None where that would have to be read, as on CUDA.
         sweeps: How many sweeps the part has.
@@ -534,15 +519,13 @@ class Detection(NamedTuple):
     near_values: Tensor
     counts: Tensor
     smallest: Tensor
-    island: Tensor
-    lowest: Tensor
+    u: Tensor
     room: Tensor
     own_room: Tensor
     # what the part has decided
-    shares: tuple[Tensor, ...] | None = None
+    shares: Tensor | None = None
     corrections: tuple[Tensor, ...] | None = None
     limits: Tensor | None = None
-    frames: Tensor | None = None
     lengths: Tensor | None = None
     kept: Tensor | None = None
     sweeps: int = 0
@@ -666,20 +649,19 @@ LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compre
 
 @torch.no_grad()
 def rooms(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
-          was: Tensor, now: Tensor, floor: Tensor | None, any_direction: bool) -> RoomsOfBodies:  # fmt: skip
+          was: Tensor, now: Tensor, floor: Tensor | None) -> RoomsOfBodies:  # fmt: skip
     """Trust-region radii of bodies until pairs are found again. Index data.
 
     Args:
         motion: Where each vertex wants to go.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
         was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or None.
-        any_direction: Whether the floor has planes across the axes, along which a translation may be turned.
     """
     s, dhat = surface, barrier.dhat
     floor = x.new_empty((0,)) if floor is None else floor.detach().contiguous()
     return contact_rooms(
-        x.detach(), origin, mass.detach().contiguous(), motion.move.detach().contiguous(), s.held, s.body_order,
+        x.detach(), origin, mass.detach().contiguous(), motion.move, s.held, s.body_order,
         s.body_ptr, motion.ways, floor, was.detach(), now.detach(), s.planes, s.body, s.radius, s.most_room,
-        s.most_room_alone, s.most_own_room, s.least_own_room, dhat, ROOM, LEAST_ROOM * dhat, any_direction,
+        s.most_room_alone, s.most_own_room, s.least_own_room, dhat, ROOM, LEAST_ROOM * dhat,
         barrier.self_contact,
     )  # fmt: skip
 
@@ -697,31 +679,27 @@ def rooms_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrie
     """
     s, none = surface, x.new_empty((0,))
     own_center, own_room = start.own or (none, none)
-    x, led, begin, move, fall = (t.detach().contiguous() for t in (x, start.x, begin, motion.move, motion.fall))
+    x, led, begin = (t.detach().contiguous() for t in (x, start.x, begin))
     return sweep_rooms(
-        x, led, begin, move, fall, motion.apart, motion.stretched, start.center, start.room, own_center, own_room,
-        s.held, s.body_order, s.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
+        x, led, begin, motion.move, motion.fall, motion.apart, motion.stretched, start.center, start.room, own_center,
+        own_room, s.held, s.body_order, s.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
     )  # fmt: skip
 
 
 # --- intended motion of bodies ----------------------------------------------------------------------------------------
 
 
-def coasting(x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor, order: Tensor, ptr: Tensor,
-             chord: float) -> Tensor:  # fmt: skip
-    """The ways ``move`` [B, V, 3] without what stretches free bodies that turn; differentiable in x, mass and move.
-    Arguments as for :func:`diffvbd.ops.contact.contact_coast`."""
-    given = (t.contiguous() for t in (x, mass, move))
-    return ops_contact.coasting(*given, held, held_bodies, order, ptr, chord)
-
-
 class Motion(NamedTuple):
     """The ways that vertices want to go in a part of a step."""
 
     move: Tensor  # [B, V, 3] [m]
-    fall: Tensor  # [B, V, 3] [m]: what contact may bear of it comes after ``move``
-    rigid: Tensor  # [B, V, 3] [m]: of ``move`` a shift and a turn of each body, which brings no two points of it closer
+    fall: Tensor  # [B, V, 3] [m]: what acceleration adds
     ways: ops_contact.Ways  # index data
+
+    @property
+    def rigid(self) -> Tensor:
+        """Of ``move`` a shift and a turn of each body, which brings no two points of it closer [B, V, 3] [m]."""
+        return self.ways.rigid
 
     @property
     def apart(self) -> Tensor:
@@ -736,87 +714,11 @@ class Motion(NamedTuple):
 
 
 def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, fall: Tensor) -> Motion:
-    """Differentiable in what x, mass and move do to ``rigid``.
+    """Index data.
 
     Args:
         x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].  move, fall: [B, V, 3] [m].
     """
-    x, mass, move = x.contiguous(), mass.contiguous(), move.contiguous()
+    x, mass, move, fall = (t.detach().contiguous() for t in (x, mass, move, fall))
     index = (surface.held, surface.held_bodies, surface.body_order, surface.body_ptr)
-    rigid, longest, sums = ops_contact.rigid_motion(x, mass, move, origin, *index, fall.detach().contiguous())
-    return Motion(move, fall, rigid, ops_contact.Ways(rigid.detach(), longest, sums))
-
-
-# --- residual acceleration of each body -------------------------------------------------------------------------------
-
-
-def unsupported(model: System, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
-                floor_data: Tensor | None, time_step: float) -> Tensor:  # fmt: skip
-    """Residual of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
-    part of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
-
-    Without it every step would push a supported body into its support, and the sweeps would have to take it back.
-
-    Args:
-        x, origin: As the sweeps take them.  push: Forces of pairs on corner points at x [B, N, 3] [N].
-        mass: [1 | B, V] [kg].  floor_data: Of the FloorBarrier [1 | B, 7 planes], or None.  time_step: [s].
-    """
-    surface = model.surface_of_contact
-    assert surface is not None
-    planes = x.new_empty((0,)) if floor_data is None else floor_data
-    constants = (surface.held_bodies, surface.body_order, surface.body_ptr, time_step)
-    at = x.detach() if floor_data is None else x  # without a floor only forces know where vertices are
-    given = (t.contiguous() for t in (at, lift, push, mass, planes))
-    return lift_left(*given, origin, *constants)
-
-
-def rests(model: System, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
-    """Vertices of partly pinned bodies whose potential ``lift`` would increase, bool [B, V]; None
-    without such bodies. Elasticity bears the weight of a body at rest, and its potential is convex about there: it
-    rises by any fall. Few sweeps do not take the fall back, and what stands on such a body would follow it.
-
-    Args:
-        x: Where vertices are without the fall, [B, V, 3] [m].  lift: As :func:`unsupported` returns it.
-        raises: As for :func:`diffvbd._contact.start.start_between_planes`.
-    """
-    assert model.surface_of_contact is not None
-    held = model.surface_of_contact.partly_held
-    return None if held is None else raises(x, x + lift) & held
-
-
-# --- start of the sweeps of a step with friction on a floor and no pairs ----------------------------------------------
-
-PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
-
-
-def start_on_floor(model: System, begun: Begun, floor: Tensor | None, mass: Tensor, prepared: Prepared
-                   ) -> Tensor:  # fmt: skip
-    """Positions [B, V, 3] [m]: free bodies go as wholes, above the floor. If each vertex went as far as the floor lets
-    it by itself, the start would press a body that hits the floor. Differentiable.
-
-    floor: Data of the FloorBarrier [1 | B, 7 planes], or None.  mass: [1 | B, V] [kg].
-    """
-    x, start = begun.x_prev, begun.x_start
-    if floor is None:
-        return start
-    order, ptr, free, held, body = bodies_of(model)
-    body, lift = body[: x.shape[1]].long(), broadcast(begun.lift, x.shape)
-    way = prepared.ways(partial(coasting, x, mass, begun.y - x - lift, held, ~free, order, ptr))
-    if model.starts_from != "inertia":
-        way = way + _borne(floor, x if begun.origin is None else x + begun.origin, lift, body, len(free))
-    none = x.new_empty((0,))
-    origin = none if begun.origin is None else begun.origin
-    left, _ = above_floor(x, none, way, floor, origin, held, order, ptr)
-    return torch.where(free[body, None], x + left, start)
-
-
-def _borne(floor: Tensor, x: Tensor, lift: Tensor, body: Tensor, bodies: int) -> Tensor:
-    """``lift`` = h^2 a [B, V, 3] without what pushes a body into a plane within dhat, which bears it. Of a body at rest
-    nothing is left, on a slope what draws it down the slope."""
-    planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
-    normal = planes[:, 0, :, :3]
-    with torch.no_grad():
-        close = (x @ normal.mT - planes[..., 3] < planes[..., DHAT]).to(x.dtype)
-        near = close.new_zeros((len(x), bodies, close.shape[-1]))
-        near = near.scatter_reduce(1, body[:, None].expand(close.shape), close, "amax")[:, body]
-    return lift - (near * (lift @ normal.mT).clamp(max=0)) @ normal
+    return Motion(move, fall, ops_contact.contact_motion(x, origin, mass, move, fall, *index))

@@ -108,6 +108,7 @@ class Trials:
         self.scenes, self.parts = scenes, parts
         moving = parts.model._moving
         self.count = moving.number + 1  # what does not move is a body too
+        self.each = torch.arange(scenes.fields.x_prev.shape[1], dtype=torch.int32, device=moving.of.device)
         self.of = moving.of
         self.of_corner = torch.cat([self.of, self.of.new_full((scenes.fields.collider.shape[1],), moving.number)])
         self.bodies = self._sets()
@@ -205,8 +206,9 @@ class Trials:
         none, collider = x.new_zeros((x.shape[0], surface.bodies, 3)), f.collider.detach()
         way = torch.nan_to_num(to - x, 0.0, 0.0, 0.0)  # what is no number is found by the potential
         share, _ = ops_start.advance(x.contiguous(), way, none, f.center, f.origin, collider, collider, f.held, f.body,
-                                     f.room, self.scenes.listed, careful=False)  # fmt: skip
-        return share
+                                     self.each, self.scenes.listed, careful=False)  # fmt: skip
+        within = (to - f.center).square().sum(-1) <= f.room**2
+        return torch.where(within | f.held[: x.shape[1]], share, 0.0)
 
 
 def _summed(
