@@ -42,7 +42,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"few", contact::kFew},                   // bodies of scenes that are one group
       {"most_coupled", contact::kMostCoupled},  // bodies of a group,
       {"group_memory", contact::kGroupMemory},  // of which there are at most so many over the bodies of the scene
-      {"asks", contact::kPending},  // state of a vertex that rests unless the potential of its body lets it go
+      {"pending", contact::kPending},  // state of a vertex: frozen unless the potential of its body decreases
       {"start_inertia", start::kInertia},
       {"start_predictor", start::kPredictor},
       {"start_lower", start::kLower},

@@ -51,14 +51,14 @@ contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, cons
 }
 
 template <class T>
-contact::SupportVertexInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
-                                              const Tensor& order, const Tensor& ptr, const Tensor& island) {
+contact::SupportVertexInputs<T> support_vertex_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
+                                                      const Tensor& order, const Tensor& ptr, const Tensor& island) {
   const Reader<T> read(x);
   contact::SupportVertexInputs<T> in{};
   in.x = read.positions();
   in.origin = read.vectors_or_null("origin", origin);
   const Batched<const T> floor = floor_of(read, planes);
-  require(floor.data != nullptr, "diffvbd::contact_lowest: expected planes [scenes, 7 planes]");
+  require(floor.data != nullptr, "diffvbd::contact_support_vertices: expected planes [scenes, 7 planes]");
   in.planes = floor.data, in.plane_scene = floor.scene, in.num_planes = planes_of(planes);
   in.body_order = read.index("body_order", order, read.v), in.body_ptr = read.index("body_ptr", ptr, 1, true);
   in.scenes = read.b;

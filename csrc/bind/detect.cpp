@@ -4,12 +4,12 @@
 namespace diffvbd {
 namespace {
 
-// What a search reads of surfaces; with room and own_room also how far it looks.
+// What a search reads of surfaces; with room and deformation_radius also how far it looks.
 template <class T>
 contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Tensor& collider,
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
                                  const Tensor& triangles, const Tensor& edges, const Tensor& points,
-                                 const Tensor& planes, const Tensor& body, const Tensor& held, int64_t mesh_bodies,
+                                 const Tensor& planes, const Tensor& body, const Tensor& pinned, int64_t mesh_bodies,
                                  bool self_contact, bool between_bodies) {
   const Reader<T> read(x);
   const int64_t b = read.b, n = body.numel();
@@ -29,7 +29,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.edges = primitives("edges", edges, 2, out.num_edges);
   out.points = primitives("points", points, 1, out.num_points);
   out.planes = primitives("planes", planes, 3, out.num_planes);
-  out.body = read.index("body", body, n), out.pinned = read.flags("held", held, n);
+  out.body = read.index("body", body, n), out.pinned = read.flags("pinned", pinned, n);
   require(b * n + 1 <= std::numeric_limits<int32_t>::max(),
           "contact: too large, expected at most 2^31 corner points in all scenes");
   out.scenes = b;
@@ -50,18 +50,18 @@ void require_capacity(int64_t capacity) {
 // 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
 // many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
 DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,
-                 In triangles, In edges, In points, In planes, In body, In held, In room, In own_room,
-                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat, int64_t capacity,
-                 bool trim) {
+                 In triangles, In edges, In points, In planes, In body, In pinned, In trust_radius,
+                 In deformation_radius, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
+                 int64_t capacity, bool trim) {
   const Device device(x);
   require_capacity(capacity);
   return dispatch_float(x, [&]<class T>(T) {
     auto in = surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body,
-                             held, mesh_bodies, self_contact, between_bodies);
+                             pinned, mesh_bodies, self_contact, between_bodies);
     require(std::isfinite(dhat), "contact: expected a finite dhat");
     const Reader<T> read(x);
-    in.trust_radius = read.like("room", room, read.b * (in.mesh_bodies + int64_t{1}));
-    in.deformation_radius = read.like("own_room", own_room, read.b * (in.mesh_bodies + int64_t{1}));
+    in.trust_radius = read.like("trust_radius", trust_radius, read.b * (in.mesh_bodies + int64_t{1}));
+    in.deformation_radius = read.like("deformation_radius", deformation_radius, read.b * (in.mesh_bodies + int64_t{1}));
     in.dhat = static_cast<T>(dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor near_corners = device.empty({b, n, contact::kNearRow}, ScalarType::Int);
@@ -93,13 +93,13 @@ DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collid
 
 // Results as in contact/intersect.h.
 DIFFVBD_OPERATOR(Out<3>, contact_intersections, In x, In origin, In collider, In rest, In radius, In triangles,
-                 In edges, In points, In planes, In body, In held, int64_t mesh_bodies, bool self_contact,
+                 In edges, In points, In planes, In body, In pinned, int64_t mesh_bodies, bool self_contact,
                  bool between_bodies, int64_t capacity) {
   const Device device(x);
   require_capacity(capacity);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points, planes, body,
-                                   held, mesh_bodies, self_contact, between_bodies);
+                                   pinned, mesh_bodies, self_contact, between_bodies);
     Tensor pairs = device.empty({capacity, contact::kCrossingRow}, ScalarType::Int);
     Tensor first = device.empty({in.scenes, 2, 2}, ScalarType::Int);
     Tensor counts = device.empty({in.scenes, 2}, ScalarType::Long);
@@ -112,12 +112,12 @@ DIFFVBD_OPERATOR(Out<3>, contact_intersections, In x, In origin, In collider, In
 
 // The smallest body of the island that each body is in [B, bodies] int32, or -1 (contact/islands.h).
 DIFFVBD_OPERATOR(Tensor, contact_islands, In x, In origin, In move, In mass, In collider, In collider_next, In planes,
-                 In body, In body_order, In body_ptr, In held, In radius, In room, int64_t mesh_bodies, double dhat,
-                 bool any_direction) {
+                 In body, In body_order, In body_ptr, In pinned, In radius, In trust_radius, int64_t mesh_bodies,
+                 double dhat, bool any_direction) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
-                                     held, radius, room, mesh_bodies, dhat, any_direction);
+                                     pinned, radius, trust_radius, mesh_bodies, dhat, any_direction);
     Tensor island = device.empty({in.scenes, in.mesh_bodies}, ScalarType::Int);
     DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::islands_workspace_bytes<T>(in));)
     DIFFVBD_RUN(device, find_islands<T>, in, data<int32_t>(island) DIFFVBD_ON_CUDA(, work.data_ptr()));

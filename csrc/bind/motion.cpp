@@ -11,7 +11,7 @@ namespace {
 
 template <class T>
 contact::MotionInputs<T> motion_inputs(const Tensor& x, const Tensor& origin, const Tensor& mass, const Tensor& move,
-                                       const Tensor& held, const Tensor& order, const Tensor& ptr) {
+                                       const Tensor& pinned, const Tensor& order, const Tensor& ptr) {
   const Reader<T> read(x);
   require(read.b * read.v <= std::numeric_limits<int32_t>::max(),
           "diffvbd::contact_motion: too large, expected at most 2^31 vertices in all scenes");
@@ -20,32 +20,32 @@ contact::MotionInputs<T> motion_inputs(const Tensor& x, const Tensor& origin, co
   in.x = read.positions(), in.move = read.vectors("move", move);
   in.origin = read.batch_or_null("origin", origin, 3 * read.v);
   in.mass = read.batch("mass", mass, read.v);
-  in.pinned = read.flags("held", held, read.v, true);
+  in.pinned = read.flags("pinned", pinned, read.v, true);
   return in;
 }
 
 // What of the ways that vertices want to go is a rigid motion of each body [B, V, 3]; the longest ways [5, B, bodies]
 // and the sums [B, bodies, 4] of contact/motion.h. origin and fall may be empty.
-DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In fall, In held, In held_bodies, In order,
-                 In ptr) {
+DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In gravity_move, In pinned,
+                 In pinned_bodies, In order, In ptr) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
-    in.pinned_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
-    in.gravity_move = Reader<T>(x).vectors_or_null("fall", fall);
-    Tensor rigid = device.like_x(), ways = device.empty({contact::kDisplacements, in.scenes, in.bodies});
+    auto in = motion_inputs<T>(x, origin, mass, move, pinned, order, ptr);
+    in.pinned_bodies = Reader<T>(x).flags("pinned_bodies", pinned_bodies, in.bodies);
+    in.gravity_move = Reader<T>(x).vectors_or_null("gravity_move", gravity_move);
+    Tensor rigid = device.like_x(), displacements = device.empty({contact::kDisplacements, in.scenes, in.bodies});
     Tensor sums = device.empty({in.scenes, in.bodies, 4});
-    DIFFVBD_RUN(device, find_motion<T>, in, data<T>(rigid), data<T>(ways), data<T>(sums));
-    return Out<3>(rigid, ways, sums);
+    DIFFVBD_RUN(device, find_motion<T>, in, data<T>(rigid), data<T>(displacements), data<T>(sums));
+    return Out<3>(rigid, displacements, sums);
   });
 }
-DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In mass, In move, In held, In held_bodies,
-                 In order, In ptr) {
+DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In mass, In move, In pinned,
+                 In pinned_bodies, In order, In ptr) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
+    auto in = motion_inputs<T>(x, origin, mass, move, pinned, order, ptr);
     const Reader<T> read(x);
-    in.pinned_bodies = read.flags("held_bodies", held_bodies, in.bodies);
+    in.pinned_bodies = read.flags("pinned_bodies", pinned_bodies, in.bodies);
     Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
     const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
                                          data<T>(mass_bar)};
@@ -56,59 +56,59 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In ma
 
 // The ways of `move`, of free bodies without what stretches them, see contact/coast.h. It asks for no origin, which all
 // vertices of a body have in common.
-DIFFVBD_OPERATOR(Tensor, contact_coast, In x, In mass, In move, In held, In held_bodies, In order, In ptr,
-                 double chord) {
+DIFFVBD_OPERATOR(Tensor, contact_extrapolate, In x, In mass, In move, In pinned, In pinned_bodies, In order, In ptr,
+                 double lookback) {
   const Device device(x);
-  require(chord != 0, "diffvbd::contact_coast: expected chord other than 0");
+  require(lookback != 0, "diffvbd::contact_extrapolate: expected lookback other than 0");
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, device.empty({0}), mass, move, held, order, ptr);
-    in.pinned_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
-    Tensor coasted = device.like_x();
-    DIFFVBD_RUN(device, extrapolate<T>, in, chord, data<T>(coasted));
-    return coasted;
+    auto in = motion_inputs<T>(x, device.empty({0}), mass, move, pinned, order, ptr);
+    in.pinned_bodies = Reader<T>(x).flags("pinned_bodies", pinned_bodies, in.bodies);
+    Tensor extrapolated = device.like_x();
+    DIFFVBD_RUN(device, extrapolate<T>, in, lookback, data<T>(extrapolated));
+    return extrapolated;
   });
 }
-DIFFVBD_OPERATOR(Out<3>, contact_coast_backward, In bar, In x, In mass, In move, In held, In held_bodies, In order,
-                 In ptr, double chord) {
+DIFFVBD_OPERATOR(Out<3>, contact_extrapolate_backward, In bar, In x, In mass, In move, In pinned, In pinned_bodies,
+                 In order, In ptr, double lookback) {
   const Device device(x);
-  require(chord != 0, "diffvbd::contact_coast: expected chord other than 0");
+  require(lookback != 0, "diffvbd::contact_extrapolate: expected lookback other than 0");
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, device.empty({0}), mass, move, held, order, ptr);
+    auto in = motion_inputs<T>(x, device.empty({0}), mass, move, pinned, order, ptr);
     const Reader<T> read(x);
-    in.pinned_bodies = read.flags("held_bodies", held_bodies, in.bodies);
+    in.pinned_bodies = read.flags("pinned_bodies", pinned_bodies, in.bodies);
     Tensor x_bar = device.like_x(), move_bar = device.like_x(), mass_bar = device.empty({in.scenes, in.vertices});
     const contact::MotionAdjoints<T> out{read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar),
                                          data<T>(mass_bar)};
-    DIFFVBD_RUN(device, reverse_extrapolate<T>, in, chord, out);
+    DIFFVBD_RUN(device, reverse_extrapolate<T>, in, lookback, out);
     return Out<3>(x_bar, mass_bar, move_bar);
   });
 }
 
 // How far bodies may go until pairs are found again, see contact/rooms.h: their islands [B, bodies] int32, rooms and
 // rooms of their own [B, bodies + 1], and how far they want to go over the most room [B, bodies].
-DIFFVBD_OPERATOR(Out<4>, contact_rooms, In x, In origin, In mass, In move, In held, In order, In ptr, In rigid, In ways,
-                 In sums, In floor, In collider, In collider_next, In planes, In body, In radius, In most,
-                 In most_alone, In most_own, In least_own, double dhat, double share, double least, bool any_direction,
-                 bool self_contact) {
+DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move, In pinned, In order, In ptr, In rigid,
+                 In displacements, In sums, In floor, In collider, In collider_next, In planes, In body, In radius,
+                 In most, In most_alone, In most_own, In least_own, double dhat, double fraction, double least,
+                 bool any_direction, bool self_contact) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     contact::RadiusInputs<T> in{};
-    in.motion = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
+    in.motion = motion_inputs<T>(x, origin, mass, move, pinned, order, ptr);
     const int64_t b = read.b, bodies = in.motion.bodies, rows = b * bodies;
     const int64_t count = planes.size(0) + planes_of(floor);
-    const Tensor island = device.empty({b, bodies}, ScalarType::Int), room = device.empty({b, bodies + 1}),
-                 own_room = device.empty({b, bodies + 1}), over = device.empty({b, bodies}),
+    const Tensor island = device.empty({b, bodies}, ScalarType::Int), trust_radius = device.empty({b, bodies + 1}),
+                 deformation_radius = device.empty({b, bodies + 1}), over = device.empty({b, bodies}),
                  memory = device.empty({b * (count * contact::kPlaneScalars + 1 + 3 * bodies)});
-    in.islands = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, order, ptr, held,
-                                  radius, room, bodies, dhat, any_direction);
+    in.islands = island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, order, ptr, pinned,
+                                  radius, trust_radius, bodies, dhat, any_direction);
     in.rigid = read.vectors("rigid", rigid);
-    in.displacements = read.like("ways", ways, contact::kDisplacements * rows),
+    in.displacements = read.like("displacements", displacements, contact::kDisplacements * rows),
     in.sums = read.like("sums", sums, 4 * rows);
     in.most = read.like("most", most, bodies), in.most_alone = read.like("most_alone", most_alone, bodies);
     in.most_own = read.like("most_own", most_own, bodies), in.least_own = read.like("least_own", least_own, bodies);
     in.floor_planes = planes_of(floor), in.floor = floor_of(read, floor);
-    in.fraction = static_cast<T>(share), in.least = static_cast<T>(least);
+    in.fraction = static_cast<T>(fraction), in.least = static_cast<T>(least);
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
     contact::RadiusWork<T> work{};
     T* at = data<T>(memory);
@@ -116,33 +116,34 @@ DIFFVBD_OPERATOR(Out<4>, contact_rooms, In x, In origin, In mass, In move, In he
     take(work.planes, b * in.planes() * contact::kPlaneScalars), take(work.pushed, b);
     take(work.stopped, rows), take(work.bent, rows), take(work.most, rows);
     work.island = data<int32_t>(island);
-    work.trust_radius = data<T>(room), work.deformation_radius = data<T>(own_room), work.over = data<T>(over);
+    work.trust_radius = data<T>(trust_radius), work.deformation_radius = data<T>(deformation_radius),
+    work.over = data<T>(over);
     DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(in.islands));)
     DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
-    return Out<4>(island, room, own_room, over);
+    return Out<4>(island, trust_radius, deformation_radius, over);
   });
 }
 
-// How far sweeps may carry each vertex [scenes, vertices], see contact/sweep_rooms.h; own_center and own_room may be
-// empty. more: factor of what sweeps take back; least: what they are given beside that [m].
-DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move, In fall, In apart, In stretched,
-                 In center, In room, In own_center, In own_room, In held, In body_order, In body_ptr, double more,
-                 double least) {
+// How far sweeps may carry each vertex [scenes, vertices], see contact/sweep_rooms.h; deformation_center and
+// deformation_radius may be empty. more: factor of what sweeps take back; least: what they are given beside that [m].
+DIFFVBD_OPERATOR(Tensor, contact_sweep_radii, In x, In start, In begin, In move, In gravity_move, In apart,
+                 In stretched, In center, In trust_radius, In deformation_center, In deformation_radius, In pinned,
+                 In body_order, In body_ptr, double more, double least) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     contact::SweepRadiusInputs<T> in{};
     read.by_body(in, body_order, body_ptr);
     in.x = read.positions(), in.start = read.vectors("start", start), in.begin = read.vectors("begin", begin);
-    in.move = read.vectors("move", move), in.gravity_move = read.vectors("fall", fall);
+    in.move = read.vectors("move", move), in.gravity_move = read.vectors("gravity_move", gravity_move);
     in.apart = read.like("apart", apart, in.scenes * in.bodies);
     in.stretched = read.like("stretched", stretched, in.scenes * in.bodies);
-    in.center = read.vectors("center", center), in.trust_radius = read.of_vertices("room", room);
-    if (own_room.numel() > 0) {
-      in.deformation_center = read.vectors("own_center", own_center),
-      in.deformation_radius = read.of_vertices("own_room", own_room);
+    in.center = read.vectors("center", center), in.trust_radius = read.of_vertices("trust_radius", trust_radius);
+    if (deformation_radius.numel() > 0) {
+      in.deformation_center = read.vectors("deformation_center", deformation_center),
+      in.deformation_radius = read.of_vertices("deformation_radius", deformation_radius);
     }
-    in.pinned = read.flags("held", held, read.v, true);
+    in.pinned = read.flags("pinned", pinned, read.v, true);
     in.more = static_cast<T>(more), in.least = static_cast<T>(least);
     Tensor out = device.empty({in.scenes, in.vertices});
     const Tensor wishes = device.empty({in.scenes, in.bodies}), most = device.empty({in.scenes});
@@ -152,10 +153,10 @@ DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move,
 }
 
 template <class T>
-contact::ResidualInputs<T> unsupported_inputs(const Tensor& x, const Tensor& origin, const Tensor& lift,
-                                              const Tensor& force, const Tensor& mass, const Tensor& planes,
-                                              const Tensor& held_bodies, const Tensor& order, const Tensor& ptr,
-                                              double time_step) {
+contact::ResidualInputs<T> residual_inputs(const Tensor& x, const Tensor& origin, const Tensor& h2a,
+                                           const Tensor& force, const Tensor& mass, const Tensor& planes,
+                                           const Tensor& pinned_bodies, const Tensor& order, const Tensor& ptr,
+                                           double time_step) {
   const Reader<T> read(x);
   contact::ResidualInputs<T> in{};
   read.by_body(in.scene, order, ptr);
@@ -164,9 +165,10 @@ contact::ResidualInputs<T> unsupported_inputs(const Tensor& x, const Tensor& ori
   in.scene.mass = read.batch("mass", mass, read.v);
   in.scene.origin = read.batch_or_null("origin", origin, 3 * read.v);
   in.scene.time_step = time_step;
-  in.pinned_bodies = read.flags("held_bodies", held_bodies, in.scene.bodies);
-  in.h2_a = read.batch("lift", lift, 3 * read.v);
-  require(force.dim() == 3 && force.size(1) >= read.v, "diffvbd::contact_unsupported: expected force of corner points");
+  in.pinned_bodies = read.flags("pinned_bodies", pinned_bodies, in.scene.bodies);
+  in.h2a = read.batch("h2a", h2a, 3 * read.v);
+  require(force.dim() == 3 && force.size(1) >= read.v,
+          "diffvbd::contact_residual_acceleration: expected force of corner points");
   in.corners = force.size(1);
   in.force = read.like("force", force, 3 * read.b * in.corners);
   in.floor = floor_of(read, planes), in.planes = planes_of(planes);
@@ -176,32 +178,32 @@ contact::ResidualInputs<T> unsupported_inputs(const Tensor& x, const Tensor& ori
 // What is left of lift once forces have borne their part of each body's acceleration, see contact/unsupported.h; origin
 // and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by body
 // [scenes, bodies, 7 planes] where wanted.
-DIFFVBD_OPERATOR(Tensor, contact_unsupported, In x, In origin, In lift, In force, In mass, In planes, In held_bodies,
-                 In body_order, In body_ptr, double time_step) {
+DIFFVBD_OPERATOR(Tensor, contact_residual_acceleration, In x, In origin, In h2a, In force, In mass, In planes,
+                 In pinned_bodies, In body_order, In body_ptr, double time_step) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in =
-        unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
+        residual_inputs<T>(x, origin, h2a, force, mass, planes, pinned_bodies, body_order, body_ptr, time_step);
     Tensor out = device.like_x();
     DIFFVBD_RUN(device, residual_acceleration<T>, in, data<T>(out));
     return out;
   });
 }
-DIFFVBD_OPERATOR(Out<5>, contact_unsupported_backward, In bar, In x, In origin, In lift, In force, In mass, In planes,
-                 In held_bodies, In body_order, In body_ptr, double time_step, bool wants_planes) {
+DIFFVBD_OPERATOR(Out<5>, contact_residual_acceleration_backward, In bar, In x, In origin, In h2a, In force, In mass,
+                 In planes, In pinned_bodies, In body_order, In body_ptr, double time_step, bool wants_planes) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in =
-        unsupported_inputs<T>(x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr, time_step);
+        residual_inputs<T>(x, origin, h2a, force, mass, planes, pinned_bodies, body_order, body_ptr, time_step);
     const int64_t b = in.scene.scenes, v = in.scene.vertices;
-    const Tensor x_bar = device.empty({in.planes > 0 ? b : 0, v, 3}), lift_bar = device.like_x(),
+    const Tensor x_bar = device.empty({in.planes > 0 ? b : 0, v, 3}), h2a_bar = device.like_x(),
                  force_bar = device.zeros({b, in.corners, 3}), mass_bar = device.empty({b, v});
     const Tensor planes_bar =
         device.zeros({wants_planes ? b : 0, in.scene.bodies, int64_t{in.planes} * contact::kPlaneScalars});
-    const contact::ResidualAdjoints<T> out{data_or_null<T>(x_bar), data<T>(lift_bar), data<T>(force_bar),
+    const contact::ResidualAdjoints<T> out{data_or_null<T>(x_bar), data<T>(h2a_bar), data<T>(force_bar),
                                            data<T>(mass_bar), data_or_null<T>(planes_bar)};
     DIFFVBD_RUN(device, residual_acceleration_backward<T>, in, Reader<T>(x).vectors("bar", bar), out);
-    return Out<5>(x_bar, lift_bar, force_bar, mass_bar, planes_bar);
+    return Out<5>(x_bar, h2a_bar, force_bar, mass_bar, planes_bar);
   });
 }
 

@@ -16,10 +16,10 @@ namespace {
 
 // The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of
 // FloorBarrier.
-DIFFVBD_OPERATOR(Tensor, contact_lowest, In x, In origin, In planes, In body_order, In body_ptr, In island) {
+DIFFVBD_OPERATOR(Tensor, contact_support_vertices, In x, In origin, In planes, In body_order, In body_ptr, In island) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = lowest_inputs<T>(x, origin, planes, body_order, body_ptr, island);
+    const auto in = support_vertex_inputs<T>(x, origin, planes, body_order, body_ptr, island);
     Tensor out = device.empty({in.scenes, in.bodies, in.num_planes}, ScalarType::Int);
     const Tensor own = device.empty({in.scenes, in.bodies, in.num_planes}, ScalarType::Int);
     DIFFVBD_RUN(device, support_vertices<T>, in, data<int32_t>(own), data<int32_t>(out));
@@ -29,47 +29,47 @@ DIFFVBD_OPERATOR(Tensor, contact_lowest, In x, In origin, In planes, In body_ord
 
 template <class T>
 contact::TranslationInputs<T> translation_inputs(const Tensor& move, const Tensor& mass, const Tensor& x,
-                                                 const Tensor& origin, const Tensor& planes, const Tensor& held,
+                                                 const Tensor& origin, const Tensor& planes, const Tensor& pinned,
                                                  const Tensor& body, const Tensor& order, const Tensor& ptr,
-                                                 const Tensor& island, const Tensor& lowest) {
+                                                 const Tensor& island, const Tensor& support_vertex) {
   const Reader<T> read(x);
   contact::TranslationInputs<T> in{};
   in.body_order = read.index("body_order", order, read.v), in.body_ptr = read.index("body_ptr", ptr, 1, true);
   in.scenes = read.b;
   in.vertices = static_cast<int32_t>(read.v), in.bodies = static_cast<int32_t>(ptr.numel() - 1);
   in.island = read.index("island", island, in.scenes * in.bodies);
-  in.pinned = read.flags("held", held, read.v, true), in.body = read.index("body", body, read.v, true);
+  in.pinned = read.flags("pinned", pinned, read.v, true), in.body = read.index("body", body, read.v, true);
   in.move = read.vectors("move", move);
   const auto masses = read.batch("mass", mass, read.v);
   in.mass = masses.data, in.mass_scene = masses.scene;
   if (planes.numel() > 0) {
-    in.floor = lowest_inputs<T>(x, origin, planes, order, ptr, island);
+    in.floor = support_vertex_inputs<T>(x, origin, planes, order, ptr, island);
     require(in.floor.num_planes <= contact::kMostPlanes, "diffvbd::contact_translation: expected at most 8 planes");
-    in.support_vertex = read.index("lowest", lowest, in.scenes * in.bodies * in.floor.num_planes);
+    in.support_vertex = read.index("support_vertex", support_vertex, in.scenes * in.bodies * in.floor.num_planes);
   }
   return in;
 }
 
 // Translation of each body's island [scenes, bodies, 3], see contact/translation.h; without a floor planes and lowest
 // are empty. The adjoint: of move, mass, x and planes.
-DIFFVBD_OPERATOR(Tensor, contact_translation, In move, In mass, In x, In origin, In planes, In held, In body,
-                 In body_order, In body_ptr, In island, In lowest) {
+DIFFVBD_OPERATOR(Tensor, contact_translation, In move, In mass, In x, In origin, In planes, In pinned, In body,
+                 In body_order, In body_ptr, In island, In support_vertex) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in =
-        translation_inputs<T>(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest);
+    const auto in = translation_inputs<T>(move, mass, x, origin, planes, pinned, body, body_order, body_ptr, island,
+                                          support_vertex);
     Tensor out = device.empty({in.scenes, in.bodies, 3});
     const Tensor sums = device.empty({in.scenes, in.bodies, 4});
     DIFFVBD_RUN(device, translation<T>, in, data<T>(sums), data<T>(out));
     return out;
   });
 }
-DIFFVBD_OPERATOR(Out<4>, contact_translation_backward, In u_bar, In move, In mass, In x, In origin, In planes, In held,
-                 In body, In body_order, In body_ptr, In island, In lowest) {
+DIFFVBD_OPERATOR(Out<4>, contact_translation_backward, In u_bar, In move, In mass, In x, In origin, In planes,
+                 In pinned, In body, In body_order, In body_ptr, In island, In support_vertex) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in =
-        translation_inputs<T>(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest);
+    const auto in = translation_inputs<T>(move, mass, x, origin, planes, pinned, body, body_order, body_ptr, island,
+                                          support_vertex);
     const int64_t b = in.scenes, v = in.vertices, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
     const T* given = Reader<T>(x).like("u_bar", u_bar, 3 * b * in.bodies);
     Tensor move_bar = device.like_x(), mass_bar = device.empty({b, v});
@@ -83,10 +83,10 @@ DIFFVBD_OPERATOR(Out<4>, contact_translation_backward, In u_bar, In move, In mas
 
 // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices], or all of a body
 // [scenes, bodies] where it goes as a whole; stuck: how many pairs what is prescribed brings too close. center: what a
-// vertex may leave by its room at most, and own_center by its own_room, unless empty.
+// vertex may leave by its room at most, and deformation_center by its deformation_radius, unless empty.
 DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In origin, In collider, In collider_next,
-                 In held, In body, In room, In own_center, In own_room, In pairs, In constants, In ptr, In entry,
-                 bool careful, bool whole) {
+                 In pinned, In body, In trust_radius, In deformation_center, In deformation_radius, In pairs,
+                 In constants, In ptr, In entry, bool careful, bool whole) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -97,11 +97,11 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
     in.center = read.vectors("center", center), in.origin = read.vectors_or_null("origin", origin);
     in.collider = read.like("collider", collider, 3 * b * (corners - v));
     in.collider_next = read.like("collider_next", collider_next, 3 * b * (corners - v));
-    in.pinned = read.flags("held", held, corners), in.body = read.index("body", body, corners);
-    in.trust_radius = read.of_vertices("room", room);
-    if (own_room.numel() > 0) {
-      in.deformation_center = read.vectors("own_center", own_center),
-      in.deformation_radius = read.of_vertices("own_room", own_room);
+    in.pinned = read.flags("pinned", pinned, corners), in.body = read.index("body", body, corners);
+    in.trust_radius = read.of_vertices("trust_radius", trust_radius);
+    if (deformation_radius.numel() > 0) {
+      in.deformation_center = read.vectors("deformation_center", deformation_center),
+      in.deformation_radius = read.of_vertices("deformation_radius", deformation_radius);
     }
     in.listed = pair_list(pairs, ptr, entry, x, b * corners);
     in.constants = pair_constants<T>(constants, pairs, x);
@@ -109,15 +109,16 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
     in.vertices = static_cast<int32_t>(v), in.corners = static_cast<int32_t>(corners);
     in.bodies = static_cast<int32_t>(u.size(1));
     in.careful = careful, in.whole = whole;
-    Tensor share = device.empty({b, whole ? in.bodies : in.vertices}), stuck = device.empty({1}, ScalarType::Long);
+    Tensor fraction = device.empty({b, whole ? in.bodies : in.vertices}),
+           infeasible = device.empty({1}, ScalarType::Long);
 #ifdef USE_CUDA
     const Tensor work = device.bytes(cuda::advance_workspace_bytes<T>(in, pairs.size(0)));
-    DIFFVBD_RUN(device, advance<T>, in, pairs.size(0), data<T>(share), data<int64_t>(stuck), work.data_ptr(),
+    DIFFVBD_RUN(device, advance<T>, in, pairs.size(0), data<T>(fraction), data<int64_t>(infeasible), work.data_ptr(),
                 device.attribute(cudaDevAttrMultiProcessorCount));
 #else
-    *data<int64_t>(stuck) = advance<T>(in, data<T>(share));
+    *data<int64_t>(infeasible) = advance<T>(in, data<T>(fraction));
 #endif
-    return Out<2>(share, stuck);
+    return Out<2>(fraction, infeasible);
   });
 }
 
@@ -125,7 +126,8 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
 // ---------------------------------------------------------------------------------------------------
 
 // constants with the gaps of the pairs where the vertices are now, see contact/narrow.h.
-DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, In pairs, In constants, In ptr) {
+DIFFVBD_OPERATOR(Tensor, contact_refresh_gaps, In x, In origin, In collider, In trust_radius, In pairs, In constants,
+                 In ptr) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -133,7 +135,7 @@ DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, 
     contact::GapInputs<T> in{};
     in.x = read.positions(), in.origin = read.vectors_or_null("origin", origin);
     in.collider = read.like("collider", collider, 3 * read.b * colliders),
-    in.trust_radius = read.of_vertices("room", room);
+    in.trust_radius = read.of_vertices("trust_radius", trust_radius);
     in.pairs = read.index("pairs", pairs, pairs.size(0) * contact::kPairRow);
     read.index("ptr", ptr, read.b * (read.v + colliders) + 1);
     in.constants = pair_constants<T>(constants, pairs, x);
@@ -146,7 +148,7 @@ DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, 
 
 // The pairs of a list that `keep` names, and which they are (contact/keep.h); exact: in lists as long as they are many,
 // on the CPU, else in room for all, with -1 where there is none.
-DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, In entry, bool exact) {
+DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In ptr, In entry, bool exact) {
   const Device device(constants);
   return dispatch_float(constants, [&]<class T>(T) {
     const contact::PairList all = pair_list(pairs, ptr, entry, constants, ptr.numel() - 1);
@@ -157,11 +159,11 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
                                        pair_constants<T>(constants, pairs, constants),
                                        pairs.size(0),
                                        ptr.numel() - 1};
-    require(in.corners >= 0, "diffvbd::contact_keep: expected pairs made by contact_detect");
+    require(in.corners >= 0, "diffvbd::contact_compact: expected pairs made by contact_detect");
     int64_t capacity = in.count;
 #ifndef USE_CUDA
     require(std::is_sorted(in.ptr, in.ptr + ptr.numel()) && *in.ptr >= 0 && in.ptr[in.corners] <= entry.numel(),
-            "diffvbd::contact_keep: expected ptr that ascends up to the number of entries");
+            "diffvbd::contact_compact: expected ptr that ascends up to the number of entries");
     std::vector<int32_t> kept(in.count + 1);
     for (int64_t i = 0; i < in.count; ++i) kept[i + 1] = kept[i] + contact::stays(in, i);
     if (exact) capacity = kept.back();
@@ -230,8 +232,8 @@ contact::LagCoefficients<T> lag_coefficients(const Tensor& friction, const Tenso
 
 // Friction, damping, normal and weights of each pair [pairs, 9], by the coefficients of its scene, which may be empty,
 // and the forces of pairs on corner points [B, N, 3]; the adjoint, of which either bar may be empty.
-DIFFVBD_OPERATOR(Out<2>, contact_rubbing, In x, In origin, In collider, In kappa, In friction, In damping, In pairs,
-                 In constants, In ptr, In entry) {
+DIFFVBD_OPERATOR(Out<2>, contact_friction_lag, In x, In origin, In collider, In kappa, In friction, In damping,
+                 In pairs, In constants, In ptr, In entry) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
@@ -243,7 +245,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_rubbing, In x, In origin, In collider, In kappa
     return Out<2>(lag, push);
   });
 }
-DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x, In origin, In collider, In kappa,
+DIFFVBD_OPERATOR(Out<4>, contact_friction_lag_backward, In lag_bar, In push_bar, In x, In origin, In collider, In kappa,
                  In friction, In damping, In pairs, In constants, In ptr, In entry) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
@@ -269,52 +271,52 @@ DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x
 // ---------------------------------------------------------------------------
 
 template <class T>
-contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u, const Tensor& way,
-                                                const Tensor& planes, const Tensor& origin, const Tensor& held,
+contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u, const Tensor& displacement,
+                                                const Tensor& planes, const Tensor& origin, const Tensor& pinned,
                                                 const Tensor& order, const Tensor& ptr) {
   const Reader<T> read(x);
   contact::AboveFloorInputs<T> in{};
   read.by_body(in.scene, order, ptr);
   in.scene.x = read.positions();
   in.scene.origin = read.batch_or_null("origin", origin, 3 * read.v);
-  in.displacement = read.vectors("way", way);
+  in.displacement = read.vectors("displacement", displacement);
   if (u.numel() > 0) in.u = read.like("u", u, 3 * in.scene.scenes * in.scene.bodies);
   in.floor = floor_of(read, planes), in.planes = planes_of(planes);
-  in.pinned = read.flags("held", held, read.v, true);
+  in.pinned = read.flags("pinned", pinned, read.v, true);
   return in;
 }
 
 // What a floor leaves of the ways of bodies as wholes, less u, and which it stops [scenes, bodies], see
 // contact/above_floor.h; u, planes and origin may be empty. The adjoint: of x, u, way and, of each body, the planes.
-DIFFVBD_OPERATOR(Out<2>, contact_above_floor, In x, In u, In way, In planes, In origin, In held, In body_order,
-                 In body_ptr) {
+DIFFVBD_OPERATOR(Out<2>, contact_above_floor, In x, In u, In displacement, In planes, In origin, In pinned,
+                 In body_order, In body_ptr) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = above_floor_inputs<T>(x, u, way, planes, origin, held, body_order, body_ptr);
-    Tensor left = device.like_x(), stopped = device.empty({in.scene.scenes, in.scene.bodies}, ScalarType::Bool);
-    device.bodies(contact::AboveFloorDisplacements<T>{in, data<T>(left), data<bool>(stopped)});
-    return Out<2>(left, stopped);
+    const auto in = above_floor_inputs<T>(x, u, displacement, planes, origin, pinned, body_order, body_ptr);
+    Tensor body_move = device.like_x(), stopped = device.empty({in.scene.scenes, in.scene.bodies}, ScalarType::Bool);
+    device.bodies(contact::AboveFloorDisplacements<T>{in, data<T>(body_move), data<bool>(stopped)});
+    return Out<2>(body_move, stopped);
   });
 }
-DIFFVBD_OPERATOR(Out<4>, contact_above_floor_backward, In bar, In x, In u, In way, In planes, In origin, In held,
-                 In body_order, In body_ptr, bool wants_planes) {
+DIFFVBD_OPERATOR(Out<4>, contact_above_floor_backward, In bar, In x, In u, In displacement, In planes, In origin,
+                 In pinned, In body_order, In body_ptr, bool wants_planes) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = above_floor_inputs<T>(x, u, way, planes, origin, held, body_order, body_ptr);
+    const auto in = above_floor_inputs<T>(x, u, displacement, planes, origin, pinned, body_order, body_ptr);
     const int64_t b = in.scene.scenes, bodies = in.scene.bodies;
-    Tensor x_bar = device.like_x(), way_bar = device.like_x(), u_bar = device.empty({in.u ? b : 0, bodies, 3});
+    Tensor x_bar = device.like_x(), displacement_bar = device.like_x(), u_bar = device.empty({in.u ? b : 0, bodies, 3});
     Tensor planes_bar = device.zeros({b, bodies, wants_planes ? in.planes * contact::kPlaneScalars : 0});
     device.bodies(contact::ReverseAboveFloor<T>{in, Reader<T>(x).vectors("bar", bar), data<T>(x_bar), data<T>(u_bar),
-                                                data<T>(way_bar), data_or_null<T>(planes_bar)});
-    return Out<4>(x_bar, u_bar, way_bar, planes_bar);
+                                                data<T>(displacement_bar), data_or_null<T>(planes_bar)});
+    return Out<4>(x_bar, u_bar, displacement_bar, planes_bar);
   });
 }
 
 // Of most entries that follow: which vertices are held, bodies of which one is, the body of each vertex, and vertices
 // by body.
-#define DIFFVBD_BODIES In held, In held_bodies, In body, In body_order, In body_ptr
+#define DIFFVBD_BODIES In pinned, In pinned_bodies, In body, In body_order, In body_ptr
 struct IndexTensors {
-  const Tensor &held, &held_bodies, &body, &order, &ptr;
+  const Tensor &pinned, &pinned_bodies, &body, &order, &ptr;
 };
 template <class T>
 contact::StartInputs<T> start_inputs(const Tensor& x, const IndexTensors& index) {
@@ -322,22 +324,22 @@ contact::StartInputs<T> start_inputs(const Tensor& x, const IndexTensors& index)
   contact::StartInputs<T> in{};
   read.by_body(in.scene, index.order, index.ptr);
   in.scene.x = read.positions();
-  in.pinned = read.flags("held", index.held, read.v, true), in.body = read.index("body", index.body, read.v, true);
-  in.pinned_bodies = read.flags("held_bodies", index.held_bodies, in.scene.bodies);
+  in.pinned = read.flags("pinned", index.pinned, read.v, true), in.body = read.index("body", index.body, read.v, true);
+  in.pinned_bodies = read.flags("pinned_bodies", index.pinned_bodies, in.scene.bodies);
   return in;
 }
 
 // What a path is made of until bodies have gone.
-struct FrameTensors {
-  const Tensor &x, &move, &u, &left, &frames, &planes, &origin;
+struct PathTensors {
+  const Tensor &x, &move, &u, &body_move, &rigid_fraction, &planes, &origin;
 };
 template <class T>
-contact::StartInputs<T> start_inputs(const FrameTensors& t, const IndexTensors& index, double filter_eta) {
+contact::StartInputs<T> start_inputs(const PathTensors& t, const IndexTensors& index, double filter_eta) {
   auto in = start_inputs<T>(t.x, index);
   const Reader<T> read(t.x);
   const int64_t bodies = in.scene.scenes * in.scene.bodies;
-  in.move = read.vectors("move", t.move), in.left = read.vectors("left", t.left);
-  in.u = read.like("u", t.u, 3 * bodies), in.frames = read.like("frames", t.frames, bodies);
+  in.move = read.vectors("move", t.move), in.body_move = read.vectors("body_move", t.body_move);
+  in.u = read.like("u", t.u, 3 * bodies), in.rigid_fraction = read.like("rigid_fraction", t.rigid_fraction, bodies);
   in.scene.origin = read.batch_or_null("origin", t.origin, 3 * read.v);
   in.floor = floor_of(read, t.planes), in.floor_scalars = planes_of(t.planes) * contact::kPlaneScalars;
   require(in.floor_scalars <= FloorStart::kMostPlanes * contact::kPlaneScalars,
@@ -347,127 +349,134 @@ contact::StartInputs<T> start_inputs(const FrameTensors& t, const IndexTensors& 
   return in;
 }
 
-// What is decided at the start of a part, see contact/part.h; planes, origin and own_room may be empty. state uint8
-// [scenes, vertices]: 0 goes, 1 rests, 2 rests unless its body's potential does not rise.
-DIFFVBD_OPERATOR(Out<5>, contact_frames, In x, In move, In u, In way, In left, In stretch, In room, In own_room,
-                 DIFFVBD_BODIES) {
+// What is decided at the start of a part, see contact/part.h; planes, origin and deformation_radius may be empty. state
+// uint8 [scenes, vertices]: 0 goes, 1 rests, 2 rests unless its body's potential does not rise.
+DIFFVBD_OPERATOR(Out<5>, contact_rigid_moves, In x, In move, In u, In displacement, In body_move, In stretch,
+                 In trust_radius, In deformation_radius, DIFFVBD_BODIES) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = start_inputs<T>(x, {held, held_bodies, body, body_order, body_ptr});
+    auto in = start_inputs<T>(x, {pinned, pinned_bodies, body, body_order, body_ptr});
     const Reader<T> read(x);
     const int64_t b = in.scene.scenes, v = in.scene.vertices, bodies = in.scene.bodies;
-    in.move = read.vectors("move", move), in.left = read.vectors("left", left);
+    in.move = read.vectors("move", move), in.body_move = read.vectors("body_move", body_move);
     in.u = read.like("u", u, 3 * b * bodies);
-    const bool own = own_room.numel() > 0;
-    Tensor limit = device.empty({b, bodies}), ways = device.like_x(), center = device.like_x();
-    Tensor rooms = device.empty({b, v}), own_rooms = device.empty({own ? b : 0, v});
-    device.bodies(contact::Frames<T>{in, read.vectors("way", way), read.like("stretch", stretch, b * bodies),
-                                     read.like("room", room, b * (bodies + 1)),
-                                     own ? read.like("own_room", own_room, b * (bodies + 1)) : nullptr, data<T>(limit),
-                                     data<T>(ways), data<T>(center), data<T>(rooms), data<T>(own_rooms)});
-    return Out<5>(limit, ways, center, rooms, own_rooms);
+    const bool own = deformation_radius.numel() > 0;
+    Tensor limit = device.empty({b, bodies}), displacements = device.like_x(), center = device.like_x();
+    Tensor trust_radii = device.empty({b, v}), deformation_radii = device.empty({own ? b : 0, v});
+    device.bodies(contact::RigidMoves<T>{
+        in, read.vectors("displacement", displacement), read.like("stretch", stretch, b * bodies),
+        read.like("trust_radius", trust_radius, b * (bodies + 1)),
+        own ? read.like("deformation_radius", deformation_radius, b * (bodies + 1)) : nullptr, data<T>(limit),
+        data<T>(displacements), data<T>(center), data<T>(trust_radii), data<T>(deformation_radii)});
+    return Out<5>(limit, displacements, center, trust_radii, deformation_radii);
   });
 }
 
-DIFFVBD_OPERATOR(Out<4>, contact_bends, In x, In move, In u, In left, In frames, In limit, In stopped, In own_room,
-                 In planes, In origin, DIFFVBD_BODIES, double filter_eta) {
+DIFFVBD_OPERATOR(Out<4>, contact_deformations, In x, In move, In u, In body_move, In rigid_fraction, In limit,
+                 In stopped, In deformation_radius, In planes, In origin, DIFFVBD_BODIES, double filter_eta) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
-                                    {held, held_bodies, body, body_order, body_ptr}, filter_eta);
+    const auto in = start_inputs<T>({x, move, u, body_move, rigid_fraction, planes, origin},
+                                    {pinned, pinned_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
     const int64_t b = in.scene.scenes, bodies = in.scene.bodies;
-    Tensor base = device.like_x(), target = device.like_x(), way = device.like_x();
+    Tensor base = device.like_x(), target = device.like_x(), displacement = device.like_x();
     Tensor state = device.empty({b, in.scene.vertices}, ScalarType::Byte);
-    const contact::Bends<T> act{in,
-                                read.like("limit", limit, b * bodies),
-                                own_room.numel() > 0 ? read.like("own_room", own_room, b * (bodies + 1)) : nullptr,
-                                read.flags("stopped", stopped, b * bodies),
-                                data<T>(way),
-                                data<uint8_t>(state)};
-    device.vertices(contact::Wishes<T>{in, data<T>(base), data<T>(target), data<T>(way)});
+    const contact::Deformations<T> act{in,
+                                       read.like("limit", limit, b * bodies),
+                                       deformation_radius.numel() > 0
+                                           ? read.like("deformation_radius", deformation_radius, b * (bodies + 1))
+                                           : nullptr,
+                                       read.flags("stopped", stopped, b * bodies),
+                                       data<T>(displacement),
+                                       data<uint8_t>(state)};
+    device.vertices(contact::Wishes<T>{in, data<T>(base), data<T>(target), data<T>(displacement)});
     device.bodies(act);
-    return Out<4>(base, target, way, state);
+    return Out<4>(base, target, displacement, state);
   });
 }
 
-DIFFVBD_OPERATOR(Out<2>, contact_hold, In way, In state, In rises) {
-  const Device device(way);
-  return dispatch_float(way, [&]<class T>(T) {
-    const Reader<T> read(way);
+DIFFVBD_OPERATOR(Out<2>, contact_freeze, In displacement, In state, In increases) {
+  const Device device(displacement);
+  return dispatch_float(displacement, [&]<class T>(T) {
+    const Reader<T> read(displacement);
     const int64_t rows = read.b * read.v;
     contact::StartInputs<T> in{};
     in.scene.scenes = read.b, in.scene.vertices = static_cast<int32_t>(read.v);
-    Tensor way_out = device.like_x(), state_out = device.empty({read.b, read.v}, ScalarType::Byte);
+    Tensor displacement_out = device.like_x(), state_out = device.empty({read.b, read.v}, ScalarType::Byte);
     device.vertices(contact::Freeze<T>{in, read.positions(), read.bytes("state", state, rows),
-                                       read.flags("rises", rises, rows), data<T>(way_out), data<uint8_t>(state_out)});
-    return Out<2>(way_out, state_out);
+                                       read.flags("increases", increases, rows), data<T>(displacement_out),
+                                       data<uint8_t>(state_out)});
+    return Out<2>(displacement_out, state_out);
   });
 }
 
-DIFFVBD_OPERATOR(Out<2>, contact_held_up, In base, In way, In share, In state, DIFFVBD_BODIES) {
+DIFFVBD_OPERATOR(Out<2>, contact_blocked, In base, In displacement, In fraction, In state, DIFFVBD_BODIES) {
   const Device device(base);
   return dispatch_float(base, [&]<class T>(T) {
-    auto in = start_inputs<T>(base, {held, held_bodies, body, body_order, body_ptr});
+    auto in = start_inputs<T>(base, {pinned, pinned_bodies, body, body_order, body_ptr});
     const Reader<T> read(base);
-    in.fraction = read.of_vertices("share", share);
+    in.fraction = read.of_vertices("fraction", fraction);
     Tensor to = device.like_x(), state_out = device.empty({read.b, read.v}, ScalarType::Byte);
-    device.bodies(contact::BlockedBodies<T>{in, read.positions(), read.vectors("way", way),
+    device.bodies(contact::BlockedBodies<T>{in, read.positions(), read.vectors("displacement", displacement),
                                             read.bytes("state", state, read.b * read.v), data<T>(to),
                                             data<uint8_t>(state_out)});
     return Out<2>(to, state_out);
   });
 }
 
-DIFFVBD_OPERATOR(Out<3>, contact_falls, In x, In move, In fall, In u, In left, In frames, In share, In state, In planes,
-                 In origin, DIFFVBD_BODIES, double filter_eta) {
+DIFFVBD_OPERATOR(Out<3>, contact_gravity_moves, In x, In move, In gravity_move, In u, In body_move, In rigid_fraction,
+                 In fraction, In state, In planes, In origin, DIFFVBD_BODIES, double filter_eta) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
-                              {held, held_bodies, body, body_order, body_ptr}, filter_eta);
+    auto in = start_inputs<T>({x, move, u, body_move, rigid_fraction, planes, origin},
+                              {pinned, pinned_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
-    in.gravity_move = read.vectors("fall", fall), in.fraction = read.of_vertices("share", share);
-    Tensor went = device.empty({read.b, read.v}), at = device.like_x(), way = device.like_x();
+    in.gravity_move = read.vectors("gravity_move", gravity_move), in.fraction = read.of_vertices("fraction", fraction);
+    Tensor went = device.empty({read.b, read.v}), at = device.like_x(), displacement = device.like_x();
     device.vertices(contact::GravityMoves<T>{in, read.bytes("state", state, read.b * read.v), data<T>(went),
-                                             data<T>(at), data<T>(way)});
-    return Out<3>(went, at, way);
+                                             data<T>(at), data<T>(displacement)});
+    return Out<3>(went, at, displacement);
   });
 }
 
 // Where each vertex starts, and whether pairs have held up more than a hundredth of its way, see contact/start.h. The
 // adjoint: of x, move, fall, u, left and planes, all for each vertex.
-DIFFVBD_OPERATOR(Out<2>, contact_start, In x, In move, In fall, In u, In left, In frames, In share, In last_share,
-                 In stopped, In planes, In origin, DIFFVBD_BODIES, double filter_eta) {
+DIFFVBD_OPERATOR(Out<2>, contact_start, In x, In move, In gravity_move, In u, In body_move, In rigid_fraction,
+                 In fraction, In last_fraction, In stopped, In planes, In origin, DIFFVBD_BODIES, double filter_eta) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
-                              {held, held_bodies, body, body_order, body_ptr}, filter_eta);
+    auto in = start_inputs<T>({x, move, u, body_move, rigid_fraction, planes, origin},
+                              {pinned, pinned_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
-    in.gravity_move = read.vectors("fall", fall);
-    in.fraction = read.of_vertices("share", share), in.last_fraction = read.of_vertices("last_share", last_share);
-    Tensor end = device.like_x(), is_short = device.empty({read.b, read.v}, ScalarType::Bool);
+    in.gravity_move = read.vectors("gravity_move", gravity_move);
+    in.fraction = read.of_vertices("fraction", fraction),
+    in.last_fraction = read.of_vertices("last_fraction", last_fraction);
+    Tensor end = device.like_x(), is_truncated = device.empty({read.b, read.v}, ScalarType::Bool);
     device.vertices(contact::Starts<T>{in, read.flags("stopped", stopped, in.scene.scenes * in.scene.bodies),
-                                       data<T>(end), data<bool>(is_short)});
-    return Out<2>(end, is_short);
+                                       data<T>(end), data<bool>(is_truncated)});
+    return Out<2>(end, is_truncated);
   });
 }
-DIFFVBD_OPERATOR(Out<6>, contact_start_backward, In bar, In x, In move, In fall, In u, In left, In frames, In share,
-                 In last_share, In planes, In origin, DIFFVBD_BODIES, double filter_eta, bool wants_planes) {
+DIFFVBD_OPERATOR(Out<6>, contact_start_backward, In bar, In x, In move, In gravity_move, In u, In body_move,
+                 In rigid_fraction, In fraction, In last_fraction, In planes, In origin, DIFFVBD_BODIES,
+                 double filter_eta, bool wants_planes) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = start_inputs<T>({x, move, u, left, frames, planes, origin},
-                              {held, held_bodies, body, body_order, body_ptr}, filter_eta);
+    auto in = start_inputs<T>({x, move, u, body_move, rigid_fraction, planes, origin},
+                              {pinned, pinned_bodies, body, body_order, body_ptr}, filter_eta);
     const Reader<T> read(x);
-    in.gravity_move = read.vectors("fall", fall);
-    in.fraction = read.of_vertices("share", share), in.last_fraction = read.of_vertices("last_share", last_share);
-    const Tensor x_bar = device.like_x(), move_bar = device.like_x(), fall_bar = device.like_x(),
-                 u_bar = device.like_x(), left_bar = device.like_x(),
+    in.gravity_move = read.vectors("gravity_move", gravity_move);
+    in.fraction = read.of_vertices("fraction", fraction),
+    in.last_fraction = read.of_vertices("last_fraction", last_fraction);
+    const Tensor x_bar = device.like_x(), move_bar = device.like_x(), gravity_move_bar = device.like_x(),
+                 u_bar = device.like_x(), body_move_bar = device.like_x(),
                  planes_bar = device.empty({read.b, read.v, wants_planes ? in.floor_scalars : 0});
-    device.vertices(
-        contact::ReverseStarts<T>{in,
-                                  {read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar), data<T>(fall_bar),
-                                   data<T>(u_bar), data<T>(left_bar), data_or_null<T>(planes_bar)}});
-    return Out<6>(x_bar, move_bar, fall_bar, u_bar, left_bar, planes_bar);
+    device.vertices(contact::ReverseStarts<T>{
+        in,
+        {read.vectors("bar", bar), data<T>(x_bar), data<T>(move_bar), data<T>(gravity_move_bar), data<T>(u_bar),
+         data<T>(body_move_bar), data_or_null<T>(planes_bar)}});
+    return Out<6>(x_bar, move_bar, gravity_move_bar, u_bar, body_move_bar, planes_bar);
   });
 }
 

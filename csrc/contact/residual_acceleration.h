@@ -12,7 +12,7 @@ using rigid::Vector;
 template <class T>
 struct ResidualInputs {
   rigid::Inputs<T> scene;     // x, mass, the vertices of all bodies and the time step
-  Batched<const T> h2_a;      // [1 | B, V, 3]  h^2 times the acceleration [m]
+  Batched<const T> h2a;       // [1 | B, V, 3]  h^2 times the acceleration [m]
   const T* force;             // [B, N, 3]  of pairs at corner points [N], the vertices first
   Batched<const T> floor;     // [1 | B, planes, kPlaneScalars]
   const bool* pinned_bodies;  // [bodies]: bodies with a pinned vertex, which contact does not support
@@ -20,7 +20,7 @@ struct ResidualInputs {
   int32_t planes;
 
   DIFFVBD_FN double square_of_step() const { return scene.time_step * scene.time_step; }
-  DIFFVBD_FN Vector h2_a_of(int64_t s, int32_t v) const { return wide_at(h2_a.data + s * h2_a.scene + 3 * int64_t{v}); }
+  DIFFVBD_FN Vector h2_a_of(int64_t s, int32_t v) const { return wide_at(h2a.data + s * h2a.scene + 3 * int64_t{v}); }
 };
 
 // One plane of a floor and one vertex. Its force is -kappa slope n.
@@ -60,8 +60,8 @@ constexpr int kSupportSums = 7;  // over the vertices of a body: mass times h^2 
 template <class T>
 DIFFVBD_FN void add_to_support(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, double* to) {
   const double m = b.mass(v);
-  const Vector h2_a = m * in.h2_a_of(b.scene, v), push = in.square_of_step() * force_on(in, b, v);
-  add_to(to, h2_a);
+  const Vector h2a = m * in.h2_a_of(b.scene, v), push = in.square_of_step() * force_on(in, b, v);
+  add_to(to, h2a);
   add_to(to + 3, push);
   to[6] += m;
 }
@@ -109,7 +109,7 @@ DIFFVBD_FN void residual_acceleration(const ResidualInputs<T>& in, const rigid::
 
 // Adjoints of the sums, by that of what contact takes from every vertex.
 struct SupportAdjoint {
-  Vector h2_a, push;
+  Vector h2a, push;
   double mass;
 
   DIFFVBD_FN SupportAdjoint(const Support& s, const Vector& taken) {
@@ -119,16 +119,16 @@ struct SupportAdjoint {
       own = -along * s.unit;
       borne -= along * (s.ratio + (2 * s.asked) * s.unit);
     }
-    h2_a = s.inverse * own, push = s.inverse * borne;
-    mass = -dot(h2_a, s.own) - dot(push, s.borne);
+    h2a = s.inverse * own, push = s.inverse * borne;
+    mass = -dot(h2a, s.own) - dot(push, s.borne);
   }
 };
 
 // x is null without a floor, planes where not wanted. Force and planes are zero at first.
 template <class T>
 struct ResidualAdjoints {
-  T *x, *h2_a, *force, *mass;  // [B, V, 3], [B, V, 3], [B, N, 3], [B, V]
-  T* planes;                   // of each body [B, bodies, planes, kPlaneScalars]
+  T *x, *h2a, *force, *mass;  // [B, V, 3], [B, V, 3], [B, N, 3], [B, V]
+  T* planes;                  // of each body [B, bodies, planes, kPlaneScalars]
 };
 
 // The adjoint of a position by the floor. push: adjoint of the force on the vertex.
@@ -161,7 +161,7 @@ DIFFVBD_FN void add_plane_adjoint(const ResidualInputs<T>& in, const rigid::Body
 template <class T, class Team>
 DIFFVBD_FN void reverse_residual_acceleration(const ResidualInputs<T>& in, const rigid::Body<T>& b, const Team& team,
                                               const T* bar, const ResidualAdjoints<T>& out) {
-  Vector h2_a{}, push{};
+  Vector h2a{}, push{};
   double mass = 0;
   if (!in.pinned_bodies[b.body]) {
     double sum[kSupportSums + 3];
@@ -172,14 +172,14 @@ DIFFVBD_FN void reverse_residual_acceleration(const ResidualInputs<T>& in, const
       add_to(to + 7, own);
     });
     const SupportAdjoint scattered(Support(sum, std::numeric_limits<T>::epsilon()), vector_at(sum + 7));
-    h2_a = scattered.h2_a, push = in.square_of_step() * scattered.push, mass = scattered.mass;
+    h2a = scattered.h2a, push = in.square_of_step() * scattered.push, mass = scattered.mass;
   }
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v);
-    put(out.h2_a + 3 * row, wide_at(bar + 3 * row) + b.mass(v) * h2_a);
+    put(out.h2a + 3 * row, wide_at(bar + 3 * row) + b.mass(v) * h2a);
     put(out.force + 3 * (b.scene * in.corners + v), push);
-    out.mass[row] = T(mass + dot(in.h2_a_of(b.scene, v), h2_a));
+    out.mass[row] = T(mass + dot(in.h2_a_of(b.scene, v), h2a));
     if (out.x) put(out.x + 3 * row, floor_adjoint(in, b, v, push));
   });
   for (int32_t k = 0; out.planes && k < in.planes; ++k) {

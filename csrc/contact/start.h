@@ -15,8 +15,8 @@ struct StartInputs {
   rigid::Inputs<T> scene;              // x, origin and the vertices of all bodies
   const T *move, *gravity_move;        // [B, V, 3]  wanted displacement from x, then that of gravity
   const T* u;                          // [B, bodies, 3]  translation of each body's island
-  const T* left;                       // [B, V, 3]  displacement of its body relative to u, limited by a floor
-  const T* frames;                     // [B, bodies]  fraction of `left`
+  const T* body_move;                  // [B, V, 3]  displacement of its body relative to u, limited by a floor
+  const T* rigid_fraction;             // [B, bodies]  fraction of `body_move`
   const T *fraction, *last_fraction;   // [B, V]  of the displacement to the target, and of the gravity move
   Batched<const T> floor;              // [1 | B, data of the planes], or null
   const bool *pinned, *pinned_bodies;  // [V], [bodies]  pinned or prescribed vertices; bodies with one
@@ -54,7 +54,7 @@ struct StartPath {
   }
   DIFFVBD_FN Vec3<T> target() const { return in.is_free(v) ? x() + move() : filtered(x() + u(), move() - u()); }
   DIFFVBD_FN Vec3<T> base(const Vec3<T>& target) const {
-    return in.pinned[v] ? target : x() + u() + in.frames[body] * vector_at(in.left + 3 * row);
+    return in.pinned[v] ? target : x() + u() + in.rigid_fraction[body] * vector_at(in.body_move + 3 * row);
   }
   DIFFVBD_FN Vec3<T> at(const Vec3<T>& target, T fraction) const {
     const Vec3<T> from = base(target);
@@ -71,9 +71,9 @@ struct StartPath {
 
 template <class T>
 struct StartAdjoints {
-  const T* end;                           // of the output
-  T *x, *move, *gravity_move, *u, *left;  // [B, V, 3] each, u for each vertex
-  T* floor;                               // [B, V, floor_scalars], or null where not wanted
+  const T* end;                                // of the output
+  T *x, *move, *gravity_move, *u, *body_move;  // [B, V, 3] each, u for each vertex
+  T* floor;                                    // [B, V, floor_scalars], or null where not wanted
 };
 
 template <class T>
@@ -102,7 +102,7 @@ DIFFVBD_FN void reverse_start(const StartInputs<T>& in, const StartAdjoints<T>& 
   put(a.move + 3 * path.row, move_bar);
   put(a.gravity_move + 3 * path.row, gravity_bar);
   put(a.u + 3 * path.row, start_bar - move_bar + base_bar);
-  put(a.left + 3 * path.row, in.frames[path.body] * base_bar);
+  put(a.body_move + 3 * path.row, in.rigid_fraction[path.body] * base_bar);
 }
 
 // Decisions at the start of a substep: which bodies move by displacements of their own. Step fractions
@@ -125,7 +125,7 @@ DIFFVBD_FN double fraction_within(double displacement, double stretch, double tr
 
 // Displacements of bodies as wholes, within the radii.
 template <class T>
-struct Frames {
+struct RigidMoves {
   StartInputs<T> in;
   const T* displacement;                       // [B, V, 3]  of the rigid motions of bodies
   const T* stretch;                            // [B, bodies]  stretch of a body by straight paths [m]
@@ -156,7 +156,7 @@ struct Frames {
       const int64_t row = b.row(v);
       const Vec3<T> x = vector_at(in.scene.x + 3 * row);
       put(displacements + 3 * row,
-          in.pinned[v] ? vector_at(in.move + 3 * row) : u + T(fraction) * vector_at(in.left + 3 * row));
+          in.pinned[v] ? vector_at(in.move + 3 * row) : u + T(fraction) * vector_at(in.body_move + 3 * row));
       put(center + 3 * row, in.pinned[v] ? x : x + u);
       trust_radii[row] = trust_radius[place];
       if (deformation_radius) deformation_radii[row] = deformation_radius[place];
@@ -182,7 +182,7 @@ struct Wishes {
 // The decision which of these displacements bend a free body. A body that a floor stops or a radius truncates is
 // frozen, and so is a blocked one that bends deeply; with self-contact any other bent body is pending.
 template <class T>
-struct Bends {
+struct Deformations {
   StartInputs<T> in;
   const T *limit, *deformation_radius;  // [B, bodies], and [B, bodies + 1] or null
   const bool* stopped;                  // [B, bodies]
@@ -192,7 +192,7 @@ struct Bends {
   template <class Team>
   DIFFVBD_FN void operator()(const rigid::Body<T>& b, const Team& team) const {
     const int64_t index = b.scene * b.in.bodies + b.body;
-    const bool free = !in.pinned_bodies[b.body], up = stopped[index] || in.frames[index] < T(kTruncated);
+    const bool free = !in.pinned_bodies[b.body], up = stopped[index] || in.rigid_fraction[index] < T(kTruncated);
     bool frozen = free && (stopped[index] || limit[index] < T(kTruncated)), pending = false;
     if (deformation_radius && free) {
       const double trust_radius = deformation_radius[index + b.scene];

@@ -64,10 +64,10 @@ struct ReverseBegin {
   static constexpr bool keeps_record = energies, computes = energies;
   start::Inputs<T> in;
   start::Adjoints<T> a;
-  T *coasted, *y;
+  T *extrapolated, *y;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration* record) const {
-    start::reverse_body<energies>(in, body, team, record, coasted, y, a);
+    start::reverse_body<energies>(in, body, team, record, extrapolated, y, a);
   }
 };
 
@@ -100,13 +100,13 @@ cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const St
 
 template <class T>
 cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups, const start::Adjoints<T>& a,
-                           T* coasted, T* y, double* workspace, cudaStream_t stream) {
+                           T* extrapolated, T* y, double* workspace, cudaStream_t stream) {
   if (in.bodies.scenes * in.bodies.vertices == 0) return cudaSuccess;
   if (in.some_alone) reverse_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, a);
   if (in.bodies.data.data) {
-    return run_bodies(in.bodies, groups, ReverseBegin<T, true>{in, a, coasted, y}, workspace, stream);
+    return run_bodies(in.bodies, groups, ReverseBegin<T, true>{in, a, extrapolated, y}, workspace, stream);
   }
-  return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, coasted, y}, workspace, stream);
+  return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, extrapolated, y}, workspace, stream);
 }
 
 DIFFVBD_INSTANTIATE(begin)

@@ -35,7 +35,7 @@ cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t sc
 template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
                               const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
-// As the CPU operator contact_rubbing; friction and damping may be null.
+// As the CPU operator contact_friction_lag; friction and damping may be null.
 template <class T>
 cudaError_t lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
                             int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
@@ -101,10 +101,10 @@ cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::Mo
                            cudaStream_t stream);
 
 template <class T>
-cudaError_t extrapolate(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
+cudaError_t extrapolate(const contact::MotionInputs<T>& in, double lookback, T* extrapolated, cudaStream_t stream);
 template <class T>
-cudaError_t reverse_extrapolate(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
-                                cudaStream_t stream);
+cudaError_t reverse_extrapolate(const contact::MotionInputs<T>& in, double lookback,
+                                const contact::MotionAdjoints<T>& a, cudaStream_t stream);
 
 // islands: memory of islands_workspace_bytes().
 template <class T>

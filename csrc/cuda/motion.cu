@@ -39,18 +39,18 @@ struct Reverse {
 };
 template <class T>
 struct Extrapolate {
-  double chord;
-  T* coasted;
+  double lookback;
+  T* extrapolated;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::extrapolate(b, team, chord, coasted);
+    contact::extrapolate(b, team, lookback, extrapolated);
   }
 };
 template <class T>
 struct ReverseExtrapolate {
-  double chord;
+  double lookback;
   MotionAdjoints<T> a;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::reverse_extrapolate(b, team, chord, a);
+    contact::reverse_extrapolate(b, team, lookback, a);
   }
 };
 template <class T>
@@ -147,14 +147,14 @@ cudaError_t reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a
 }
 
 template <class T>
-cudaError_t extrapolate(const MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream) {
-  return for_bodies(in, Extrapolate<T>{chord, coasted}, stream);
+cudaError_t extrapolate(const MotionInputs<T>& in, double lookback, T* extrapolated, cudaStream_t stream) {
+  return for_bodies(in, Extrapolate<T>{lookback, extrapolated}, stream);
 }
 
 template <class T>
-cudaError_t reverse_extrapolate(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a,
+cudaError_t reverse_extrapolate(const MotionInputs<T>& in, double lookback, const MotionAdjoints<T>& a,
                                 cudaStream_t stream) {
-  return for_bodies(in, ReverseExtrapolate<T>{chord, a}, stream);
+  return for_bodies(in, ReverseExtrapolate<T>{lookback, a}, stream);
 }
 
 template <class T>

@@ -95,8 +95,8 @@ cudaError_t act_on_vertices(const Act& act, cudaStream_t stream) {
   template cudaError_t act_on_##on(const contact::Act<double>&, cudaStream_t);
 DIFFVBD_ACT(bodies, AboveFloorDisplacements)
 DIFFVBD_ACT(bodies, ReverseAboveFloor)
-DIFFVBD_ACT(bodies, Frames)
-DIFFVBD_ACT(bodies, Bends)
+DIFFVBD_ACT(bodies, RigidMoves)
+DIFFVBD_ACT(bodies, Deformations)
 DIFFVBD_ACT(bodies, BlockedBodies)
 DIFFVBD_ACT(vertices, Wishes)
 DIFFVBD_ACT(vertices, Freeze)

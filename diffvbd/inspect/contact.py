@@ -50,8 +50,8 @@ class Status:
     pairs: int
     capacity: int
     touching: int
-    hindered: int
-    cut: list[int]
+    infeasible: int
+    truncated: list[int]
     smallest_gap: list[float]
 
     @property
@@ -75,8 +75,8 @@ def status(model: Model) -> Status:
         pairs=int(counts[:, 0].max()),
         capacity=outcome.capacity,
         touching=int(counts[:, 1].sum()),
-        hindered=int(counts[:, 3].sum()),
-        cut=outcome.cut.sum(-1).tolist(),
+        infeasible=int(counts[:, 3].sum()),
+        truncated=outcome.truncated.sum(-1).tolist(),
         smallest_gap=outcome.smallest.min(0).values.tolist(),
     )
 

@@ -24,7 +24,7 @@ PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS, CROSSING_ROW = (
 UNKNOWNS, FEW, MOST_COUPLED, GROUP_MEMORY = (
     _C[name] for name in ("unknowns", "few", "most_coupled", "group_memory")
 )  # of bodies that touch
-ASKS = _C["asks"]  # state of a vertex that rests unless the potential of its body lets it go
+PENDING = _C["pending"]  # state of a vertex: frozen unless the potential of its body decreases
 STARTS = {"inertia": _C["start_inertia"], "predictor": _C["start_predictor"], "auto": _C["start_lower"]}
 START_LOWER = STARTS["auto"]
 CORRECTED, TILE, NO_MOVE, FRACTIONS, WORKSPACE_BUDGET, ROUNDINGS, DECREASE, RESTING_MOTION = (
@@ -38,7 +38,8 @@ SWEEP_ADJOINTS, STEP_ADJOINTS, TOUCHING_ADJOINTS = (
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 THREAD = 1  # the regime whose tape has scenes last; twin of kThread in csrc/cuda/step.h
-WAYS = ("bends", "driven", "apart", "stretched", "falls")  # of vertices of a body, as Way in csrc/contact/motion.h
+# Of vertices of a body; twins of DisplacementKind in csrc/contact/motion.h.
+DISPLACEMENTS = ("bends", "driven", "apart", "stretched", "gravity")
 
 
 class SweepFields(NamedTuple):
@@ -70,7 +71,7 @@ class SweepFields(NamedTuple):
     lag_entry: Tensor | None = None
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     center: Tensor | None = None  # [B, V, 3] from where a vertex may go,
-    room: Tensor | None = None  # [B, V] as far as this [m]
+    trust_radius: Tensor | None = None  # [B, V] as far as this [m]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
     # [B, 9 cells]  Cholesky factors (CUDA: inverses), with vertex energies the matrices; its adjoint is the matrix's
@@ -122,7 +123,7 @@ class TouchingFields(NamedTuple):
     order: Tensor  # [V] int32, vertices by body
     ptr: Tensor  # [bodies + 1] int32
     free: Tensor  # [bodies] bool: nothing of it is pinned
-    held: Tensor  # [N] bool, of all corner points: pinned, or of a collider
+    pinned: Tensor  # [N] bool, of all corner points: pinned, or of a collider
     body: Tensor  # [N] int32
     collider: Tensor  # as in SweepFields, as are the rest
     collider_prev: Tensor
@@ -137,7 +138,7 @@ class TouchingFields(NamedTuple):
     lag_entry: Tensor
     floor_lag: Tensor
     center: Tensor
-    room: Tensor
+    trust_radius: Tensor
 
 
 class CoarseFields(NamedTuple):

@@ -18,7 +18,7 @@ from ..model.bodies import Bodies, OtherBodies
 from ..model.system import System
 from ..ops import STARTS, distinct
 from ..ops.contact import join_data
-from .arguments import CHORD, Prepared, broadcastable
+from .arguments import LOOKBACK, Prepared, broadcastable
 
 
 def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -45,12 +45,12 @@ class Begun(NamedTuple):
     y: Tensor  # the predictor
     data: Tensor  # [1 | B, n], of the energies
     origin: Tensor | None
-    lift: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
+    h2a: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
-                     self.lift.detach())  # fmt: skip
+                     self.h2a.detach())  # fmt: skip
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
@@ -118,9 +118,9 @@ def begin(
         rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
         start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
-    x_start, y = begins(chord=prepared.chord)
+    x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
-        x_start = torch.where(prepared.euler[..., None], begins(chord=CHORD)[0], x_start)
+        x_start = torch.where(prepared.euler[..., None], begins(lookback=LOOKBACK)[0], x_start)
     return Begun(x_start, start, y, data, origin, (h * h) * acceleration)
 
 
@@ -141,11 +141,15 @@ def _run_start(*args: Any) -> tuple[Tensor, ...]:
 def _reverse_start(
     bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
 ) -> list[Any]:
-    fields, (falls, alone), (groups, options) = ops.BeginFields(*saved[:_START_FIELDS]), saved[_START_FIELDS:], rest
+    fields, (from_predictor, alone), (groups, options) = (
+        ops.BeginFields(*saved[:_START_FIELDS]),
+        saved[_START_FIELDS:],
+        rest,
+    )
     x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
     wants = (needs[2], needs[3], needs[5])
     *out, shared, own, planes = ops.direct.begin_backward(
-        *ops.as_list(fields, fields.x), x_start_bar, y_bar, falls, alone, groups, *options[:-1], wants
+        *ops.as_list(fields, fields.x), x_start_bar, y_bar, from_predictor, alone, groups, *options[:-1], wants
     )
     data_out = None
     if needs[5]:
@@ -180,7 +184,7 @@ _begin = ops.Differentiable(
 def start_of(
     x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
     origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
-    others: OtherBodies, data_count: tuple[int, ...], time_step: float, chord: float, *, start: str, filters: bool,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float, lookback: float, *, start: str, filters: bool,
     parts: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Start of the sweeps and predictor [m], both [B, V, 3]; differentiable in the first six tensors.
@@ -200,7 +204,7 @@ def start_of(
     tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
     *listed, groups = bodies
     *listed_others, other_groups = others
-    options = (data_count, time_step, FILTER_ETA, chord, STARTS[start], filters)
+    options = (data_count, time_step, FILTER_ETA, lookback, STARTS[start], filters)
     x_start, y, *_ = _begin(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
     return x_start, y
 
