@@ -113,9 +113,9 @@ void require_states(const BeginFields& f) {
           "diffvbd::begin: expected ptr, tet_ptr, other_ptr and other_tet_ptr int32 [bodies + 1]");
 }
 
-// Predictor and start of the sweeps. lookback: as in rigid/coast.h. kind: of the start of bodies that are not
-// corrected, 0 x + h v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone
-// [scenes, bodies]: with parts, 1 where the vertices of a body that is corrected start each by itself.
+// Predictor and start of the sweeps. lookback: as in sweep/extrapolation.h. kind: of the start of bodies that are not
+// corrected, 0 x + h v, 1 y, 2 the lower potential of the two; from_predictor [scenes, other bodies]: 1 where that is
+// y; alone [scenes, bodies]: with parts, 1 where the vertices of a body that is corrected start each by itself.
 DIFFVBD_OPERATOR(Out<4>, begin, DIFFVBD_PARAMETERS(BEGIN) Ints groups, Ints other_groups, Ints data_count,
                  double time_step, double filter_eta, double lookback, int64_t kind, bool filters, bool parts) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
@@ -184,8 +184,8 @@ DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_ba
   });
 }
 
-// By how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms [scenes, bodies,
-// 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by body; material [1 |
+// Increase of the potential of each body from x to `to`, and the sum of the sizes of its terms [scenes, bodies, 2],
+// float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by body; material [1 |
 // scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex) [blocks, 4, lanes] of
 // their tets, in blocks by body.
 DIFFVBD_OPERATOR(Tensor, potential_increase, In x, In to, In x_prev, In y, In mass, In energy_data, In origin,

@@ -42,7 +42,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"few", contact::kFew},                   // bodies of scenes that are one group
       {"most_coupled", contact::kMostCoupled},  // bodies of a group,
       {"group_memory", contact::kGroupMemory},  // of which there are at most so many over the bodies of the scene
-      {"pending", contact::kPending},  // state of a vertex: frozen unless the potential of its body decreases
+      {"pending", contact::kPending},           // state of a vertex: frozen unless the potential of its body decreases
       {"start_inertia", start::kInertia},
       {"start_predictor", start::kPredictor},
       {"start_lower", start::kLower},
@@ -54,7 +54,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"roundings", static_cast<int64_t>(kRounding)},  // ulps of the terms by which a potential may rise
   };
   for (const auto& [name, value] : numbers) add("int", name, std::to_string(value));
-  add("float", "decrease", std::to_string(coarse::kDecrease));              // share of what a slope promises
+  add("float", "decrease", std::to_string(coarse::kDecrease));              // fraction of the decrease to first order
   add("float", "resting_motion", std::to_string(contact::kRestingMotion));  // of that below which friction is smoothed
   add("bool", "tet_reads_x_prev", TetLayout::reads_x_prev ? "True" : "False");
   add("str", "sweep_adjoints", "\"" DIFFVBD_SWEEP_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");

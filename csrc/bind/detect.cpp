@@ -4,7 +4,7 @@
 namespace diffvbd {
 namespace {
 
-// What a search reads of surfaces; with room and deformation_radius also how far it looks.
+// Surfaces, as a search reads them; trust_radius and deformation_radius set the search distance.
 template <class T>
 contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Tensor& collider,
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
@@ -46,7 +46,7 @@ void require_capacity(int64_t capacity) {
           "contact: expected 0 <= capacity < 2^29");
 }
 
-// Results as in contact/candidates.h. mesh_bodies: body labels from there on are colliders; room [scenes, mesh_bodies +
+// Results as in contact/detection.h. mesh_bodies: body labels from there on are colliders; radii [scenes, mesh_bodies +
 // 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
 // many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
 DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,

@@ -1,4 +1,4 @@
-// Islands of bodies, as the entries of searches and of rooms take them.
+// Islands of bodies, as the operators of detection and of trust regions take them.
 #pragma once
 
 #include <cmath>

@@ -1,4 +1,4 @@
-// Operators on how bodies want to move, and how far they may: rigid motions, rooms, what contact bears.
+// Operators on wanted motions of bodies: rigid motions, trust-region radii, residual acceleration.
 #include "../contact/motion.h"
 
 #include "../contact/residual_acceleration.h"
@@ -24,8 +24,8 @@ contact::MotionInputs<T> motion_inputs(const Tensor& x, const Tensor& origin, co
   return in;
 }
 
-// What of the ways that vertices want to go is a rigid motion of each body [B, V, 3]; the longest ways [5, B, bodies]
-// and the sums [B, bodies, 4] of contact/motion.h. origin and fall may be empty.
+// Rigid motion of each body [B, V, 3] in the wanted displacements; the longest displacements [5, B, bodies] and the
+// sums [B, bodies, 4] of contact/motion.h. origin and gravity_move may be empty.
 DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In gravity_move, In pinned,
                  In pinned_bodies, In order, In ptr) {
   const Device device(x);
@@ -54,8 +54,8 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion_backward, In bar, In x, In origin, In ma
   });
 }
 
-// The ways of `move`, of free bodies without what stretches them, see contact/coast.h. It asks for no origin, which all
-// vertices of a body have in common.
+// Displacements `move` without the stretch of free bodies that rotate, see sweep/extrapolation.h. The origin cancels:
+// it is the same for all vertices of a body.
 DIFFVBD_OPERATOR(Tensor, contact_extrapolate, In x, In mass, In move, In pinned, In pinned_bodies, In order, In ptr,
                  double lookback) {
   const Device device(x);
@@ -84,8 +84,8 @@ DIFFVBD_OPERATOR(Out<3>, contact_extrapolate_backward, In bar, In x, In mass, In
   });
 }
 
-// How far bodies may go until pairs are found again, see contact/rooms.h: their islands [B, bodies] int32, rooms and
-// rooms of their own [B, bodies + 1], and how far they want to go over the most room [B, bodies].
+// Trust-region radii of bodies, see contact/trust_region.h: islands [B, bodies] int32, trust-region and deformation
+// radii [B, bodies + 1], and wanted displacement over the largest radius [B, bodies].
 DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move, In pinned, In order, In ptr, In rigid,
                  In displacements, In sums, In floor, In collider, In collider_next, In planes, In body, In radius,
                  In most, In most_alone, In most_own, In least_own, double dhat, double fraction, double least,
@@ -124,8 +124,9 @@ DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move,
   });
 }
 
-// How far sweeps may carry each vertex [scenes, vertices], see contact/sweep_rooms.h; deformation_center and
-// deformation_radius may be empty. more: factor of what sweeps take back; least: what they are given beside that [m].
+// Trust-region radii of the sweeps [scenes, vertices], see contact/trust_region.h; deformation_center and
+// deformation_radius may be empty. more: factor of the truncated displacement and the stretch; least: smallest radius
+// [m].
 DIFFVBD_OPERATOR(Tensor, contact_sweep_radii, In x, In start, In begin, In move, In gravity_move, In apart,
                  In stretched, In center, In trust_radius, In deformation_center, In deformation_radius, In pinned,
                  In body_order, In body_ptr, double more, double least) {
@@ -175,9 +176,9 @@ contact::ResidualInputs<T> residual_inputs(const Tensor& x, const Tensor& origin
   return in;
 }
 
-// What is left of lift once forces have borne their part of each body's acceleration, see contact/unsupported.h; origin
-// and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by body
-// [scenes, bodies, 7 planes] where wanted.
+// Residual of h2a after contact forces, see contact/residual_acceleration.h; origin and planes may be empty. The
+// adjoint: of x, empty without planes, h2a, force and mass, and of planes by body [scenes, bodies, 7 planes] where
+// wanted.
 DIFFVBD_OPERATOR(Tensor, contact_residual_acceleration, In x, In origin, In h2a, In force, In mass, In planes,
                  In pinned_bodies, In body_order, In body_ptr, double time_step) {
   const Device device(x);

@@ -1,5 +1,5 @@
-// Operators of the start of a part of a step with contact: translations of islands, ways above a floor, shares of ways;
-// what sweeps with contact keep of the start of a step; and lists of pairs.
+// Operators of the start of a substep with contact: translations of islands, displacements above a floor, step
+// fractions; values lagged from the start of a step; and lists of pairs.
 #include "../contact/start.h"
 
 #include "../contact/above_floor.h"
@@ -11,10 +11,9 @@
 namespace diffvbd {
 namespace {
 
-// --- translations of islands
-// ------------------------------------------------------------------------------------------
+// --- translations of islands -----------------------------------------------------------------------------------------
 
-// The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of
+// Support vertex of each body's island above each plane of a floor: the one of the smallest gap. planes: data of
 // FloorBarrier.
 DIFFVBD_OPERATOR(Tensor, contact_support_vertices, In x, In origin, In planes, In body_order, In body_ptr, In island) {
   const Device device(x);
@@ -50,8 +49,8 @@ contact::TranslationInputs<T> translation_inputs(const Tensor& move, const Tenso
   return in;
 }
 
-// Translation of each body's island [scenes, bodies, 3], see contact/translation.h; without a floor planes and lowest
-// are empty. The adjoint: of move, mass, x and planes.
+// Translation of each body's island [scenes, bodies, 3], see contact/islands.h; without a floor planes and
+// support_vertex are empty. The adjoint: of move, mass, x and planes.
 DIFFVBD_OPERATOR(Tensor, contact_translation, In move, In mass, In x, In origin, In planes, In pinned, In body,
                  In body_order, In body_ptr, In island, In support_vertex) {
   const Device device(x);
@@ -81,9 +80,9 @@ DIFFVBD_OPERATOR(Out<4>, contact_translation_backward, In u_bar, In move, In mas
   });
 }
 
-// How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices], or all of a body
-// [scenes, bodies] where it goes as a whole; stuck: how many pairs what is prescribed brings too close. center: what a
-// vertex may leave by its room at most, and deformation_center by its deformation_radius, unless empty.
+// Step fractions at the start, see contact/advance.h: of vertices [scenes, vertices], or of whole bodies [scenes,
+// bodies]; infeasible: number of pairs that prescribed motion brings too close. center, trust_radius: the trust region
+// of a vertex; deformation_center and deformation_radius likewise, or empty.
 DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In origin, In collider, In collider_next,
                  In pinned, In body, In trust_radius, In deformation_center, In deformation_radius, In pairs,
                  In constants, In ptr, In entry, bool careful, bool whole) {
@@ -122,10 +121,9 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
   });
 }
 
-// --- lists of pairs
-// ---------------------------------------------------------------------------------------------------
+// --- lists of pairs --------------------------------------------------------------------------------------------------
 
-// constants with the gaps of the pairs where the vertices are now, see contact/narrow.h.
+// constants with the current gaps of the pairs, see contact/pair_list.h.
 DIFFVBD_OPERATOR(Tensor, contact_refresh_gaps, In x, In origin, In collider, In trust_radius, In pairs, In constants,
                  In ptr) {
   const Device device(x);
@@ -146,8 +144,8 @@ DIFFVBD_OPERATOR(Tensor, contact_refresh_gaps, In x, In origin, In collider, In 
   });
 }
 
-// The pairs of a list that `keep` names, and which they are (contact/keep.h); exact: in lists as long as they are many,
-// on the CPU, else in room for all, with -1 where there is none.
+// Compact list of the pairs that `keep` selects, and their indices (contact/pair_list.h); exact: of their number, on
+// the CPU; else as long as the whole list, with -1 in empty rows.
 DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In ptr, In entry, bool exact) {
   const Device device(constants);
   return dispatch_float(constants, [&]<class T>(T) {
@@ -194,11 +192,10 @@ DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In pt
   });
 }
 
-// --- what sweeps keep of the start of a step
-// --------------------------------------------------------------------------
+// --- lagged values ---------------------------------------------------------------------------------------------------
 
-// Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of where corner points are
-// [B, N, 3] and of kappa.
+// Normal force, 1 where active, normal and weights of each pair [pairs, 9]; the adjoint: of corner points [B, N, 3] and
+// of kappa.
 DIFFVBD_OPERATOR(Tensor, contact_lag, In x, In origin, In collider, In kappa, In pairs, In constants, In ptr,
                  In entry) {
   const Device device(x);
@@ -267,8 +264,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_friction_lag_backward, In lag_bar, In push_bar,
   });
 }
 
-// --- ways above a floor, and shares of ways
-// ---------------------------------------------------------------------------
+// --- displacements above a floor, and step fractions -----------------------------------------------------------------
 
 template <class T>
 contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u, const Tensor& displacement,
@@ -286,8 +282,8 @@ contact::AboveFloorInputs<T> above_floor_inputs(const Tensor& x, const Tensor& u
   return in;
 }
 
-// What a floor leaves of the ways of bodies as wholes, less u, and which it stops [scenes, bodies], see
-// contact/above_floor.h; u, planes and origin may be empty. The adjoint: of x, u, way and, of each body, the planes.
+// Displacements of whole bodies relative to u, limited by a floor, and stopped bodies [scenes, bodies], see
+// contact/above_floor.h; u, planes and origin may be empty. The adjoint: of x, u, displacement and, by body, planes.
 DIFFVBD_OPERATOR(Out<2>, contact_above_floor, In x, In u, In displacement, In planes, In origin, In pinned,
                  In body_order, In body_ptr) {
   const Device device(x);
@@ -312,8 +308,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_above_floor_backward, In bar, In x, In u, In di
   });
 }
 
-// Of most entries that follow: which vertices are held, bodies of which one is, the body of each vertex, and vertices
-// by body.
+// Index data of the operators below: pinned vertices, bodies with one, the body of each vertex, and vertices by body.
 #define DIFFVBD_BODIES In pinned, In pinned_bodies, In body, In body_order, In body_ptr
 struct IndexTensors {
   const Tensor &pinned, &pinned_bodies, &body, &order, &ptr;
@@ -329,7 +324,7 @@ contact::StartInputs<T> start_inputs(const Tensor& x, const IndexTensors& index)
   return in;
 }
 
-// What a path is made of until bodies have gone.
+// Inputs of a path up to the rigid displacement.
 struct PathTensors {
   const Tensor &x, &move, &u, &body_move, &rigid_fraction, &planes, &origin;
 };
@@ -349,8 +344,8 @@ contact::StartInputs<T> start_inputs(const PathTensors& t, const IndexTensors& i
   return in;
 }
 
-// What is decided at the start of a part, see contact/part.h; planes, origin and deformation_radius may be empty. state
-// uint8 [scenes, vertices]: 0 goes, 1 rests, 2 rests unless its body's potential does not rise.
+// Decisions at the start of a substep, see contact/start.h; planes, origin and deformation_radius may be empty. state
+// uint8 [scenes, vertices]: MoveState.
 DIFFVBD_OPERATOR(Out<5>, contact_rigid_moves, In x, In move, In u, In displacement, In body_move, In stretch,
                  In trust_radius, In deformation_radius, DIFFVBD_BODIES) {
   const Device device(x);
@@ -440,8 +435,8 @@ DIFFVBD_OPERATOR(Out<3>, contact_gravity_moves, In x, In move, In gravity_move, 
   });
 }
 
-// Where each vertex starts, and whether pairs have held up more than a hundredth of its way, see contact/start.h. The
-// adjoint: of x, move, fall, u, left and planes, all for each vertex.
+// Positions at the start of the sweeps, and vertices truncated by pairs, see contact/start.h. The adjoint: of x, move,
+// gravity_move, u, body_move and planes, all for each vertex.
 DIFFVBD_OPERATOR(Out<2>, contact_start, In x, In move, In gravity_move, In u, In body_move, In rigid_fraction,
                  In fraction, In last_fraction, In stopped, In planes, In origin, DIFFVBD_BODIES, double filter_eta) {
   const Device device(x);

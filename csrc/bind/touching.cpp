@@ -98,9 +98,9 @@ DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints
   });
 }
 
-// The state after each body has taken what it may of its motion [scenes, bodies, 6]; that share [scenes, bodies], zero
-// of what does not move beside a mask `moving`; whether it has a motion; whether it was held up where others that were
-// have gone on; and how much of its shift is left [m].
+// The state after the admissible fraction of each motion [scenes, bodies, 6]; that fraction [scenes, bodies], with a
+// mask `moving` zero where a body has no motion; whether it has a motion; whether it was blocked, in a scene where some
+// blocked body has moved on; and the translation that it did not take [m].
 DIFFVBD_OPERATOR(Out<5>, contact_rigid_move, DIFFVBD_PARAMETERS(TOUCHING) In centers, In motion, Ints data_count,
                  double time_step, double friction_eps, In moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -170,10 +170,10 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_backward, DIFFVBD_PARAMETERS(TOUCHING) In
   });
 }
 
-// The adjoint of corrections one after another, each from `at` [scenes, V, 3], by its motion, share, factor and groups,
-// of that of where the last one led, x_bar [scenes, V, 3]: of the first `at`, x_prev, y and mass, of data as of
-// rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed pair
-// adds to that of kappa, and of lag.
+// The adjoint of corrections in sequence, each from `at` [scenes, V, 3] by its motion, fraction, factor and groups.
+// x_bar [scenes, V, 3]: adjoint of the state after the last one. Returned: adjoints of the first `at`, x_prev, y and
+// mass, of data as of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus the
+// contribution of each listed pair to that of kappa, and of lag.
 DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors motion,
                  Tensors fraction, Tensors factor, Tensors groups, In x_bar, Ints data_count, double time_step,
                  double friction_eps, bool wants_data) {

@@ -20,7 +20,7 @@ struct ResidualInputs {
   int32_t planes;
 
   DIFFVBD_FN double square_of_step() const { return scene.time_step * scene.time_step; }
-  DIFFVBD_FN Vector h2_a_of(int64_t s, int32_t v) const { return wide_at(h2a.data + s * h2a.scene + 3 * int64_t{v}); }
+  DIFFVBD_FN Vector h2a_of(int64_t s, int32_t v) const { return wide_at(h2a.data + s * h2a.scene + 3 * int64_t{v}); }
 };
 
 // One plane of a floor and one vertex. Its force is -kappa slope n.
@@ -60,7 +60,7 @@ constexpr int kSupportSums = 7;  // over the vertices of a body: mass times h^2 
 template <class T>
 DIFFVBD_FN void add_to_support(const ResidualInputs<T>& in, const rigid::Body<T>& b, int32_t v, double* to) {
   const double m = b.mass(v);
-  const Vector h2a = m * in.h2_a_of(b.scene, v), push = in.square_of_step() * force_on(in, b, v);
+  const Vector h2a = m * in.h2a_of(b.scene, v), push = in.square_of_step() * force_on(in, b, v);
   add_to(to, h2a);
   add_to(to + 3, push);
   to[6] += m;
@@ -103,7 +103,7 @@ DIFFVBD_FN void residual_acceleration(const ResidualInputs<T>& in, const rigid::
   }
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
-    put(out + 3 * b.row(v), in.h2_a_of(b.scene, v) + taken);
+    put(out + 3 * b.row(v), in.h2a_of(b.scene, v) + taken);
   });
 }
 
@@ -179,7 +179,7 @@ DIFFVBD_FN void reverse_residual_acceleration(const ResidualInputs<T>& in, const
     const int64_t row = b.row(v);
     put(out.h2a + 3 * row, wide_at(bar + 3 * row) + b.mass(v) * h2a);
     put(out.force + 3 * (b.scene * in.corners + v), push);
-    out.mass[row] = T(mass + dot(in.h2_a_of(b.scene, v), h2a));
+    out.mass[row] = T(mass + dot(in.h2a_of(b.scene, v), h2a));
     if (out.x) put(out.x + 3 * row, floor_adjoint(in, b, v, push));
   });
   for (int32_t k = 0; out.planes && k < in.planes; ++k) {

@@ -1,4 +1,4 @@
-// Start of a substep (contact/part.h, contact/above_floor_reverse.h): a block for each body, a thread for each vertex.
+// Start of a substep (contact/start.h, contact/above_floor.h): a block for each body, a thread for each vertex.
 #include "bodies.cuh"
 #include "contact.h"
 

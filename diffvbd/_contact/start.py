@@ -73,9 +73,7 @@ def start_between_planes(x: Tensor, move: Tensor, gravity_move: Tensor, mass: Te
         return fraction
 
     def any_pending(state: Tensor) -> bool:
-        return state.is_cuda or (
-            state.numel() > 0 and int(state.max()) == PENDING
-        )  # CUDA would have to wait
+        return state.is_cuda or (state.numel() > 0 and int(state.max()) == PENDING)  # CUDA would have to wait
 
     with torch.no_grad():
         # bodies first, each as a whole

@@ -16,8 +16,8 @@ from ..mesh import TetMesh
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # Radii without a given reach, in mean edges of the body: the trust-region radius where one body moves and where several
-# do; the deformation radius at least and at most, and that of a pinned body, whose every motion is a deformation. Larger
-# radii list more pairs.
+# do; the deformation radius at least and at most, and that of a pinned body, whose every motion is a deformation.
+# Larger radii list more pairs.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_PINNED = 0.2, 0.3, 0.75
 # Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.

@@ -1,4 +1,4 @@
-"""Lagged contact: what sweeps keep of the start of a step: forces, normals and weights of pairs, differentiable."""
+"""Lagged contact: forces, normals and weights of pairs at the start of a step, differentiable."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
 
 def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
                  listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_share), normal (3),
+    """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_fraction), normal (3),
     weights (4); and the forces of pairs on corner points [B, N, 3] [N]. Differentiable in the first five.
 
     Args:

@@ -418,9 +418,7 @@ class Moved(NamedTuple):
     x: Tensor  # [B, V, 3]
     fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; with `moving`, zero where there is none
     moved: Tensor  # bool [B, bodies]: the body has a motion
-    blocked: (
-        Tensor  # bool [B, bodies]: the body was blocked, in a scene where some blocked body has moved on
-    )
+    blocked: Tensor  # bool [B, bodies]: the body was blocked, in a scene where some blocked body has moved on
     remaining: Tensor  # [B, bodies]: translation that was not taken [m]
 
 

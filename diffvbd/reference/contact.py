@@ -1,8 +1,8 @@
 """One step with contact between bodies, in plain torch: barrier, damping and friction of pairs, starts, limits, rigid
 corrections.
 
-Which pairs there are, which bodies move together and what a step has decided are data (`Part`); everything that follows
-from them is computed here from positions and differentiated by autograd.
+Pairs, islands and decisions of a step are data (`Substep`). The rest is computed here from positions and differentiated
+by autograd.
 Source: Li et al. 2020 (barrier, mollifier, friction).
 """
 
@@ -23,28 +23,28 @@ from .sweep import check_start, color_masses, executed, predictor, run_sweeps, s
 
 
 class Substep(NamedTuple):
-    """One detection and what the part of a step has decided: data without gradient, of B scenes with N corner points,
-    mesh vertices before colliders."""
+    """One detection and the decisions of its substep: data without gradient, of B scenes with N corner points, mesh
+    vertices before colliders."""
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
     constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
-    fractions: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
-    # [1 to 3, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    fractions: Tensor  # [2, B, V]: step fractions of the two displacements of the start
+    # [1 to 3, B, bodies]: step fractions of the rigid motions before and after the sweeps
     corrections: Tensor
-    limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
-    rigid_fraction: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
+    limits: Tensor | None = None  # [K, B, V]: step fraction of each update
+    rigid_fraction: Tensor | None = None  # [B, bodies]: step fractions of the rigid motions of the start; None: none
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
     support_vertex: Tensor | None = (
         None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
     )
-    sweeps: int | None = None  # None: its share of those of the step
+    sweeps: int | None = None  # None: an even part of those of the step
     going: Tensor | None = None  # bool [B, 1, 1]: scenes that it is for; None: all
-    resting: Tensor | None = None  # bool [B, V]: vertices that begin without gravity's fall; None: none
+    resting: Tensor | None = None  # bool [B, V]: vertices that begin without their gravity move; None: none
 
 
 class Pairs:
-    """The listed pairs of a part, and for each color the (pair, local corner) of its vertices, sorted by pair.
+    """The listed pairs of a substep, and for each color the (pair, local corner) of its vertices, sorted by pair.
 
     order: permutation [Q] of the pairs, which changes only the order of summation.
     """
@@ -96,7 +96,7 @@ class Pairs:
 
 
 class PairBarrier:
-    """e b(d - offset) over the pairs of a part.
+    """e b(d - offset) over the pairs of a substep.
 
     The block drops b' Hess d and the curvature of the mollifier e, and takes the stiffness of a pair once for each of
     its corners of the color: they move at once.
@@ -161,7 +161,7 @@ class LaggedPairForces:
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Approach n.m [n], which is damped (else 0), slip u [3, n] and weights [n, 4] of some pairs."""
+        """Approach n.m [n], which is damped (else 0), tangential motion u [3, n] and weights [n, 4] of some pairs."""
         slope, normal = self.slope[pair], self.normal[pair]
         weights = (slope * normal[:, None]).sum(-1)
         moved = self.pairs.positions(corner_points(x, self.colliders) - self.start, pair)
@@ -238,18 +238,16 @@ def contact_step(
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
 
-    Arguments of `step`, and: parts, one for each detection, scenes counted in
+    Arguments of `step`, and: substeps, one for each detection, scenes counted in
     row-major order of x's leading dimensions; colliders and colliders_before: positions [..., Vc, 3] [m] of collider
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
-    permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation; chord:
-    how far back along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h.
-    parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction".
-    Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
-    Returns (x', v').
-    """
+    permutation of the pairs for each substep, tet_order one of the tets: they change only the order of summation;
+    lookback: distance back along h v at which a vertex counts as having been, over h v, 1 where v = (x - x_prev) / h.
+    parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction". Raises ValueError when an unpinned
+    vertex starts below a floor plane, or when substeps or order have another length. Returns (x', v')."""
     model, time_step, sweeps = executed(model, solver), solver.time_step, solver.sweeps
     count = model.contact.detections or len(substeps)
-    prescribed_substeps = model.contact.detections or 1  # of what is prescribed
+    prescribed_substeps = model.contact.detections or 1
     for name, value in (("substeps", substeps), ("order", order)):
         if value is not None and len(value) != count:
             raise ValueError(f"{name}: expected one for each of {count} detections, got {len(value)}")
@@ -340,7 +338,7 @@ def corner_points(x: Tensor, colliders: Tensor) -> Tensor:
 
 
 class Translation:
-    """Of the island of each vertex [..., 3, V]: the mean of where its vertices want to go, above the floor."""
+    """Translation of the island of each vertex [..., 3, V]: the mean wanted displacement, above the floor."""
 
     def __init__(self, scene: Scene, substep: Any, x: Tensor, wanted: Tensor, floor: FloorBarrier | None) -> None:
         rows = wanted.transpose(-1, -2).reshape(len(substep.island), x.shape[-1], 3)
@@ -367,7 +365,7 @@ class Translation:
 
     @staticmethod
     def _above(floor: FloorBarrier, u: Tensor, x: Tensor, support_vertex: Tensor) -> Tensor:
-        """u [..., 3, V], down at most until the lowest vertex [..., V, planes] comes within dhat of a plane."""
+        """u [..., 3, V], limited so that the support vertex [..., V, planes] stays dhat above each plane."""
         lead, count = x.shape[:-2], x.shape[-1]
         gap = floor.gap(x)  # [..., planes, V]
         allowance = (gap.gather(-1, support_vertex.transpose(-1, -2)) - floor.dhat).clamp(min=0)
@@ -383,7 +381,7 @@ class Translation:
 
 def residual_acceleration(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor, colliders: Tensor,
                           h2a: Tensor) -> Tensor:  # fmt: skip
-    """What barriers at the start of the step leave of the ways [..., 3, V] that bodies want to fall."""
+    """Residual acceleration times h^2 [..., 3, V] of bodies after the barriers at the start of the step."""
     model, scenes, count = scene.model, len(colliders), int(scene.model.body.max()) + 1
     points = corner_points(x, colliders)
     gap, slope, e, _ = pairs.measures(points, torch.arange(len(pairs.kind), device=x.device))
@@ -411,7 +409,7 @@ def residual_acceleration(scene: Scene, pairs: Any, floor: FloorBarrier | None, 
 
 
 def rigid_displacement(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
-    """The shift and the linearised turn of each body that have the momenta of the ways [..., 3, V]."""
+    """Translation and linearised rotation of each body with the momenta of the displacements [..., 3, V]."""
     model, displacement, at = scene.model, move.transpose(-1, -2), x.transpose(-1, -2)
     mass = scene.mass.expand(at.shape[:-1])[..., None]
     eye, out = torch.eye(3).to(x), torch.zeros_like(at)
@@ -431,7 +429,7 @@ def rigid_displacement(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
 
 
 def extrapolation(scene: Scene, x: Tensor, displacement: Tensor, free: Tensor, lookback: float) -> Tensor:
-    """The ways [..., 3, V] of free bodies without what stretches them. free: bool [V]."""
+    """Displacements [..., 3, V] without the stretch of free bodies. free: bool [V]."""
     model = scene.model
     mass = scene.mass.expand(x[..., 0, :].shape).unsqueeze(-2)
     for number in model.body[free].unique().tolist():
@@ -441,13 +439,12 @@ def extrapolation(scene: Scene, x: Tensor, displacement: Tensor, free: Tensor, l
     return displacement
 
 
-TRUNCATED = 0.99  # share of a way that counts as all of it
+TRUNCATED = 0.99  # step fraction below which a displacement counts as truncated
 KEPT, DEEP, KEPT_DEEP = 0.9, 0.1, 0.1  # of a gap; of dhat, and of a gap below that
 
 
 def above_floor(floor: FloorBarrier, model: Any, x: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-    """What the floor leaves of the ways [..., 3, V] of bodies as wholes, and which vertices are of bodies that it stops
-    [..., V]."""
+    """Displacements [..., 3, V] of whole bodies limited by the floor, and vertices of stopped bodies [..., V]."""
     lead, out, stopped = x.shape[:-2], displacement, torch.zeros_like(x[..., 0, :], dtype=torch.bool)
     deep, gap = DEEP * floor.dhat, floor.gap(x)  # [..., planes, V]
     allowance = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
@@ -483,7 +480,7 @@ def in_cycles(
     """The state [..., 3, V] after so many sweeps.
 
     swept(state, x_prev, sweeps, limits, relaxation): the state after some of them. forces: terms of pairs, each with
-    its `on_corners`. part: what has been decided, the Part of a detection.
+    its `on_corners`. substep: decisions.
     """
     lead, model = state.shape[:-2], scene.model
     limits = None if substep.limits is None else substep.limits.reshape(number, *lead, 1, -1).to(state)
@@ -506,7 +503,8 @@ def in_cycles(
 
 
 class Corrections:
-    """Coarse corrections of all bodies of a scene together, against which pairs, friction and vertex energies press."""
+    """Coarse corrections of all bodies of a scene together, with the stiffness of pairs, friction and vertex
+    energies."""
 
     def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
         self.coarse = Coarse(scene, energies, forces)

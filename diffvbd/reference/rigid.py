@@ -16,16 +16,17 @@ from .scene import Scene, dot
 ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
 MOST_TURN = 0.7  # [rad] in a step, which the start leaves out
-# chords of ways that are tangents of a turn, of implicit Euler's, and of BDF2's after a step from tangents
+# lookback ratios of displacements that are tangents of a rotation, of implicit Euler's, and of BDF2's after a step from
+# tangents
 BETTER = (0.01, 1.0, -0.74)
-FITS = 0.25  # of the squares that one chord leaves: what one that fits better leaves at most
-TURNS = 0.15  # of the squares of all ways: what a wrong chord may leave of a turn alone
-STRETCH = 1e-8  # squared stretch of a step below which all chords are the same
+FITS = 0.25  # of the squares that one ratio leaves: a better one leaves at most so much
+TURNS = 0.15  # of the squares of all displacements: a wrong ratio may leave so much of a rotation
+STRETCH = 1e-8  # squared stretch of a step below which all ratios agree
 LEAST_FRACTION = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration from which on two more steps are taken
 ARRIVALS = 2
-ROUNDING = 1e-13  # relative rise of the energies that is rounding
+ROUNDING = 1e-13  # relative increase of the energies that is rounding
 FAR = 0.25  # squared angle of a Newton step to the nearest rotation, beyond which steps are shortened
 DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
@@ -71,16 +72,16 @@ class Correction:
         return x
 
     def extrapolation(self, body: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> tuple[Tensor, Tensor]:
-        """The vertices of one body on their ways from x [..., 3, n] without its turn, as far as all of them may go
-        together; and the share of it that this is [...]."""
+        """Vertices of one body after their displacements from x [..., 3, n] without its rotation, by one fraction that
+        all may take; and this fraction [...]."""
         own = bent(self.scene.mass[..., body].unsqueeze(-2), x, displacement, lookback)[0]
         to, fraction = self._toward(x, own)
-        kept, kept_fraction = self._toward(x, displacement)  # where planes hold the body back
+        kept, kept_fraction = self._toward(x, displacement)  # where planes block the body
         blocked = fraction < 1
         return torch.where(blocked[..., None, None], kept, to), torch.where(blocked, kept_fraction, fraction)
 
     def _toward(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertices after their ways, as far as all of them may go together, and the share of these."""
+        """Vertices after one fraction of their displacements that all may take, and this fraction."""
         fraction, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
         floors = [e for e in self.energies if hasattr(e, "gap")]
         slack = 8 * torch.finfo(x.dtype).eps * step.detach().norm(dim=-2).unsqueeze(-2)
@@ -167,7 +168,8 @@ class Correction:
     def _fraction(self, running: Tensor, arrives: Tensor, step: Tensor, turn: Tensor, at: Tensor, state: Tensor,
                   total: Tensor, target: Tensor, y_x: Tensor, placed: Any, body: Tensor, x_prev: Tensor
                   ) -> Tensor:  # fmt: skip
-        """The largest of 1, 1/2, 1/4, ... that is admitted and, unless a step arrives, raises no potential; 0: none."""
+        """The largest of 1, 1/2, 1/4, ... that is admitted and, unless a step arrives, does not increase the potential;
+        0: none."""
         fraction, found = torch.ones_like(running, dtype=state.dtype), torch.zeros_like(running)
         value = self._value(state, x_prev)
         for _ in range(HALVINGS):
@@ -185,8 +187,8 @@ class Correction:
 
 
 def bent(mass: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The ways of the vertices of a body [..., 3, n] without its turn; its new shape, and the ends of its ways, both
-    about the center of mass. mass: [..., 1, n]. Where the ways have no rotation they stay as they are."""
+    """Displacements of the vertices of a body [..., 3, n] without its rotation; its new shape, and the ends of its
+    displacements, both about the center of mass. mass: [..., 1, n]. Without a rotation they stay as they are."""
     total = mass.sum(-1, keepdim=True)
     center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, displacement))
     r, beside = x - center, displacement - mean
@@ -201,7 +203,7 @@ def bent(mass: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> tupl
 
 
 def _straightened(mass: Tensor, r: Tensor, beside: Tensor, lookback: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The ways of a body beside that of its center, without its turn; their squares, by mass; whether it turns."""
+    """Displacements relative to the center without the rotation; their squares, by mass; whether the body rotates."""
     before = r - lookback * beside
     turn, turns = _turn_or_none((mass * r) @ before.transpose(-1, -2), lookback)
     change = torch.where(turns, (r - turn @ before) / lookback, beside)
@@ -209,14 +211,14 @@ def _straightened(mass: Tensor, r: Tensor, beside: Tensor, lookback: float) -> t
 
 
 def _turn_or_none(b: Tensor, lookback: float) -> tuple[Tensor, Tensor]:
-    """The rotation closest to b, and whether there is one that a step may turn by over a share ``chord`` of it."""
+    """The rotation closest to b, and whether a step may rotate by so much over the lookback ratio."""
     turn, turns = _polar_or_none(b)
     square = (turn - torch.eye(3, dtype=b.dtype, device=b.device)).detach().square().sum((-2, -1))
     return turn, turns & (square < 2 * (MOST_TURN * lookback) ** 2)[..., None, None]
 
 
 def turned(mass: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> Tensor:
-    """The same, turned as a whole to where the ways point."""
+    """The same, rotated as a whole toward the ends of the displacements."""
     total = mass.sum(-1, keepdim=True)
     center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, displacement))
     _, shape, end = bent(mass, x, displacement, lookback)

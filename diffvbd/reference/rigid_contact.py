@@ -31,7 +31,7 @@ class Correction:
         self.free = ~pinned.to(y.device)
 
     def __call__(self, x: Tensor, fraction: Tensor) -> Tensor:
-        """The state [..., 3, V] after each body [B, bodies] has taken its share of its motion."""
+        """The state [..., 3, V] after each body [B, bodies] has taken its fraction of its motion."""
         lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(fraction), -1, 3)
         mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(fraction), -1)
         total = mass.new_zeros(len(fraction), self.count).index_add(1, self.body, mass)

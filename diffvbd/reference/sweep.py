@@ -116,8 +116,8 @@ def stepper(
 ) -> Callable[..., tuple[Tensor, Tensor]]:
     """Do what is common to all steps of a run, and return the function
     (x, v, force, gravity, prescribed, given=(None, None), record=None) -> (x', v') that makes one.
-    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`; chord: how far back
-    along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h."""
+    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`; lookback: distance back
+    along h v at which a vertex counts as having been, over h v, 1 where v = (x - x_prev) / h."""
     scene = build_scene(
         model,
         layout,

@@ -984,7 +984,7 @@ class ErrorBudget:
         solver: Whose error it is.
         shares: One for each cause, the largest first, then "all but mesh" together, which need not be their sum.
         duration: Of the motion that was looked at [s].
-        cut: The largest share of vertices that pairs truncated in a step [-]; None without pairs.
+        truncated: The largest fraction of vertices that pairs truncated in a step [-]; None without pairs.
         friction: The share of the friction that the last step left unbalanced [-]; None without friction.
         reached: Whether all runs that others are compared with have steps that balance their forces, to 1 %. Where one
             has not, its note says so, and what is compared with it says little.

@@ -54,13 +54,13 @@ class Prepared(NamedTuple):
     parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
     settings: ops.SweepSettings
     coarse: CoarseParts | None = None  # what the coarse corrections of all steps have in common
-    # of a time step, sweeps and a chord, the reference's step, where autograd unrolls it
+    # of a time step, sweeps and a lookback ratio, the reference's step, where autograd unrolls it
     unrolled: Callable[[float, int, float], Callable[..., tuple[Tensor, Tensor]]] | None = None
-    lookback: float = LOOKBACK  # how far back along its way h v a vertex is taken to have been (csrc/rigid/coast.h)
-    euler: Tensor | None = None  # bool [B, V]: who takes implicit Euler in a step of another scheme, and its chord
+    lookback: float = LOOKBACK  # over h v; see csrc/sweep/extrapolation.h
+    euler: Tensor | None = None  # bool [B, V]: vertices that take implicit Euler in a step of another scheme
 
     def displacements(self, of: Callable[[float], Tensor]) -> Tensor:
-        """of(chord) [B, V, 3], each vertex by the chord of its scheme."""
+        """of(lookback) [B, V, 3], each vertex by the lookback ratio of its scheme."""
         own = of(self.lookback)
         return own if self.euler is None else torch.where(self.euler[..., None], of(LOOKBACK), own)
 

@@ -245,9 +245,7 @@ class ContactStep:
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.substeps < MOST_DETECTIONS:
-                asked = blocked.any(-1) | (
-                    truncated.sum(-1) > TRUNCATED * self.model.num_active
-                )  # still truncated
+                asked = blocked.any(-1) | (truncated.sum(-1) > TRUNCATED * self.model.num_active)  # still truncated
                 asked = asked & ~self._inverted(x)  # another body might pass through an inverted one
                 going = asked[:, None, None] if going is None else going & asked[:, None, None]
                 self.substeps += int(going.any())
@@ -390,8 +388,8 @@ class ContactStep:
         if infeasible:
             raise ValueError(
                 f"prescribed or colliders: expected feasible motion, got {infeasible} pairs in substep "
-                f"{r} of {self.substeps} that it would bring too close: spread a long motion over more steps (per_step), "
-                "give PairBarrier a larger number of detections, or use a smaller time_step"
+                f"{r} of {self.substeps} that it would bring too close: spread a long motion over more steps "
+                "(per_step), give PairBarrier a larger number of detections, or use a smaller time_step"
             )
 
     def _refuse_what_is_not_finite(self) -> None:
@@ -428,9 +426,7 @@ def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor,
 
 # Substeps of a step without a given number: by the wanted displacements, and more while pairs truncate motion.
 MOST_PLANNED, MOST_DETECTIONS = 4, 8
-TRUNCATED = (
-    0.01  # fraction of vertices, besides blocked bodies, above which a step goes on and a rollout warns
-)
+TRUNCATED = 0.01  # fraction of vertices, besides blocked bodies, above which a step goes on and a rollout warns
 
 
 class SweptSubstep(NamedTuple):
@@ -711,8 +707,8 @@ def trust_radii(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x
 @torch.no_grad()
 def radii_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrier, start: SubstepStart, x: Tensor,
                     begin: Tensor) -> Tensor:  # fmt: skip
-    """Trust-region radii of the sweeps [B, V] [m]. They allow for barriers, weight, the elastic recovery of deformation,
-    and truncated displacements. The largest of a scene counts, since bodies push one another. Index data.
+    """Trust-region radii of the sweeps [B, V] [m]. They allow for barriers, weight, the elastic recovery of
+    deformation, and truncated displacements. The largest of a scene counts, since bodies push one another. Index data.
 
     Args:
         motion: Wanted displacements of the substep.  start: Its start, whose trust regions bound the sum.
@@ -821,8 +817,8 @@ PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is
 
 def start_on_floor(model: System, begun: Begun, floor: Tensor | None, mass: Tensor, prepared: Prepared
                    ) -> Tensor:  # fmt: skip
-    """Positions [B, V, 3] [m]: free bodies move as wholes, above the floor. With a limit for each vertex, the start would
-    compress a body that hits the floor. Differentiable.
+    """Positions [B, V, 3] [m]: free bodies move as wholes, above the floor. With a limit for each vertex, the start
+    would compress a body that hits the floor. Differentiable.
 
     floor: Data of the FloorBarrier [1 | B, 7 planes], or None.  mass: [1 | B, V] [kg].
     """
@@ -842,8 +838,8 @@ def start_on_floor(model: System, begun: Begun, floor: Tensor | None, mass: Tens
 
 
 def _borne(floor: Tensor, x: Tensor, h2a: Tensor, body: Tensor, bodies: int) -> Tensor:
-    """``h2a`` = h^2 a [B, V, 3] without its component into planes within dhat of the body, which bear it. Zero for a body
-    at rest; on a slope, the component along the slope."""
+    """``h2a`` = h^2 a [B, V, 3] without its component into planes within dhat of the body, which bear it. Zero for a
+    body at rest; on a slope, the component along the slope."""
     planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
     normal = planes[:, 0, :, :3]
     with torch.no_grad():

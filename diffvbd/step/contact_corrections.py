@@ -157,7 +157,8 @@ class Trials:
 
     @torch.no_grad()
     def admits(self, x: Tensor, to: Tensor) -> Tensor:
-        """Whether each set may move from x to ``to`` [1, B V, 3], bool [1, sets]; what does not move is at x in both."""
+        """Whether each set may move from x to ``to`` [1, B V, 3], bool [1, sets]; what does not move is at x in
+        both."""
         x, to = (t.reshape(self.scenes.fields.x_prev.shape) for t in (x, to))
         return self._admits(x, to, 0.0)[None, :-1]
 
@@ -188,8 +189,8 @@ class Trials:
         return values[0][self.bodies.of_body[:, :-1]]
 
     def increase(self, x: Tensor, to: Tensor) -> Tensor:
-        """Increase of the potential of each set from x to ``to`` [B, V, 3], and the sizes of its terms [sets + 1, 2]; the
-        last row is of what does not move."""
+        """Increase of the potential of each set from x to ``to`` [B, V, 3], and the sizes of its terms [sets + 1, 2];
+        the last row is of what does not move."""
         rows = self.bodies.number + 1
         own = increase_of_bodies(self.inputs, x, to)
         total = sum_by(own.flatten(0, 1), self.bodies.of_body[:, :-1].reshape(-1), rows)
@@ -221,8 +222,8 @@ def _summed(
 
 
 def connected_rows(one: Tensor, two: Tensor, count: int) -> Tensor:
-    """Smallest row connected with each of ``count`` rows by pairs (one, two) [n]; on CUDA after a fixed number of rounds,
-    enough for all but unusual graphs."""
+    """Smallest row connected with each of ``count`` rows by pairs (one, two) [n]; on CUDA after a fixed number of
+    rounds, enough for all but unusual graphs."""
     least = torch.arange(count, device=one.device)
     for _ in range(2 * count.bit_length()):
         low = torch.minimum(least[one], least[two])
@@ -285,7 +286,8 @@ def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
 
 
 def _slip_stiffness(rate: Tensor, bend: Tensor, n: Tensor, u: Tensor) -> Tensor:
-    """Exact derivative of friction by the tangential motion [..., 3, 3]; rate, bend: results of _slip times the load."""
+    """Exact derivative of friction by the tangential motion [..., 3, 3]; rate, bend: results of _slip times the
+    load."""
     eye = torch.eye(3, dtype=n.dtype, device=n.device)
     return rate[..., None, None] * (eye - outer(n)) + bend[..., None, None] * outer(u)
 
@@ -429,8 +431,8 @@ class Which(NamedTuple):
     alone: bool = False
 
 
-# more(count, moved, groups): bodies of the next correction, after `count` of them, from the results of the last one; None
-# ends them.
+# more(count, moved, groups): bodies of the next correction, after `count` of them, from the results of the last one;
+# None ends them.
 More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
 
 
@@ -440,8 +442,8 @@ def once(*_: Any) -> None:
 
 def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float,
             more: More = once) -> Corrected:  # fmt: skip
-    """State after the rigid correction of every free body, by an admissible step fraction, and after those that ``more``
-    adds. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
+    """State after the rigid correction of every free body, by an admissible step fraction, and after those that
+    ``more`` adds. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
     kept = torch.is_grad_enabled() and any(t.requires_grad for t in fields)
     x, back, *rest = _correct(*fields, model, time_step, friction_eps, more, kept)
@@ -502,8 +504,8 @@ _correct = ops.Differentiable(
 
 
 def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> list[Tensor | None]:
-    """Adjoints of the fields. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint of d: a
-    sum over vertices and pairs."""
+    """Adjoints of the fields. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint of d:
+    a sum over vertices and pairs."""
     f = s.fields
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
     own = ops_rigid.rigid_reverse(f, made, x_bar, s.model._data_count, s.time_step, s.friction_eps,
@@ -645,8 +647,8 @@ class Corrections:
         return _Back.apply(self.cholesky, right).reshape(r.shape).to(r.dtype)
 
     def _differentiable(self, a: Tensor, r: Tensor, presses: list[_Press]) -> Tensor:
-        """a with its derivatives: one more step with the same matrix. Its value, r - A a, is dropped, even where the matrix
-        is nearly singular: the correction that was tried is the one that is made."""
+        """a with its derivatives: one more step with the same matrix. Its value, r - A a, is dropped, even where the
+        matrix is nearly singular: the correction that was tried is the one that is made."""
         pushed = _Product.apply(self.packed, a, self.space)
         displacement = self.space.prolonged(a)
         for press in presses:

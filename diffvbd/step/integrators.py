@@ -33,7 +33,7 @@ from .predict import Begun, begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
 # With these a turn leaves the shape of a body to third order in its angle. The first solve of SDIRK2() goes along
-# tangents, of chord 0, by which no turn could be measured.
+# tangents, of lookback 0, by which no turn could be measured.
 LOOKBACK_OF_BDF2, LOOKBACKS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
 SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
 STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
@@ -215,7 +215,7 @@ def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _over(whole: Prepared, fraction: float, lookback: float) -> Prepared:
-    """The arguments of a solve over a share of the step, along ways of a chord."""
+    """The arguments of a solve over a fraction of the step, with a lookback ratio."""
     numbers = whole.settings.numbers
     numbers = replaced(numbers, time_step=fraction * numbers.time_step, friction_eps=fraction * numbers.friction_eps)
     return replaced(whole, settings=replaced(whole.settings, numbers=numbers), lookback=lookback)
@@ -235,7 +235,8 @@ def _touching(model: System, x: Tensor, v: Tensor, prepared: Prepared, given: di
 
 def _of_euler(model: System, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, fraction: float
               ) -> tuple[Prepared, dict[str, Any]]:  # fmt: skip
-    """Arguments of a solve over a share of the step in which some bodies take all of it. ``euler``: bool [..., V]."""
+    """Arguments of a solve over a fraction of the step in which some bodies take all of it. ``euler``: bool [...,
+    V]."""
     factor = torch.ones_like(x[..., 0]).masked_fill(euler, fraction * fraction)
     mass = prepared.mass * factor.reshape(-1, factor.shape[-1])
     numbers = prepared.settings.numbers
@@ -262,7 +263,7 @@ def _at_end(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _at_fraction(given: dict[str, Any], x: Tensor, fraction: float) -> dict[str, Any]:
-    """Of a solve up to a share of the step, to which what is prescribed moves evenly unless that is given."""
+    """Of a solve up to a fraction of the step, to which what is prescribed moves evenly unless that is given."""
     out = {k: v[0] if k in STAGED and isinstance(v, tuple) else v for k, v in given.items()}
     prescribed, colliders, before = (given[k] for k in ("prescribed", "colliders", "colliders_before"))
     if isinstance(prescribed, Tensor):

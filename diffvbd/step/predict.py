@@ -174,7 +174,7 @@ def _saved(inputs: tuple, made: tuple) -> tuple:
     return *read, *made[2:]
 
 
-# Fields; groups, other_groups, (data_count, time_step, filter_eta, chord, start, filters, parts).
+# Fields; groups, other_groups, (data_count, time_step, filter_eta, lookback, start, filters, parts).
 _begin = ops.Differentiable(
     _run_start, _reverse_start, arguments=_START_FIELDS + 3, inputs=_START_TENSORS, outputs=2, saved=_saved,
     rest=lambda inputs: (inputs[_START_FIELDS], inputs[-1]), vmap=_vmap_start, batched=True,
@@ -194,10 +194,10 @@ def start_of(
         prescribed: Where pinned vertices go [m], [1 | B, V, 3]; None: they stay.
         mass, energy_data, origin, mu, lam: As in ops.SweepFields.  pinned: bool [V].
         rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by choices alone.
-        chord: How far back along its way h v a vertex is taken to have been, over h: 1 where v = (x - x_prev) / h.
-        start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
-        filters: Whether the planes of a floor hold back a start.
-        parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
+        lookback: Distance back along h v at which a vertex counts as having been, over h v: 1 where v = (x - x_prev) /
+        h. start: "auto", "predictor" or "inertia", of the bodies that are not corrected. filters: Whether the planes of
+        a floor hold back a start. parts: Whether bodies that are held back may start vertex by vertex, for which there
+        must be filters.
     """
     # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
     looked_at = mu.detach(), lam.detach(), rest if rest is None else rest.detach()

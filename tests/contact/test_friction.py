@@ -357,7 +357,7 @@ def test_what_does_not_hold_slides() -> None:
 
 @pytest.mark.parametrize("support", ["floor", "plane"])
 def test_the_derivative_of_rest_is_that_of_rest(support: str) -> None:
-    """Some fifty times less than that of the coasting which one Newton step with a bound for friction left."""
+    """Some fifty times less than that of the sliding which one Newton step with a bound for friction left."""
     share = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     speed = pushed(block(support), share, 5, 1e6).v[-1, :, 0].mean()
     (slope,) = torch.autograd.grad(speed, share)

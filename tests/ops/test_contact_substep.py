@@ -175,7 +175,7 @@ def test_how_far_bodies_go_and_who_asks(device: str, own_pairs: bool) -> None:
         torch.tensor(rng.uniform(0.2, 2.0, size=(2, 6)), device=device) for _ in range(2)
     )
     none = c.x.new_empty((0,))
-    limit, displacements, center, trust_radii, deformation_radii = ops_start.rigid_fraction(
+    limit, displacements, center, trust_radii, deformation_radii = ops_start.rigid_moves(
         c.x, move, c.u, c.displacement, body_move, stretch, trust_radius, deformation_radius if own_pairs else none,
         c.bodies,
     )  # fmt: skip
