@@ -167,7 +167,7 @@ def _crossings(seed: int, device: str, batch: int) -> tuple[int, int, int, float
             return crossings, lost, step, float(np.mean(cut or [0.0]))
         crossings += len(dv.contact.intersections(model, x))
         lost += int((~torch.isfinite(x)).sum() + (~torch.isfinite(v)).sum())
-        cut.append(float(np.mean(dv.contact.status(model).cut)) / model.num_vertices)
+        cut.append(float(np.mean(dv.contact.status(model).truncated)) / model.num_vertices)
     return crossings, lost, FUZZ_STEPS, float(np.mean(cut))
 
 

@@ -115,7 +115,7 @@ def march(scene: Scene, steps: int, keep: int = 1, until: Callable[[Tensor], boo
             torch.cuda.synchronize(x.device)
         course.seconds.append(time.perf_counter() - began)
         if scene.model.contact is not None:
-            course.cut.append(sum(dv.contact.status(scene.model).cut) / scene.model.num_vertices)
+            course.cut.append(sum(dv.contact.status(scene.model).truncated) / scene.model.num_vertices)
         course.nonfinite = int((~torch.isfinite(torch.cat([x, v]))).sum())
         if course.nonfinite:
             break

@@ -374,7 +374,7 @@ def grippers(card: Card, scenes: int, steps: int) -> tuple[Row, Work, Work]:
     status = dv.contact.status(model)
     pairs = status.pairs / scenes
     dv.contact.reserve(model, math.ceil(SPARE * pairs))
-    held_up = sum(status.cut) / (scenes * model.num_active)
+    held_up = sum(status.truncated) / (scenes * model.num_active)
     about: dict[str, Any] = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": CLAMPED_SWEEPS,
                              "pairs_per_scene": pairs, "held_up": held_up}  # fmt: skip
     return about, forward, both

@@ -123,7 +123,7 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     return -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
 
 
-def damped_share(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
+def damped_fraction(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """Fraction of its damping that a contact has, from 0 to 1, by its normal force at the start of the step [N]."""
     whole = force + FADE * kappa * dhat
     some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
@@ -145,7 +145,7 @@ def _approach(normal: Tensor, x: Tensor, x_prev: Tensor) -> Tensor:
 
 def _share(before: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """Of its damping that a vertex has which began the step at a gap ``before`` [m]."""
-    return damped_share(-_barrier_slope(before, kappa, dhat), kappa, dhat)
+    return damped_fraction(-_barrier_slope(before, kappa, dhat), kappa, dhat)
 
 
 @dataclass(frozen=True, eq=False)

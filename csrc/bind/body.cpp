@@ -42,7 +42,7 @@ DIFFVBD_OPERATOR(Out<6>, rigid_backward, DIFFVBD_PARAMETERS(RIGID) In x_bar, In 
 
 struct BeginSettings {
   Ints data_count;
-  double time_step, filter_eta, chord;
+  double time_step, filter_eta, lookback;
   int64_t from;
   bool filters;
 };
@@ -52,7 +52,7 @@ int64_t other_bodies(const BeginFields& f) { return f.other_ptr.numel() - 1; }
 // x_start and y: [B, V, 3] that the bodies read and the kernels write.
 template <class T>
 start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, const Tensor& x_start, const Tensor& y,
-                              const Tensor& falls, const Tensor& alone) {
+                              const Tensor& from_predictor, const Tensor& alone) {
   const Reader<T> read(t.x);
   start::Inputs<T> in{};
   in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.energy_data, t.origin, t.order, t.ptr, t.spread, t.other},
@@ -65,7 +65,8 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   in.pinned = read.flags("pinned", t.pinned, v);
   require(q.from >= start::kInertia && q.from <= start::kLower, "diffvbd::begin: expected start 0, 1 or 2");
   in.others = static_cast<int32_t>(other_bodies(t));
-  in.from_predictor = q.from == start::kLower ? read.bytes("falls", falls, b * in.others) : data<const uint8_t>(falls);
+  in.from_predictor = q.from == start::kLower ? read.bytes("from_predictor", from_predictor, b * in.others)
+                                              : data<const uint8_t>(from_predictor);
   require(alone.numel() == 0 || q.filters, "diffvbd::begin: expected filters with alone");
   in.alone = alone.numel() > 0 ? read.bytes("alone", alone, b * corrected_bodies(t)) : nullptr;
   require(!q.filters || (in.bodies.data_count[0] > 0 &&
@@ -74,8 +75,8 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   in.from = static_cast<int>(q.from);
   in.some_alone = t.order.numel() < v;
   in.filters = q.filters;
-  require(q.chord != 0, "diffvbd::begin: expected chord other than 0");
-  in.lookback = q.chord;
+  require(q.lookback != 0, "diffvbd::begin: expected lookback other than 0");
+  in.lookback = q.lookback;
   in.parameters.time_step = T(q.time_step);
   in.parameters.filter_eta = T(q.filter_eta);
   return in;
@@ -112,26 +113,27 @@ void require_states(const BeginFields& f) {
           "diffvbd::begin: expected ptr, tet_ptr, other_ptr and other_tet_ptr int32 [bodies + 1]");
 }
 
-// Predictor and start of the sweeps. chord: as in rigid/coast.h. kind: of the start of bodies that are not corrected, 0
-// x + h v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes,
-// bodies]: with parts, 1 where the vertices of a body that is corrected start each by itself.
+// Predictor and start of the sweeps. lookback: as in sweep/extrapolation.h. kind: of the start of bodies that are not
+// corrected, 0 x + h v, 1 y, 2 the lower potential of the two; from_predictor [scenes, other bodies]: 1 where that is
+// y; alone [scenes, bodies]: with parts, 1 where the vertices of a body that is corrected start each by itself.
 DIFFVBD_OPERATOR(Out<4>, begin, DIFFVBD_PARAMETERS(BEGIN) Ints groups, Ints other_groups, Ints data_count,
-                 double time_step, double filter_eta, double chord, int64_t kind, bool filters, bool parts) {
+                 double time_step, double filter_eta, double lookback, int64_t kind, bool filters, bool parts) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   require_states(f);
   const Device device(x);
-  const BeginSettings settings{data_count, time_step, filter_eta, chord, kind, filters};
+  const BeginSettings settings{data_count, time_step, filter_eta, lookback, kind, filters};
   return dispatch_float(x, [&]<class T>(T) {
     const bool chooses = kind == start::kLower && other_bodies(f) > 0, may_part = parts && corrected_bodies(f) > 0;
     const Tensor x_start = device.like_x(), y = device.like_x();
     const Tensor from_y = chooses && filters ? device.like_x() : y, apart = may_part ? device.like_x() : y;
-    const Tensor falls = device.empty({kind == start::kLower ? x.size(0) : 0, other_bodies(f)}, ScalarType::Byte);
+    const Tensor from_predictor =
+        device.empty({kind == start::kLower ? x.size(0) : 0, other_bodies(f)}, ScalarType::Byte);
     const Tensor alone = device.empty({parts ? x.size(0) : 0, corrected_bodies(f)}, ScalarType::Byte);
-    const auto in = begin_inputs<T>(f, settings, x_start, y, falls, alone);
+    const auto in = begin_inputs<T>(f, settings, x_start, y, from_predictor, alone);
     start::Candidates<T> two{}, parting{};
     if (chooses) two = candidates<T>(f, settings, false, x_start, from_y, y);
     if (may_part) parting = candidates<T>(f, settings, true, x_start, apart, y);
-    const StartChoice<T> of_others{chooses ? &two : nullptr, data<T>(from_y), data_or_null<uint8_t>(falls)};
+    const StartChoice<T> of_others{chooses ? &two : nullptr, data<T>(from_y), data_or_null<uint8_t>(from_predictor)};
     const StartChoice<T> of_corrected{may_part ? &parting : nullptr, data<T>(apart), data_or_null<uint8_t>(alone)};
 #ifdef USE_CUDA
     const Teams teams(groups, in.bodies.bodies, device, x), others(other_groups, other_bodies(f), device, x);
@@ -140,24 +142,24 @@ DIFFVBD_OPERATOR(Out<4>, begin, DIFFVBD_PARAMETERS(BEGIN) Ints groups, Ints othe
 #else
     diffvbd::begin<T>(in, of_corrected, of_others, data<T>(x_start), data<T>(y));
 #endif
-    return Out<4>(x_start, y, falls, alone);
+    return Out<4>(x_start, y, from_predictor, alone);
   });
 }
 
 // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes by
 // vertex [scenes, vertices, scalars of the planes].
-DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_bar, In y_bar, In falls, In alone,
-                 Ints groups, Ints data_count, double time_step, double filter_eta, double chord, int64_t kind,
-                 bool filters, Flags wants) {
+DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_bar, In y_bar, In from_predictor,
+                 In alone, Ints groups, Ints data_count, double time_step, double filter_eta, double lookback,
+                 int64_t kind, bool filters, Flags wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   require_states(f);
   require(wants.size() == 3, "diffvbd::begin_backward: expected 3 wishes");
   const Device device(x);
-  const BeginSettings settings{data_count, time_step, filter_eta, chord, kind, filters};
+  const BeginSettings settings{data_count, time_step, filter_eta, lookback, kind, filters};
   return dispatch_float(x, [&]<class T>(T) {
     // where the bodies that are corrected coast to, and their predictor, once more
-    const Tensor coasted = order.numel() > 0 ? device.like_x() : x, y = order.numel() > 0 ? device.like_x() : x;
-    const auto in = begin_inputs<T>(f, settings, coasted, y, falls, alone);
+    const Tensor extrapolated = order.numel() > 0 ? device.like_x() : x, y = order.numel() > 0 ? device.like_x() : x;
+    const auto in = begin_inputs<T>(f, settings, extrapolated, y, from_predictor, alone);
     const Reader<T> read(x);
     const int64_t b = read.b, v_ = read.v;
     const auto [of_scene, of_vertex] = scalars_of_data(in.bodies.data_count);
@@ -176,18 +178,19 @@ DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_ba
     a.x_prev = data_or_null<T>(x_prev_out);
     a.shared_count = static_cast<int32_t>(of_scene), a.own_count = static_cast<int32_t>(of_vertex);
     DIFFVBD_ON_CUDA(const Teams teams(groups, in.bodies.bodies, device, x);)
-    DIFFVBD_RUN(device, begin_backward<T>, in, DIFFVBD_ON_CUDA(teams.groups, ) a, data<T>(coasted),
+    DIFFVBD_RUN(device, begin_backward<T>, in, DIFFVBD_ON_CUDA(teams.groups, ) a, data<T>(extrapolated),
                 data<T>(y) DIFFVBD_ON_CUDA(, teams.work()));
     return Out<8>(x_out, v_out, acceleration_out, prescribed_out, mass_out, shared, own, planes);
   });
 }
 
-// By how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms [scenes, bodies,
-// 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by body; material [1 |
+// Increase of the potential of each body from x to `to`, and the sum of the sizes of its terms [scenes, bodies, 2],
+// float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by body; material [1 |
 // scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex) [blocks, 4, lanes] of
 // their tets, in blocks by body.
-DIFFVBD_OPERATOR(Tensor, potential_rise, In x, In to, In x_prev, In y, In mass, In energy_data, In origin, In material,
-                 In rest, In order, In ptr, In other, In corner, In block_ptr, Ints data_count, double time_step) {
+DIFFVBD_OPERATOR(Tensor, potential_increase, In x, In to, In x_prev, In y, In mass, In energy_data, In origin,
+                 In material, In rest, In order, In ptr, In other, In corner, In block_ptr, Ints data_count,
+                 double time_step) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -202,7 +205,7 @@ DIFFVBD_OPERATOR(Tensor, potential_rise, In x, In to, In x_prev, In y, In mass, 
     in.material = read.batch("material", material, blocks * kTetScalars * coarse::kBlockTets);
     in.blocks = blocks, in.listed = order.numel();
 #ifndef USE_CUDA
-    require(in.bodies.ptr[bodies] <= in.listed, "diffvbd::potential_rise: expected order with all vertices of ptr");
+    require(in.bodies.ptr[bodies] <= in.listed, "diffvbd::potential_increase: expected order with all vertices of ptr");
 #endif
     const Tensor out = device.empty({read.b, bodies, 2}, ScalarType::Double);
     DIFFVBD_ON_CUDA(const Tensor work = device.empty({cuda::energy_increase_workspace(in)}, ScalarType::Double);)

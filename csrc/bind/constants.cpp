@@ -52,7 +52,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"roundings", static_cast<int64_t>(kRounding)},  // ulps of the terms by which a potential may rise
   };
   for (const auto& [name, value] : numbers) add("int", name, std::to_string(value));
-  add("float", "decrease", std::to_string(coarse::kDecrease));              // share of what a slope promises
+  add("float", "decrease", std::to_string(coarse::kDecrease));              // fraction of the decrease to first order
   add("float", "resting_motion", std::to_string(contact::kRestingMotion));  // of that below which friction is smoothed
   add("bool", "tet_reads_x_prev", TetLayout::reads_x_prev ? "True" : "False");
   add("str", "sweep_adjoints", "\"" DIFFVBD_SWEEP_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");

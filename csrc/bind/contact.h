@@ -1,4 +1,4 @@
-// Lists of pairs, bodies and planes, as the entries of contact take them.
+// Lists of pairs, bodies and planes, as the operators of contact take them.
 #pragma once
 
 #include "../contact/friction.h"

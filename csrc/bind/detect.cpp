@@ -8,12 +8,12 @@
 namespace diffvbd {
 namespace {
 
-// What a search reads of surfaces; with room and own_room also how far it looks.
+// Surfaces, as a search reads them; trust_radius and deformation_radius set the search distance.
 template <class T>
 contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Tensor& collider,
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
                                  const Tensor& triangles, const Tensor& edges, const Tensor& points,
-                                 const Tensor& planes, const Tensor& body, const Tensor& held, int64_t mesh_bodies,
+                                 const Tensor& planes, const Tensor& body, const Tensor& pinned, int64_t mesh_bodies,
                                  bool self_contact, bool between_bodies) {
   const Reader<T> read(x);
   const int64_t b = read.b, n = body.numel();
@@ -33,7 +33,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.edges = primitives("edges", edges, 2, out.num_edges);
   out.points = primitives("points", points, 1, out.num_points);
   out.planes = primitives("planes", planes, 3, out.num_planes);
-  out.body = read.index("body", body, n), out.pinned = read.flags("held", held, n);
+  out.body = read.index("body", body, n), out.pinned = read.flags("pinned", pinned, n);
   require(b * n + 1 <= std::numeric_limits<int32_t>::max(),
           "contact: too large, expected at most 2^31 corner points in all scenes");
   out.scenes = b;
@@ -50,22 +50,22 @@ void require_capacity(int64_t capacity) {
           "contact: expected 0 <= capacity < 2^29");
 }
 
-// Results as in contact/candidates.h. mesh_bodies: body labels from there on are colliders; room [scenes, mesh_bodies +
+// Results as in contact/detection.h. mesh_bodies: body labels from there on are colliders; radii [scenes, mesh_bodies +
 // 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
 // many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
 DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,
-                 In triangles, In edges, In points, In planes, In body, In held, In room, In own_room,
-                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat, int64_t capacity,
-                 bool trim) {
+                 In triangles, In edges, In points, In planes, In body, In pinned, In trust_radius,
+                 In deformation_radius, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
+                 int64_t capacity, bool trim) {
   const Device device(x);
   require_capacity(capacity);
   return dispatch_float(x, [&]<class T>(T) {
     auto in = surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body,
-                             held, mesh_bodies, self_contact, between_bodies);
+                             pinned, mesh_bodies, self_contact, between_bodies);
     require(std::isfinite(dhat), "contact: expected a finite dhat");
     const Reader<T> read(x);
-    in.trust_radius = read.like("room", room, read.b * (in.mesh_bodies + int64_t{1}));
-    in.deformation_radius = read.like("own_room", own_room, read.b * (in.mesh_bodies + int64_t{1}));
+    in.trust_radius = read.like("trust_radius", trust_radius, read.b * (in.mesh_bodies + int64_t{1}));
+    in.deformation_radius = read.like("deformation_radius", deformation_radius, read.b * (in.mesh_bodies + int64_t{1}));
     in.dhat = static_cast<T>(dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor near_corners = device.empty({b, n, contact::kNearRow}, ScalarType::Int);
@@ -97,13 +97,13 @@ DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collid
 
 // Results as in contact/intersect.h.
 DIFFVBD_OPERATOR(Out<3>, contact_intersections, In x, In origin, In collider, In rest, In radius, In triangles,
-                 In edges, In points, In planes, In body, In held, int64_t mesh_bodies, bool self_contact,
+                 In edges, In points, In planes, In body, In pinned, int64_t mesh_bodies, bool self_contact,
                  bool between_bodies, int64_t capacity) {
   const Device device(x);
   require_capacity(capacity);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points, planes, body,
-                                   held, mesh_bodies, self_contact, between_bodies);
+                                   pinned, mesh_bodies, self_contact, between_bodies);
     Tensor pairs = device.empty({capacity, contact::kCrossingRow}, ScalarType::Int);
     Tensor first = device.empty({in.scenes, 2, 2}, ScalarType::Int);
     Tensor counts = device.empty({in.scenes, 2}, ScalarType::Long);

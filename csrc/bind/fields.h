@@ -19,7 +19,7 @@
   ADJOINT(energy_data) INDEX(origin) \
   ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
   INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
-  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(room) \
+  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(trust_radius) \
   ADJOINT(corners_prev) \
   ADJOINT(coarse_factor) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
 
@@ -40,13 +40,13 @@
   INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other)
 
 // The rigid correction of bodies that touch (contact/rigid.h): vertices by body; free [bodies] bool: nothing of it is
-// pinned; held and body of all corner points; contact as of the sweeps.
+// pinned; pinned and body of all corner points; contact as of the sweeps.
 #define DIFFVBD_TOUCHING_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x) ADJOINT(x_prev) ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
-  INDEX(order) INDEX(ptr) INDEX(free) INDEX(held) INDEX(body) \
+  INDEX(order) INDEX(ptr) INDEX(free) INDEX(pinned) INDEX(body) \
   ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
   INDEX(pairs) INDEX(constants) INDEX(pair_ptr) INDEX(pair_entry) \
-  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(room)
+  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(trust_radius)
 
 // The beginning of a step (start/begin.h): as of the correction, and the other bodies. other [vertices]: which of them
 // a vertex is in, -1: none, -2: it is corrected; tets, other_tets [listed, 5]: a tet and its corners; rest [1 | scenes,

@@ -9,7 +9,7 @@ namespace {
 
 template <class T>
 contact::MotionInputs<T> motion_inputs(const Tensor& x, const Tensor& origin, const Tensor& mass, const Tensor& move,
-                                       const Tensor& held, const Tensor& order, const Tensor& ptr) {
+                                       const Tensor& pinned, const Tensor& order, const Tensor& ptr) {
   const Reader<T> read(x);
   require(read.b * read.v <= std::numeric_limits<int32_t>::max(),
           "diffvbd::contact_motion: too large, expected at most 2^31 vertices in all scenes");
@@ -18,41 +18,41 @@ contact::MotionInputs<T> motion_inputs(const Tensor& x, const Tensor& origin, co
   in.x = read.positions(), in.move = read.vectors("move", move);
   in.origin = read.batch_or_null("origin", origin, 3 * read.v);
   in.mass = read.batch("mass", mass, read.v);
-  in.pinned = read.flags("held", held, read.v, true);
+  in.pinned = read.flags("pinned", pinned, read.v, true);
   return in;
 }
 
-// What of the ways that vertices want to go is a rigid motion of each body [B, V, 3]; the longest ways [5, B, bodies]
-// and the sums [B, bodies, 4] of contact/motion.h. origin and fall may be empty.
-DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In fall, In held, In held_bodies, In order,
-                 In ptr) {
+// Rigid motion of each body [B, V, 3] in the wanted displacements; the longest displacements [5, B, bodies] and the
+// sums [B, bodies, 4] of contact/motion.h. origin and gravity_move may be empty.
+DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In gravity_move, In pinned,
+                 In pinned_bodies, In order, In ptr) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
-    in.pinned_bodies = Reader<T>(x).flags("held_bodies", held_bodies, in.bodies);
-    in.gravity_move = Reader<T>(x).vectors_or_null("fall", fall);
-    Tensor rigid = device.like_x(), ways = device.empty({contact::kDisplacements, in.scenes, in.bodies});
+    auto in = motion_inputs<T>(x, origin, mass, move, pinned, order, ptr);
+    in.pinned_bodies = Reader<T>(x).flags("pinned_bodies", pinned_bodies, in.bodies);
+    in.gravity_move = Reader<T>(x).vectors_or_null("gravity_move", gravity_move);
+    Tensor rigid = device.like_x(), displacements = device.empty({contact::kDisplacements, in.scenes, in.bodies});
     Tensor sums = device.empty({in.scenes, in.bodies, 4});
-    DIFFVBD_RUN(device, find_motion<T>, in, data<T>(rigid), data<T>(ways), data<T>(sums));
-    return Out<3>(rigid, ways, sums);
+    DIFFVBD_RUN(device, find_motion<T>, in, data<T>(rigid), data<T>(displacements), data<T>(sums));
+    return Out<3>(rigid, displacements, sums);
   });
 }
 // Islands of bodies [B, bodies] int32, their translations [B, bodies, 3], trust-region and deformation radii [B,
 // bodies + 1] and how far bodies want to move over the largest radius [B, bodies], see contact/trust_region.h. held
 // [N]; floor: planes in the data of FloorBarrier, or empty.
-DIFFVBD_OPERATOR(Out<5>, contact_rooms, In x, In origin, In mass, In move, In held, In order, In ptr, In ways, In sums,
+DIFFVBD_OPERATOR(Out<5>, contact_trust_radii, In x, In origin, In mass, In move, In pinned, In order, In ptr, In displacements, In sums,
                  In floor, In collider, In collider_next, In planes, In body, In radius, In most, In most_alone,
-                 In most_own, In least_own, double dhat, double share, double least, bool self_contact) {
+                 In most_own, In least_own, double dhat, double fraction, double least, bool self_contact) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     contact::RadiusInputs<T> in{};
-    in.motion = motion_inputs<T>(x, origin, mass, move, held, order, ptr);
+    in.motion = motion_inputs<T>(x, origin, mass, move, pinned, order, ptr);
     const int64_t b = read.b, bodies = in.motion.bodies, rows = b * bodies, n = body.numel(), colliders = n - read.v;
     require(read.v <= n && b * n <= std::numeric_limits<int32_t>::max(),
             "contact: expected body of shape [N], N >= vertices, and at most 2^31 corner points in all scenes");
     const Tensor island = device.empty({b, bodies}, ScalarType::Int), u = device.empty({b, bodies, 3}),
-                 room = device.empty({b, bodies + 1}), own_room = device.empty({b, bodies + 1}),
+                 trust_radius = device.empty({b, bodies + 1}), deformation_radius = device.empty({b, bodies + 1}),
                  over = device.empty({b, bodies}), memory = device.empty({b * (1 + bodies)});
     contact::IslandInputs<T>& of = in.islands;
     of.x = in.motion.x, of.move = in.motion.move, of.origin = read.vectors_or_null("origin", origin);
@@ -61,46 +61,47 @@ DIFFVBD_OPERATOR(Out<5>, contact_rooms, In x, In origin, In mass, In move, In he
     of.collider_next = read.like("collider_next", collider_next, 3 * b * colliders);
     of.planes = read.index("planes", planes, 3 * planes.size(0)), of.body = read.index("body", body, n);
     of.body_order = in.motion.order, of.body_ptr = in.motion.ptr;
-    of.pinned = read.flags("held", held, n), of.radius = read.like("radius", radius, n);
+    of.pinned = read.flags("pinned", pinned, n), of.radius = read.like("radius", radius, n);
     of.scenes = b, of.vertices = in.motion.vertices, of.corners = static_cast<int32_t>(n);
     of.num_planes = static_cast<int32_t>(planes.size(0)), of.mesh_bodies = in.motion.bodies;
     of.half = static_cast<T>(dhat / 2), of.floor = floor_of(read, floor), of.floor_planes = planes_of(floor);
-    in.displacements = read.like("ways", ways, contact::kDisplacements * rows),
+    in.displacements = read.like("displacements", displacements, contact::kDisplacements * rows),
     in.sums = read.like("sums", sums, 4 * rows);
     in.most = read.like("most", most, bodies), in.most_alone = read.like("most_alone", most_alone, bodies);
     in.most_own = read.like("most_own", most_own, bodies), in.least_own = read.like("least_own", least_own, bodies);
-    in.fraction = static_cast<T>(share), in.least = static_cast<T>(least);
+    in.fraction = static_cast<T>(fraction), in.least = static_cast<T>(least);
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
     contact::RadiusWork<T> work{};
     work.pushed = data<T>(memory), work.most = work.pushed + b;
     work.island = data<int32_t>(island), work.u = data<T>(u), work.over = data<T>(over);
-    work.trust_radius = data<T>(room), work.deformation_radius = data<T>(own_room);
+    work.trust_radius = data<T>(trust_radius), work.deformation_radius = data<T>(deformation_radius);
     DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(of));)
     DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
-    return Out<5>(island, u, room, own_room, over);
+    return Out<5>(island, u, trust_radius, deformation_radius, over);
   });
 }
 
-// How far sweeps may carry each vertex [scenes, vertices], see contact/sweep_rooms.h; own_center and own_room may be
-// empty. more: factor of what sweeps take back; least: what they are given beside that [m].
-DIFFVBD_OPERATOR(Tensor, contact_sweep_rooms, In x, In start, In begin, In move, In fall, In apart, In stretched,
-                 In center, In room, In own_center, In own_room, In held, In body_order, In body_ptr, double more,
-                 double least) {
+// Trust-region radii of the sweeps [scenes, vertices], see contact/trust_region.h; deformation_center and
+// deformation_radius may be empty. more: factor of the truncated displacement and the stretch; least: smallest radius
+// [m].
+DIFFVBD_OPERATOR(Tensor, contact_sweep_radii, In x, In start, In begin, In move, In gravity_move, In apart,
+                 In stretched, In center, In trust_radius, In deformation_center, In deformation_radius, In pinned,
+                 In body_order, In body_ptr, double more, double least) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     contact::SweepRadiusInputs<T> in{};
     read.by_body(in, body_order, body_ptr);
     in.x = read.positions(), in.start = read.vectors("start", start), in.begin = read.vectors("begin", begin);
-    in.move = read.vectors("move", move), in.gravity_move = read.vectors("fall", fall);
+    in.move = read.vectors("move", move), in.gravity_move = read.vectors("gravity_move", gravity_move);
     in.apart = read.like("apart", apart, in.scenes * in.bodies);
     in.stretched = read.like("stretched", stretched, in.scenes * in.bodies);
-    in.center = read.vectors("center", center), in.trust_radius = read.of_vertices("room", room);
-    if (own_room.numel() > 0) {
-      in.deformation_center = read.vectors("own_center", own_center),
-      in.deformation_radius = read.of_vertices("own_room", own_room);
+    in.center = read.vectors("center", center), in.trust_radius = read.of_vertices("trust_radius", trust_radius);
+    if (deformation_radius.numel() > 0) {
+      in.deformation_center = read.vectors("deformation_center", deformation_center),
+      in.deformation_radius = read.of_vertices("deformation_radius", deformation_radius);
     }
-    in.pinned = read.flags("held", held, read.v, true);
+    in.pinned = read.flags("pinned", pinned, read.v, true);
     in.more = static_cast<T>(more), in.least = static_cast<T>(least);
     Tensor out = device.empty({in.scenes, in.vertices});
     const Tensor wishes = device.empty({in.scenes, in.bodies}), most = device.empty({in.scenes});

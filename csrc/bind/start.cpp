@@ -13,7 +13,7 @@ namespace {
 // prescribed motion brings too close. center: positions at which gaps were taken, less u. unit [vertices]: the vertex
 // whose fraction each has.
 DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In origin, In collider, In collider_next,
-                 In held, In body, In unit, In pairs, In constants, In ptr, In entry, bool careful) {
+                 In pinned, In body, In unit, In pairs, In constants, In ptr, In entry, bool careful) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -24,7 +24,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
     in.center = read.vectors("center", center), in.origin = read.vectors_or_null("origin", origin);
     in.collider = read.like("collider", collider, 3 * b * (corners - v));
     in.collider_next = read.like("collider_next", collider_next, 3 * b * (corners - v));
-    in.pinned = read.flags("held", held, corners), in.body = read.index("body", body, corners);
+    in.pinned = read.flags("pinned", pinned, corners), in.body = read.index("body", body, corners);
     in.unit_of = read.index("unit", unit, v);
     in.listed = pair_list(pairs, ptr, entry, x, b * corners);
     in.constants = pair_constants<T>(constants, pairs, x);
@@ -32,23 +32,23 @@ DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In ori
     in.vertices = static_cast<int32_t>(v), in.corners = static_cast<int32_t>(corners);
     in.bodies = static_cast<int32_t>(u.size(1));
     in.units_of_scene = in.vertices, in.careful = careful;
-    Tensor share = device.empty({b, v}), stuck = device.empty({1}, ScalarType::Long);
+    Tensor fraction = device.empty({b, v}), infeasible = device.empty({1}, ScalarType::Long);
 #ifdef USE_CUDA
     const Tensor work = device.bytes(cuda::advance_workspace_bytes<T>(in, pairs.size(0)));
-    DIFFVBD_RUN(device, advance<T>, in, pairs.size(0), data<T>(share), data<int64_t>(stuck), work.data_ptr(),
+    DIFFVBD_RUN(device, advance<T>, in, pairs.size(0), data<T>(fraction), data<int64_t>(infeasible), work.data_ptr(),
                 device.attribute(cudaDevAttrMultiProcessorCount));
 #else
-    *data<int64_t>(stuck) = advance<T>(in, data<T>(share));
+    *data<int64_t>(infeasible) = advance<T>(in, data<T>(fraction));
 #endif
-    return Out<2>(share, stuck);
+    return Out<2>(fraction, infeasible);
   });
 }
 
-// --- lists of pairs
-// ---------------------------------------------------------------------------------------------------
+// --- lists of pairs --------------------------------------------------------------------------------------------------
 
-// constants with the gaps of the pairs where the vertices are now, see contact/narrow.h.
-DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, In pairs, In constants, In ptr) {
+// constants with the current gaps of the pairs, see contact/pair_list.h.
+DIFFVBD_OPERATOR(Tensor, contact_refresh_gaps, In x, In origin, In collider, In trust_radius, In pairs, In constants,
+                 In ptr) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -56,7 +56,7 @@ DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, 
     contact::GapInputs<T> in{};
     in.x = read.positions(), in.origin = read.vectors_or_null("origin", origin);
     in.collider = read.like("collider", collider, 3 * read.b * colliders),
-    in.trust_radius = read.of_vertices("room", room);
+    in.trust_radius = read.of_vertices("trust_radius", trust_radius);
     in.pairs = read.index("pairs", pairs, pairs.size(0) * contact::kPairRow);
     read.index("ptr", ptr, read.b * (read.v + colliders) + 1);
     in.constants = pair_constants<T>(constants, pairs, x);
@@ -67,9 +67,9 @@ DIFFVBD_OPERATOR(Tensor, contact_narrow, In x, In origin, In collider, In room, 
   });
 }
 
-// The pairs of a list that `keep` names, and which they are (contact/keep.h); exact: in lists as long as they are many,
-// on the CPU, else in room for all, with -1 where there is none.
-DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, In entry, bool exact) {
+// Compact list of the pairs that `keep` selects, and their indices (contact/pair_list.h); exact: of their number, on
+// the CPU; else as long as the whole list, with -1 in empty rows.
+DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In ptr, In entry, bool exact) {
   const Device device(constants);
   return dispatch_float(constants, [&]<class T>(T) {
     const contact::PairList all = pair_list(pairs, ptr, entry, constants, ptr.numel() - 1);
@@ -80,11 +80,11 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
                                        pair_constants<T>(constants, pairs, constants),
                                        pairs.size(0),
                                        ptr.numel() - 1};
-    require(in.corners >= 0, "diffvbd::contact_keep: expected pairs made by contact_detect");
+    require(in.corners >= 0, "diffvbd::contact_compact: expected pairs made by contact_detect");
     int64_t capacity = in.count;
 #ifndef USE_CUDA
     require(std::is_sorted(in.ptr, in.ptr + ptr.numel()) && *in.ptr >= 0 && in.ptr[in.corners] <= entry.numel(),
-            "diffvbd::contact_keep: expected ptr that ascends up to the number of entries");
+            "diffvbd::contact_compact: expected ptr that ascends up to the number of entries");
     std::vector<int32_t> kept(in.count + 1);
     for (int64_t i = 0; i < in.count; ++i) kept[i + 1] = kept[i] + contact::stays(in, i);
     if (exact) capacity = kept.back();
@@ -115,11 +115,10 @@ DIFFVBD_OPERATOR(Out<5>, contact_keep, In keep, In pairs, In constants, In ptr, 
   });
 }
 
-// --- what sweeps keep of the start of a step
-// --------------------------------------------------------------------------
+// --- lagged values ---------------------------------------------------------------------------------------------------
 
-// Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of where corner points are
-// [B, N, 3] and of kappa.
+// Normal force, 1 where active, normal and weights of each pair [pairs, 9]; the adjoint: of corner points [B, N, 3] and
+// of kappa.
 DIFFVBD_OPERATOR(Tensor, contact_lag, In x, In origin, In collider, In kappa, In pairs, In constants, In ptr,
                  In entry) {
   const Device device(x);
@@ -153,8 +152,8 @@ contact::LagCoefficients<T> lag_coefficients(const Tensor& friction, const Tenso
 
 // Friction, damping, normal and weights of each pair [pairs, 9], by the coefficients of its scene, which may be empty,
 // and the forces of pairs on corner points [B, N, 3]; the adjoint, of which either bar may be empty.
-DIFFVBD_OPERATOR(Out<2>, contact_rubbing, In x, In origin, In collider, In kappa, In friction, In damping, In pairs,
-                 In constants, In ptr, In entry) {
+DIFFVBD_OPERATOR(Out<2>, contact_friction_lag, In x, In origin, In collider, In kappa, In friction, In damping,
+                 In pairs, In constants, In ptr, In entry) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
@@ -166,7 +165,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_rubbing, In x, In origin, In collider, In kappa
     return Out<2>(lag, push);
   });
 }
-DIFFVBD_OPERATOR(Out<4>, contact_rubbing_backward, In lag_bar, In push_bar, In x, In origin, In collider, In kappa,
+DIFFVBD_OPERATOR(Out<4>, contact_friction_lag_backward, In lag_bar, In push_bar, In x, In origin, In collider, In kappa,
                  In friction, In damping, In pairs, In constants, In ptr, In entry) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {

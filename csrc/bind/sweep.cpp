@@ -56,7 +56,7 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
     in.planes = static_cast<int>(t.floor_lag.numel() / t.floor_lag.size(0) / (read.v * contact::kFloorLag));
     in.floor_lag = read.batch("floor_lag", t.floor_lag, read.v * in.planes * contact::kFloorLag);
   }
-  in.center = read.vectors("center", t.center), in.trust_radius = read.of_vertices("room", t.room);
+  in.center = read.vectors("center", t.center), in.trust_radius = read.of_vertices("trust_radius", t.trust_radius);
   in.x_prev = step.x_prev;
   in.friction_eps = static_cast<T>(friction_eps);
   return in;
@@ -148,7 +148,7 @@ struct Given {
     return {in.scenes, in.sweeps, rows, active};
   }
   // Exponents of limits, of no scenes without contact.
-  std::vector<int64_t> cut_shape(int64_t vertices) const {
+  std::vector<int64_t> truncations_shape(int64_t vertices) const {
     return {in.contact ? in.scenes : 0, int64_t{in.sweeps}, vertices};
   }
 
@@ -246,9 +246,9 @@ void run_reverse(const Device& device, const HostPlan& host, const StepInputs<T>
 
 #endif
 
-// Where the sweeps end, the tape; cut [scenes, sweeps, vertices]: exponents of limits (contact/limit.h), no scenes
-// without contact; corrections [scenes, corrections, 3 functions + bodies]: what coarse corrections have done, empty
-// without them.
+// Where the sweeps end, the tape; truncations [scenes, sweeps, vertices]: exponents of limits (contact/limit.h), no
+// scenes without contact; corrections [scenes, corrections, 3 functions + bodies]: what coarse corrections have done,
+// empty without them.
 DIFFVBD_OPERATOR(Out<4>, sweep, DIFFVBD_PARAMETERS(SWEEP) DIFFVBD_SETTINGS, int64_t debug_step, bool checked) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q DIFFVBD_SETTINGS_ITEMS;
@@ -263,18 +263,18 @@ DIFFVBD_OPERATOR(Out<4>, sweep, DIFFVBD_PARAMETERS(SWEEP) DIFFVBD_SETTINGS, int6
 #endif
     const int64_t v = view_of(host).num_vertices;
     Tensor x = device.empty({in.scenes, v, 3}), tape = device.empty(given.tape_shape(host, launch));
-    const Tensor cut = device.zeros(given.cut_shape(v), ScalarType::Byte);
+    const Tensor truncations = device.zeros(given.truncations_shape(v), ScalarType::Byte);
     Tensor corrections = device.empty(given.corrections_shape());
     given.coarse.tape = data<T>(corrections);
 #ifdef USE_CUDA
     cuda::Choice choice = choose(in, device, launch, false);
     const Tensor work = workspace<T>(device, host, in, nullptr, choice);
-    const cuda::StepOutputs<T> out{data<T>(x), nullptr, data<T>(tape), data<uint8_t>(cut)};
+    const cuda::StepOutputs<T> out{data<T>(x), nullptr, data<T>(tape), data<uint8_t>(truncations)};
     DIFFVBD_RUN(device, run_forward<T>, host, in, out, choice, work.data_ptr());
 #else
-    run_forward<T>(host, in, data<T>(x), data<T>(tape), data<uint8_t>(cut));
+    run_forward<T>(host, in, data<T>(x), data<T>(tape), data<uint8_t>(truncations));
 #endif
-    return Out<4>(x, tape, cut, corrections);
+    return Out<4>(x, tape, truncations, corrections);
   });
 }
 
@@ -356,7 +356,7 @@ struct ContactSlots {
 
 // x: the end of the sweeps; wants: material, mass, rest, energy_data, coarse_factor.
 DIFFVBD_OPERATOR(decltype(std::declval<SweepBars>().tensors()), sweep_backward, DIFFVBD_PARAMETERS(SWEEP) In x_bar,
-                 In x, In tape, In corrections, In cut, DIFFVBD_SETTINGS, Flags wants) {
+                 In x, In tape, In corrections, In truncations, DIFFVBD_SETTINGS, Flags wants) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q DIFFVBD_SETTINGS_ITEMS;
   const Device device(x);
@@ -370,7 +370,7 @@ DIFFVBD_OPERATOR(decltype(std::declval<SweepBars>().tensors()), sweep_backward, 
     const int64_t v = read.v, b = read.b, tets = view_of(host).num_tets;
     const T* x_bars = read.vectors("x_bar", x_bar);
     const T* taped = read.like("tape", tape, product(given.tape_shape(host, launch)));
-    const uint8_t* limits = in.contact ? read.bytes("cut", cut, b * in.sweeps * v) : nullptr;
+    const uint8_t* limits = in.contact ? read.bytes("truncations", truncations, b * in.sweeps * v) : nullptr;
     read.like("corrections", corrections, product(given.corrections_shape()));
     DIFFVBD_ON_CUDA(require(tape.size(0) == given.tape_shape(host, launch)[0], "tape: expected that of this step");)
 #ifndef USE_CUDA

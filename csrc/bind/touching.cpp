@@ -27,10 +27,10 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
   contact::AdvanceInputs<T>& gate = in.gate;
   gate.x = read.positions(), gate.move = move;
   gate.origin = in.scene.origin.data;
-  gate.center = read.vectors("center", t.center), gate.trust_radius = read.of_vertices("room", t.room);
+  gate.center = read.vectors("center", t.center), gate.trust_radius = read.of_vertices("trust_radius", t.trust_radius);
   gate.collider = gate.collider_next = read.like("collider", t.collider, 3 * b * colliders);
   in.collider_prev = read.like("collider_prev", t.collider_prev, 3 * b * colliders);
-  gate.pinned = read.flags("held", t.held, corners), gate.body = read.index("body", t.body, corners);
+  gate.pinned = read.flags("pinned", t.pinned, corners), gate.body = read.index("body", t.body, corners);
   gate.listed = pair_list(t.pairs, t.pair_ptr, t.pair_entry, t.x, b * corners);
   gate.constants = pair_constants<T>(t.constants, t.pairs, t.x);
   gate.scenes = b;
@@ -98,29 +98,30 @@ DIFFVBD_OPERATOR(Out<4>, contact_rigid_system, DIFFVBD_PARAMETERS(TOUCHING) Ints
   });
 }
 
-// The state after each body has taken what it may of its motion [scenes, bodies, 6]; that share [scenes, bodies], zero
-// of what does not move beside a mask `moving`; whether it has a motion; whether it was held up where others that were
-// have gone on; and how much of its shift is left [m].
+// The state after the admissible fraction of each motion [scenes, bodies, 6]; that fraction [scenes, bodies], with a
+// mask `moving` zero where a body has no motion; whether it has a motion; whether it was blocked, in a scene where some
+// blocked body has moved on; and the translation that it did not take [m].
 DIFFVBD_OPERATOR(Out<5>, contact_rigid_move, DIFFVBD_PARAMETERS(TOUCHING) In centers, In motion, Ints data_count,
                  double time_step, double friction_eps, In moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    const Tensor way = device.like_x(), none = device.empty({0});
-    auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, data_or_null<T>(way), none);
+    const Tensor displacement = device.like_x(), none = device.empty({0});
+    auto in = touching_inputs<T>(f, {data_count, time_step, friction_eps}, data_or_null<T>(displacement), none);
     set_moving(in, moving, false, x);
     const int64_t b = read.b, n = in.bodies();
     const double *center = read.doubles("centers", centers, 3 * b * n),
                  *motions = read.doubles("motion", motion, contact::kUnknowns * b * n);
-    const Tensor end = device.like_x(), share = device.empty({b, n}, ScalarType::Double),
-                 moved = device.empty({b, n}, ScalarType::Bool), held_up = device.empty({b, n}, ScalarType::Bool),
-                 left = device.empty({b, n});
-    const contact::RigidOutcome<T> out{data<double>(share), data<bool>(moved), data<bool>(held_up), data<T>(left)};
+    const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double),
+                 moved = device.empty({b, n}, ScalarType::Bool), blocked = device.empty({b, n}, ScalarType::Bool),
+                 remaining = device.empty({b, n});
+    const contact::RigidOutcome<T> out{data<double>(fraction), data<bool>(moved), data<bool>(blocked),
+                                       data<T>(remaining)};
     DIFFVBD_ON_CUDA(const Tensor work = device.bytes(cuda::rigid_move_bytes(in, trust_radius_of(f)));)
-    DIFFVBD_RUN(device, rigid_move<T>, in, DIFFVBD_ON_CUDA(trust_radius_of(f), ) center, motions, data<T>(way), out,
-                data<T>(end) DIFFVBD_ON_CUDA(, work.data_ptr()));
-    return Out<5>(end, share, moved, held_up, left);
+    DIFFVBD_RUN(device, rigid_move<T>, in, DIFFVBD_ON_CUDA(trust_radius_of(f), ) center, motions, data<T>(displacement),
+                out, data<T>(end) DIFFVBD_ON_CUDA(, work.data_ptr()));
+    return Out<5>(end, fraction, moved, blocked, remaining);
   });
 }
 
@@ -169,18 +170,18 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_backward, DIFFVBD_PARAMETERS(TOUCHING) In
   });
 }
 
-// The adjoint of corrections one after another, each from `at` [scenes, V, 3], by its motion, share, factor and groups,
-// of that of where the last one led, x_bar [scenes, V, 3]: of the first `at`, x_prev, y and mass, of data as of
-// rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed pair
-// adds to that of kappa, and of lag.
-DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors motion, Tensors share,
-                 Tensors factor, Tensors groups, In x_bar, Ints data_count, double time_step, double friction_eps,
-                 bool wants_data) {
+// The adjoint of corrections in sequence, each from `at` [scenes, V, 3] by its motion, fraction, factor and groups.
+// x_bar [scenes, V, 3]: adjoint of the state after the last one. Returned: adjoints of the first `at`, x_prev, y and
+// mass, of data as of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus the
+// contribution of each listed pair to that of kappa, and of lag.
+DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors motion,
+                 Tensors fraction, Tensors factor, Tensors groups, In x_bar, Ints data_count, double time_step,
+                 double friction_eps, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
-  for (const auto* each : {&motion, &share, &factor, &groups}) {
+  for (const auto* each : {&motion, &fraction, &factor, &groups}) {
     require(each->size() == at.size() && !at.empty(),
-            "diffvbd::contact_rigid_reverse: expected as many at, motion, share, factor and groups, one at least");
+            "diffvbd::contact_rigid_reverse: expected as many at, motion, fraction, factor and groups, one at least");
   }
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -193,13 +194,14 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
       read.doubles("factor", factor[k], read.b * in.matrix_size());
       require(read.b == 0 || in.together() == (in.groups == nullptr),
               "diffvbd::contact_rigid: expected groups as contact_rigid_system returns them");
-      read.doubles("motion", motion[k], contact::kUnknowns * rows), read.doubles("share", share[k], rows);
+      read.doubles("motion", motion[k], contact::kUnknowns * rows), read.doubles("fraction", fraction[k], rows);
       inputs.push_back(in);
     }
     const auto& last = inputs.back();
     const int64_t b = read.b, v = read.v, corners = last.gate.corners;
     const WorkTensors pairs_out(f, device);
-    const Tensor p = device.zeros({b, corners, 3}), q = device.zeros({b, corners, 3}), way = device.empty({b, v, 3});
+    const Tensor p = device.zeros({b, corners, 3}), q = device.zeros({b, corners, 3}),
+                 displacement = device.empty({b, v, 3});
     const RigidBars bars(last.scene, true, wants_data, [&](Ints sizes, bool) { return device.zeros(sizes); });
     const Tensor floor_out = device.zeros({last.planes > 0 ? b : 0, v, last.planes, contact::kFloorLag});
     const Tensor collider_out = device.zeros({b, corners - v, 3}),
@@ -213,29 +215,29 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
     const T* end_bar = read.vectors("x_bar", x_bar);
     for (size_t k = inputs.size(); k-- > 0;) {
       const auto& in = inputs[k];
-      const auto *motions = data<const double>(motion[k]), *shares = data<const double>(share[k]),
+      const auto *motions = data<const double>(motion[k]), *fractions = data<const double>(fraction[k]),
                  *factors = data<const double>(factor[k]);
       double* l = data<double>(solution);
 #ifdef USE_CUDA
       const cuda::RigidReverse<T> own{motions,
-                                      shares,
+                                      fractions,
                                       factors,
                                       end_bar,
                                       l,
                                       data<T>(p),
                                       data<T>(q),
-                                      data<T>(way),
+                                      data<T>(displacement),
                                       work,
                                       sums,
                                       data<int32_t>(pushing),
                                       out};
       DIFFVBD_RUN(device, rigid_contact_backward<T>, in, own);
 #else
-      rigid_end_backward<T>(in, motions, shares, end_bar, l, data<T>(way), out.vertices.mass);
+      rigid_end_backward<T>(in, motions, fractions, end_bar, l, data<T>(displacement), out.vertices.mass);
       rigid_solve<T>(in, factors, l);
       rigid_virtual_motions<T>(in, motions, l, data<T>(p), data<T>(q));
       rigid_backward<T>(in, {data<T>(p), data<T>(q)}, work, sums);
-      rigid_vertices_backward<T>(in, motions, l, data<T>(way), sums, out);
+      rigid_vertices_backward<T>(in, motions, l, data<T>(displacement), sums, out);
 #endif
       end_bar = out.vertices.x;
     }

@@ -121,7 +121,7 @@ DIFFVBD_FN void store_lag(const LagState<T>& a, T* to) {
   for (int i = 0; i < kLagScalars; ++i) to[i] = values[i];
 }
 
-// A pair's damping fraction by its normal force (diffvbd/energies.py, damped_share), and its derivatives.
+// A pair's damping fraction by its normal force (diffvbd/energies.py, damped_fraction), and its derivatives.
 template <class T>
 struct DampingFraction {
   T value = T(0), by_force = T(0), by_kappa = T(0);

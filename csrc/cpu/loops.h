@@ -107,7 +107,7 @@ void begin_backward(const start::Inputs<T>& in, const start::Adjoints<T>& a, T* 
   });
 }
 
-// out [B, bodies, 2]: the rise, and how much of it is rounding at most; infinite where a vertex would be too near a
+// out [B, bodies, 2]: the increase, and how much of it is rounding at most; infinite where a vertex would be too near a
 // plane.
 template <class T>
 void energy_increase(const coarse::IncreaseInputs<T>& in, double* out) {

@@ -47,7 +47,7 @@ void check_values(const Plan& plan, const StepInputs<T>& in);
 template <class T>
 void check_masses(const T* fractions, int64_t scenes, int64_t tets, int64_t stride);
 
-// x [B, V, 3], tape [B, sweeps, tape_rows, active]; cut with contact: [B, sweeps, V] exponents of limits
+// x [B, V, 3], tape [B, sweeps, tape_rows, active]; truncations with contact: [B, sweeps, V] exponents of limits
 // (contact/limit.h)
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* truncations = nullptr);

@@ -242,14 +242,14 @@ int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
 }
 
 template <class T>
-cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* infeasible, void* workspace,
+cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* fraction, int64_t* infeasible, void* workspace,
                     int multiprocessors, cudaStream_t stream) {
   const int64_t rows = in.scenes * in.vertices;
   const bool clusters = has_block_each(in.vertices, in.scenes, capacity);
   std::vector<Span> zeros{{infeasible, sizeof(*infeasible)}};
   if (rows == 0) return clear(zeros, stream);
   AdvanceWork<T> work(in, capacity, clusters, workspace);
-  work.state.fraction = share, work.state.first = true;
+  work.state.fraction = fraction, work.state.first = true;
   auto* found = reinterpret_cast<unsigned long long*>(infeasible);
   if (clusters) {
     if (in.scenes > 1) {  // a single scene clears it itself

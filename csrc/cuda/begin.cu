@@ -29,11 +29,11 @@ template <class T>
 struct Choose {
   static constexpr bool keeps_record = false, computes = false;
   start::Candidates<T> two;
-  uint8_t* falls;
+  uint8_t* decreases;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    const double rise = start::path_between(two, body, team).increase;
-    if (team.leads()) falls[body.scene * two.bodies.bodies + body.body] = rise <= 0;
+    const double increase = start::path_between(two, body, team).increase;
+    if (team.leads()) decreases[body.scene * two.bodies.bodies + body.body] = increase <= 0;
   }
 };
 template <class T, bool energies>
@@ -41,10 +41,10 @@ struct Begin {
   static constexpr bool keeps_record = false, computes = energies;
   start::Inputs<T> in;
   T *x_start, *y;
-  uint8_t* held;
+  uint8_t* blocked;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    start::begin_body<energies>(in, body, team, x_start, y, held);
+    start::begin_body<energies>(in, body, team, x_start, y, blocked);
   }
 };
 template <class T>
@@ -64,10 +64,10 @@ struct ReverseBegin {
   static constexpr bool keeps_record = energies, computes = energies;
   start::Inputs<T> in;
   start::Adjoints<T> a;
-  T *coasted, *y;
+  T *extrapolated, *y;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration* record) const {
-    start::reverse_body<energies>(in, body, team, record, coasted, y, a);
+    start::reverse_body<energies>(in, body, team, record, extrapolated, y, a);
   }
 };
 
@@ -91,8 +91,8 @@ cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const St
   if (in.bodies.data.data == nullptr) {
     return run_bodies(in.bodies, groups, Begin<T, false>{in, x_start, y, nullptr}, workspace, stream);
   }
-  uint8_t* held = of_corrected.two != nullptr ? of_corrected.taken : nullptr;
-  const auto error = run_bodies(in.bodies, groups, Begin<T, true>{in, x_start, y, held}, workspace, stream);
+  uint8_t* blocked = of_corrected.two != nullptr ? of_corrected.taken : nullptr;
+  const auto error = run_bodies(in.bodies, groups, Begin<T, true>{in, x_start, y, blocked}, workspace, stream);
   if (error != cudaSuccess || of_corrected.two == nullptr) return error;
   const Part<T> act{in, *of_corrected.two, x_start, of_corrected.second, of_corrected.taken};
   return run_bodies(act.two.bodies, groups, act, workspace, stream);
@@ -100,13 +100,13 @@ cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const St
 
 template <class T>
 cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups, const start::Adjoints<T>& a,
-                           T* coasted, T* y, double* workspace, cudaStream_t stream) {
+                           T* extrapolated, T* y, double* workspace, cudaStream_t stream) {
   if (in.bodies.scenes * in.bodies.vertices == 0) return cudaSuccess;
   if (in.some_alone) reverse_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, a);
   if (in.bodies.data.data) {
-    return run_bodies(in.bodies, groups, ReverseBegin<T, true>{in, a, coasted, y}, workspace, stream);
+    return run_bodies(in.bodies, groups, ReverseBegin<T, true>{in, a, extrapolated, y}, workspace, stream);
   }
-  return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, coasted, y}, workspace, stream);
+  return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, extrapolated, y}, workspace, stream);
 }
 
 DIFFVBD_INSTANTIATE(begin)

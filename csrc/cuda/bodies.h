@@ -42,7 +42,7 @@ cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const St
                   cudaStream_t stream);
 template <class T>
 cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups, const start::Adjoints<T>& a,
-                           T* coasted, T* y, double* workspace, cudaStream_t stream);
+                           T* extrapolated, T* y, double* workspace, cudaStream_t stream);
 
 // Doubles that energy_increase works in.
 template <class T>

@@ -1,4 +1,4 @@
-// Compact list of pairs (contact/keep.h): a part of a list in the memory of the whole; the host does not learn its
+// Compact list of pairs (contact/pair_list.h): a part of a list in the memory of the whole; the host does not learn its
 // size.
 #include <cub/device/device_scan.cuh>
 

@@ -32,7 +32,7 @@ cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t sc
 template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
                               const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
-// As the CPU operator contact_rubbing; friction and damping may be null.
+// As the CPU operator contact_friction_lag; friction and damping may be null.
 template <class T>
 cudaError_t lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
                             int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);

@@ -38,10 +38,10 @@ cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::Vir
 // Adjoint of a correction.
 template <class T>
 struct RigidReverse {
-  const double *motions, *shares, *factor;
-  const T* end_bar;   // [B, V, 3]; may be out.vertices.x
-  double* solutions;  // [B, bodies, 6]  workspace, as the rest
-  T *p, *q, *way;     // as of virtual_motion() and reverse_end()
+  const double *motions, *fractions, *factor;
+  const T* end_bar;         // [B, V, 3]; may be out.vertices.x
+  double* solutions;        // [B, bodies, 6]  workspace, as the rest
+  T *p, *q, *displacement;  // as of virtual_motion() and reverse_end()
   contact::RigidWork<T> work;
   contact::PointWork<T> sums;
   int32_t* pushing;  // a number for each scene and for each listed pair

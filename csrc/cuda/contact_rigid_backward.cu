@@ -53,7 +53,8 @@ __device__ void sum_at_point(const RigidInputs<T>& in, const RigidWork<T>& work,
 template <class T, class Team>
 __device__ void end_of_body(const RigidReverse<T>& r, const Body<T>& body, int64_t unit, const Team& team) {
   const int64_t at = kUnknowns * unit;
-  reverse_end(body, team, r.motions + at, r.shares[unit], r.end_bar, r.solutions + at, r.way, r.out.vertices.mass);
+  reverse_end(body, team, r.motions + at, r.fractions[unit], r.end_bar, r.solutions + at, r.displacement,
+              r.out.vertices.mass);
 }
 template <class T, class Team>
 __device__ void motion_of_body(const RigidInputs<T>& in, const RigidReverse<T>& r, const Body<T>& body, int64_t unit,
@@ -65,7 +66,7 @@ template <class T, class Team>
 __device__ void vertices_of_body(const RigidInputs<T>& in, const RigidReverse<T>& r, const Body<T>& body, int64_t unit,
                                  const Team& team) {
   const int64_t at = kUnknowns * unit;
-  reverse_vertices(in, body, team, r.motions + at, r.solutions + at, r.way, r.sums, r.out);
+  reverse_vertices(in, body, team, r.motions + at, r.solutions + at, r.displacement, r.sums, r.out);
 }
 
 // Shared memory of a block that solves for a group.
@@ -188,7 +189,7 @@ __global__ void __launch_bounds__(kThreads)
     cluster.meet();
   };
   bool went = false;
-  block.each(in.bodies(), [&](int32_t b) { went = went || r.shares[unit + b] != 0; });
+  block.each(in.bodies(), [&](int32_t b) { went = went || r.fractions[unit + b] != 0; });
   if (!__syncthreads_or(went)) {  // a captured step launches all corrections, and most move nothing
     const int64_t first = 3 * scene * in.scene.vertices;
     if (r.end_bar == r.out.vertices.x) return;

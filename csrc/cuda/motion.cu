@@ -87,7 +87,7 @@ __global__ void __launch_bounds__(kThreads)
         [&](int32_t b, const auto& by) { f(body(b), by); });
     __syncthreads();
   };
-  const auto room = [&](int32_t body) { return radius_at(in, work.trust_radius, scene, body); };
+  const auto radius = [&](int32_t body) { return radius_at(in, work.trust_radius, scene, body); };
   prepare_scene(in, scene, team, work);
   __syncthreads();
   islands.each(in.motion.bodies, [&](int32_t body) { wish_of_body(in, scene, body, work); });
@@ -100,15 +100,15 @@ __global__ void __launch_bounds__(kThreads)
     changes = false;
     if (round < 0) {
       islands.each(in.motion.bodies, [&](int32_t body) {
-        const T before = room(body);
+        const T before = radius(body);
         radius_among_others(in, work, scene, body, true);
-        changes = changes || !(room(body) == before);
+        changes = changes || !(radius(body) == before);
       });
     } else {
       for_each_body([&](const MovingBody<T>& b, const auto& by) {
-        const T before = by.leads() ? room(b.body) : T(0);  // only the leader writes it
+        const T before = by.leads() ? radius(b.body) : T(0);  // only the leader writes it
         radius_beside_island(in, b, by, work);
-        if (by.leads()) changes = changes || !(room(b.body) == before);
+        if (by.leads()) changes = changes || !(radius(b.body) == before);
       });
     }
     changes = __syncthreads_or(changes);

@@ -51,14 +51,14 @@ __device__ void tet_line(const IncreaseInputs<T>& in, int64_t scene, int64_t blo
   double own_rest[kRest], own_material[kMaterial];
   for (int i = 0; i < kRest; ++i) own_rest[i] = rest[i * kBlockTets];
   for (int i = 0; i < kMaterial; ++i) own_material[i] = material[i * kBlockTets];
-  Vector at[4], way[4];
+  Vector at[4], displacement[4];
   for (int k = 0; k < 4; ++k) {
     const int64_t v = in.corner[(4 * block + k) * kBlockTets + lane] / 4;
     const int64_t row = 3 * (scene * in.bodies.vertices + v);
     at[k] = diffvbd::wide_at(in.bodies.x + row);
-    way[k] = diffvbd::wide_at(in.to + row) - at[k];
+    displacement[k] = diffvbd::wide_at(in.to + row) - at[k];
   }
-  TetLaw::line(at, way, own_rest, own_material, c);
+  TetLaw::line(at, displacement, own_rest, own_material, c);
   for (double& power : c) power *= in.bodies.time_step * in.bodies.time_step;
 }
 
@@ -77,9 +77,9 @@ __global__ void __launch_bounds__(kThreads)
     const unsigned mask = ((1u << kBlockTets) - 1) << (threadIdx.x % 32 / kBlockTets * kBlockTets);
     butterfly<kDegree, kBlockTets>(mask, c);
     if (lane != 0) return;
-    double *to = parts + 2 * (scene * rows + block), rise = 0, size = 0;
-    for (const double power : c) rise += power, size += absolute(power);
-    to[0] = rise, to[1] = size;
+    double *to = parts + 2 * (scene * rows + block), increase = 0, size = 0;
+    for (const double power : c) increase += power, size += absolute(power);
+    to[0] = increase, to[1] = size;
     return;
   }
   const int64_t row = item - tets;

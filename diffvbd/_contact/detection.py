@@ -1,4 +1,4 @@
-"""Detection as a step asks for it: which pairs are near."""
+"""Detection for a step: near pairs, intersections and support vertices."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ..ops import contact as ops_contact
 
 
 def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
-           capacity: int, room: Tensor | None = None, own_room: Tensor | None = None
+           capacity: int, trust_radius: Tensor | None = None, deformation_radius: Tensor | None = None
            ) -> tuple[Tensor, ...]:  # fmt: skip
     """Pairs that may come closer than dhat before the next detection, and the nearest pair of each corner point.
 
     Args:
         x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  was, now: Collider points [B, Vc, 3] [m].
         capacity: Pairs of all scenes that fit.
-        room, own_room: How far the vertices of each body may go beside its island and beside its own rigid motion, and
-            the largest [B, bodies + 1] [m]; None: nobody moves.
+        trust_radius, deformation_radius: Of each body, relative to its island and to its rigid motion, and the largest
+            [B, bodies + 1] [m]; None: zero.
 
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
         pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
@@ -28,10 +28,12 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
     """
     s = surface
-    room, own_room = (x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (room, own_room))
+    trust_radius, deformation_radius = (
+        x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (trust_radius, deformation_radius)
+    )
     return ops_contact.contact_detect(
-        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room,
-        own_room, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
+        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.pinned, trust_radius,
+        deformation_radius, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
         not torch.compiler.is_compiling(),
     )  # fmt: skip
 
@@ -49,5 +51,5 @@ def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: Contact
     with torch.no_grad():
         return ops_contact.contact_intersections(
             x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius, s.triangles, s.edges,
-            s.points, s.planes, s.body, s.held, s.bodies, self_contact, between_bodies, capacity,
+            s.points, s.planes, s.body, s.pinned, s.bodies, self_contact, between_bodies, capacity,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from .._common.checks import fail
 from .._contact.barrier import PairBarrier
 from .._contact.detection import detect
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
-from ..energies import damped_share
+from ..energies import damped_fraction
 from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from ..reference.energies import smoothed
 
@@ -131,7 +131,7 @@ class Lag(NamedTuple):
     start: Tensor  # corner points at the start [B, N, 3]
     size: Tensor  # [Q] normal force there [N]
     normal: Tensor  # [Q, 3]
-    share: Tensor  # [Q] of its damping
+    fraction: Tensor  # [Q] of its damping
     weights: Tensor  # [Q, 4]
     slope: Tensor  # [Q, 4, 3] weights times normal
 
@@ -143,7 +143,7 @@ def lag_of(pairs: NearPairs, start: Tensor, kappa: Tensor) -> Lag:
     normal = pairs.of_first(slope)  # weights of the first side sum to 1
     weights = (slope * normal[:, None]).sum(-1)
     size = -e * first
-    return Lag(pairs, start, size, normal, damped_share(size, pairs.of_scene(kappa), pairs.dhat), weights, slope)
+    return Lag(pairs, start, size, normal, damped_fraction(size, pairs.of_scene(kappa), pairs.dhat), weights, slope)
 
 
 def lagged_forces(
@@ -156,7 +156,7 @@ def lagged_forces(
         reach: Slip in a step from which friction is full [m].
     """
     along, slip, size = _slips(lag, points, coefficient, reach)
-    damped = -(lag.pairs.of_scene(damping) * lag.share / time_step) * along.clamp(max=0)
+    damped = -(lag.pairs.of_scene(damping) * lag.fraction / time_step) * along.clamp(max=0)
     return damped[:, None, None] * lag.slope, -(size[:, None] * slip)[:, None] * lag.weights[..., None]
 
 
@@ -174,5 +174,5 @@ def lagged_stiffness(
     """Trace of the same two terms' part of each corner point's block [N/m], [B, N]; arguments as of lagged_forces."""
     pairs = lag.pairs
     *_, size = _slips(lag, points, coefficient, reach)
-    each = pairs.of_scene(damping) * lag.share / time_step + 2 * size
+    each = pairs.of_scene(damping) * lag.fraction / time_step + 2 * size
     return pairs.summed((each[:, None] * lag.weights.square())[..., None], points)[..., 0]

@@ -13,25 +13,25 @@ from .._contact.surface import ContactSurface
 from ..ops import contact as ops_contact
 from ..ops.fields import PLANE_SCALARS
 
-SHORT = 0.99  # fraction of a displacement below which a vertex is truncated
+TRUNCATED = 0.99  # fraction of a displacement below which a vertex is truncated
 LEAST = 6  # the smallest fraction is 2^-6, and then 0
 FAR = 1e15  # [m] trust-region radius without pairs
 
 
-class PartStart(NamedTuple):
+class SubstepStart(NamedTuple):
     """Start of the sweeps of a substep; all but x is index data."""
 
     x: Tensor  # [B, V, 3] [m]
     center: Tensor  # [B, V, 3]  center of the trust region of each vertex [m]
-    room: Tensor  # [B, V]  its radius [m]
+    trust_radius: Tensor  # [B, V]  its radius [m]
     own: tuple  # center and radius of the deformation; empty where bodies have no pairs of their own
-    short: Tensor  # [B, V] bool: pairs or radii have truncated the displacement
-    stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
-    shares: Tensor  # [B, V]  fraction of its displacement that each vertex went
+    truncated: Tensor  # [B, V] bool: pairs or radii have truncated the displacement
+    infeasible: Tensor  # [1] int64: pairs that hinder what is prescribed
+    fractions: Tensor  # [B, V]  fraction of its displacement that each vertex went
 
 
 def start_between(x: Tensor, move: Tensor, was: Tensor, now: Tensor, planes: Tensor | None, origin: Tensor,
-                  detection: Any, surface: ContactSurface, rigid: Tensor, own_pairs: bool) -> PartStart:  # fmt: skip
+                  detection: Any, surface: ContactSurface, rigid: Tensor, own_pairs: bool) -> SubstepStart:  # fmt: skip
     """``x + u + f (move - u)``, differentiable in x and move. The fraction f is the largest of 1, 1/2, ..., 1/64 and 0
     that keeps pairs, floors and radii: one for each free body, one for each vertex of a body that is pinned.
 
@@ -43,39 +43,40 @@ def start_between(x: Tensor, move: Tensor, was: Tensor, now: Tensor, planes: Ten
         own_pairs: Whether bodies have pairs of their own, and deformation radii for them.
     """
     with torch.no_grad():
-        body, held, unit = surface.body[: x.shape[1]], surface.held[: x.shape[1]], surface.unit
-        u, at, way = detection.u[:, body], x.detach(), move.detach()
-        room = detection.room[:, body]
-        relative = way - u
-        ratio = room / _length(relative)
+        body, pinned, unit = surface.body[: x.shape[1]], surface.pinned[: x.shape[1]], surface.unit
+        u, at, displacement = detection.u[:, body], x.detach(), move.detach()
+        trust_radius = detection.trust_radius[:, body]
+        relative = displacement - u
+        ratio = trust_radius / _length(relative)
         if own_pairs:
-            own_room = detection.own_room[:, body]
-            ratio = torch.minimum(ratio, own_room / _length(way - rigid))
-        within = _of_units(_fraction(ratio), held, unit)
-        above = _of_units(_fraction(_above(planes, at + u, relative, origin)), held, unit)
+            deformation_radius = detection.deformation_radius[:, body]
+            ratio = torch.minimum(ratio, deformation_radius / _length(displacement - rigid))
+        within = _of_units(_fraction(ratio), pinned, unit)
+        above = _of_units(_fraction(_above(planes, at + u, relative, origin)), pinned, unit)
         first = torch.minimum(within, above)
         listed = detection.listed[:4]
-        wanted = torch.where(held[:, None], way, u + first[..., None] * relative).contiguous()
-        passed, stuck = ops_contact.advance(at, wanted, detection.u, at, origin, was.detach(), now.detach(),
-                                            surface.held, surface.body, unit, listed)  # fmt: skip
-        share = first * passed
-        short = (torch.minimum(within, passed) < SHORT) & ~held
-        own = (at + u + share[..., None] * (rigid - u), own_room) if own_pairs else ()
-    return PartStart(_started(x, move, u, share, held), at + u, room, own, short, stuck, share)
+        wanted = torch.where(pinned[:, None], displacement, u + first[..., None] * relative).contiguous()
+        passed, infeasible = ops_contact.advance(at, wanted, detection.u, at, origin, was.detach(), now.detach(),
+                                                 surface.pinned, surface.body, unit, listed)  # fmt: skip
+        fraction = first * passed
+        truncated = (torch.minimum(within, passed) < TRUNCATED) & ~pinned
+        own = (at + u + fraction[..., None] * (rigid - u), deformation_radius) if own_pairs else ()
+    start = _started(x, move, u, fraction, pinned)
+    return SubstepStart(start, at + u, trust_radius, own, truncated, infeasible, fraction)
 
 
-def start_above(x: Tensor, move: Tensor, planes: Tensor | None, origin: Tensor, held: Tensor, unit: Tensor
-                ) -> PartStart:  # fmt: skip
+def start_above(x: Tensor, move: Tensor, planes: Tensor | None, origin: Tensor, pinned: Tensor, unit: Tensor
+                ) -> SubstepStart:  # fmt: skip
     """The same without pairs: nothing but the floor limits motion."""
     with torch.no_grad():
-        share = _of_units(_fraction(_above(planes, x.detach(), move.detach(), origin)), held, unit)
-        free, zero = torch.full_like(share, FAR), torch.zeros_like(share, dtype=torch.bool)
-    start = _started(x, move, torch.zeros_like(x), share, held)
-    return PartStart(start, x.detach(), free, (), zero, zero.new_zeros((1,), dtype=torch.int64), share)
+        fraction = _of_units(_fraction(_above(planes, x.detach(), move.detach(), origin)), pinned, unit)
+        free, zero = torch.full_like(fraction, FAR), torch.zeros_like(fraction, dtype=torch.bool)
+    start = _started(x, move, torch.zeros_like(x), fraction, pinned)
+    return SubstepStart(start, x.detach(), free, (), zero, zero.new_zeros((1,), dtype=torch.int64), fraction)
 
 
-def _started(x: Tensor, move: Tensor, u: Tensor, share: Tensor, held: Tensor) -> Tensor:
-    return x + torch.where(held[:, None], move, u + share[..., None] * (move - u))
+def _started(x: Tensor, move: Tensor, u: Tensor, fraction: Tensor, pinned: Tensor) -> Tensor:
+    return x + torch.where(pinned[:, None], move, u + fraction[..., None] * (move - u))
 
 
 def _length(a: Tensor) -> Tensor:
@@ -99,7 +100,7 @@ def _fraction(ratio: Tensor) -> Tensor:
     return torch.where(halved > LEAST, 0.0, torch.ldexp(torch.ones_like(ratio), -halved))
 
 
-def _of_units(fraction: Tensor, held: Tensor, unit: Tensor) -> Tensor:
-    """The smallest fraction of the vertices of each unit that are not held [B, V]."""
-    fraction, index = torch.where(held, 1.0, fraction), unit.long().expand(fraction.shape)
+def _of_units(fraction: Tensor, pinned: Tensor, unit: Tensor) -> Tensor:
+    """The smallest fraction of the vertices of each unit that are not pinned [B, V]."""
+    fraction, index = torch.where(pinned, 1.0, fraction), unit.long().expand(fraction.shape)
     return torch.ones_like(fraction).scatter_reduce(1, index, fraction, "amin").gather(1, index)

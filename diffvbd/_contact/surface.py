@@ -15,11 +15,11 @@ from .._contact.colliders import Capsule, Collider, Obstacle, Plane, Sphere, uni
 from ..mesh import TetMesh
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
-# Mean edges of its body that a vertex may go where no reach is given: beside its island, where one body moves and where
-# several do; beside the rigid motion of its body, at least and at most; and that of a body which is held, whose
-# every motion is a deformation. The farther, the more pairs there are.
+# Radii without a given reach, in mean edges of the body: the trust-region radius where one body moves and where several
+# do; the deformation radius at least and at most, and that of a pinned body, whose every motion is a deformation.
+# Larger radii list more pairs.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
-LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
+LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_PINNED = 0.2, 0.3, 0.75
 # Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
 COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
 
@@ -35,19 +35,19 @@ class ContactSurface:
     points: Tensor  # [P] int32
     planes: Tensor  # [L, 3] int32
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
-    held: Tensor  # [N] bool: pinned, or of a collider
-    held_bodies: Tensor  # [bodies] bool: a vertex of it is pinned
-    partly_held: Tensor | None  # [V] bool: of a body of which a vertex is pinned and another not; None: there is none
+    pinned: Tensor  # [N] bool: pinned, or of a collider
+    pinned_bodies: Tensor  # [bodies] bool: a vertex of it is pinned
+    partly_pinned: Tensor | None  # [V] bool: of a body of which a vertex is pinned and another not; None: there is none
     plane_points: Tensor  # [N] bool: spans a plane
     body_order: Tensor  # [V] int32: vertices by body
     body_ptr: Tensor  # [bodies + 1] int32
     unit: Tensor  # [V] int32: the vertex whose step fraction each has, one for a free body; itself on a pinned one
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
-    most_room: Tensor  # [bodies] [m]: that any vertex is given beside its island
-    most_room_alone: Tensor  # [bodies] [m]: and where no other body is in reach of that
-    most_own_room: Tensor  # [bodies] [m]: and beside the rigid motion of its body
-    least_own_room: (
+    max_trust_radius: Tensor  # [bodies] [m]: bound of the trust-region radius
+    max_trust_radius_alone: Tensor  # [bodies] [m]: the same where no other body is near
+    max_deformation_radius: Tensor  # [bodies] [m]: bounds of the deformation radius
+    min_deformation_radius: (
         Tensor  # [bodies] [m]: and is given there in any case, because hardly any two sides of a body are so close
     )
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
@@ -107,23 +107,23 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     lengths = np.linalg.norm(mesh.points[first] - mesh.points[second], axis=1)
     total, number = (np.bincount(label[first], weights, minlength=bodies) for weights in (lengths, None))
     edge = torch.from_numpy(total / np.maximum(number, 1))
-    held_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
-    held_bodies = torch.from_numpy(held_vertices > 0)
-    moving_bodies = held_vertices < np.bincount(label, minlength=bodies)
-    partly_held = torch.from_numpy(((held_vertices > 0) & moving_bodies)[label])
+    pinned_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
+    pinned_bodies = torch.from_numpy(pinned_vertices > 0)
+    moving_bodies = pinned_vertices < np.bincount(label, minlength=bodies)
+    partly_pinned = torch.from_numpy(((pinned_vertices > 0) & moving_bodies)[label])
     alone = moving_bodies.sum() <= 1 or not barrier.between_bodies
     own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
                       MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
-    most_room_alone = MOST_EDGES * edge
-    most_room = most_room_alone if alone else MOST_EDGES_BETWEEN * edge
+    max_trust_radius_alone = MOST_EDGES * edge
+    max_trust_radius = max_trust_radius_alone if alone else MOST_EDGES_BETWEEN * edge
     if barrier.reach is not None:
-        most_room = most_room_alone = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
+        max_trust_radius = max_trust_radius_alone = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
 
     def index_tensor(parts: list[Any], width: int) -> Tensor:
         joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
         return torch.from_numpy(joined.astype(np.int32))
 
-    held = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
+    pinned = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
@@ -133,28 +133,28 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         points=index_tensor(points, 1).reshape(-1),
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
-        held=held,
-        held_bodies=held_bodies,
-        partly_held=partly_held if partly_held.any() else None,
+        pinned=pinned,
+        pinned_bodies=pinned_bodies,
+        partly_pinned=partly_pinned if partly_pinned.any() else None,
         plane_points=torch.from_numpy(np.concatenate(flat)),
         body_order=torch.from_numpy(order.astype(np.int32)),
         body_ptr=torch.from_numpy(np.searchsorted(label[order], np.arange(bodies + 1)).astype(np.int32)),
-        unit=units(torch.from_numpy(label), held_bodies),
+        unit=units(torch.from_numpy(label), pinned_bodies),
         bodies=bodies,
         rows=tuple(rows),
-        most_room=most_room,
-        most_room_alone=most_room_alone,
-        most_own_room=torch.where(held_bodies, MOST_EDGES_HELD, own) * edge,
-        least_own_room=LEAST_EDGES_OWN * edge,
+        max_trust_radius=max_trust_radius,
+        max_trust_radius_alone=max_trust_radius_alone,
+        max_deformation_radius=torch.where(pinned_bodies, MOST_EDGES_PINNED, own) * edge,
+        min_deformation_radius=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
 
 
-def units(body: Tensor, held_bodies: Tensor) -> Tensor:
+def units(body: Tensor, pinned_bodies: Tensor) -> Tensor:
     """The first vertex of each vertex's body where no vertex of that is pinned, else itself; int32 [V]."""
     own = torch.arange(len(body), device=body.device)
-    first = torch.full((len(held_bodies),), len(body), device=body.device).scatter_reduce(0, body, own, "amin")
-    return torch.where(held_bodies[body], own, first[body]).to(torch.int32)
+    first = torch.full((len(pinned_bodies),), len(body), device=body.device).scatter_reduce(0, body, own, "amin")
+    return torch.where(pinned_bodies[body], own, first[body]).to(torch.int32)
 
 
 def check_colliders(colliders: Any) -> tuple[Collider, ...]:

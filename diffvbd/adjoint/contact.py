@@ -1,4 +1,4 @@
-"""Lagged contact: what sweeps keep of the start of a step: forces, normals and weights of pairs, differentiable."""
+"""Lagged contact: forces, normals and weights of pairs at the start of a step, differentiable."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
     """Those of listed pairs that ``keep`` names, bool [pairs], and which they are. Where values must not decide sizes,
     on CUDA and compiled, in lists of the same length, with -1 where there is none."""
     exact = not keep.is_cuda and not torch.compiler.is_compiling()
-    rows, *kept = ops_contact.keep(keep, listed, exact)
+    rows, *kept = ops_contact.compact(keep, listed, exact)
     return Pairs(*kept), rows
 
 
@@ -104,9 +104,9 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
     return ops_contact.pair_lag(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, *listed)
 
 
-def rubbing(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
-            listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_share), normal (3),
+def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
+                 listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_fraction), normal (3),
     weights (4); and the forces of pairs on corner points [B, N, 3] [N]. Differentiable in the first five.
 
     Args:
@@ -114,7 +114,7 @@ def rubbing(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, dampin
         origin: [B, V, 3] or empty.
     """
     given = (t.contiguous() for t in (x, collider, kappa, friction, damping))
-    return ops_contact.pair_rubbing(*given, origin, *listed)
+    return ops_contact.pair_friction_lag(*given, origin, *listed)
 
 
 # --- contact of a step at one state -----------------------------------------------------------------------------------

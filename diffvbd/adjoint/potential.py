@@ -21,7 +21,7 @@ from .. import ops
 from ..model.moving import MovingBodies
 from ..model.system import System
 from ..ops.fields import ROUNDINGS
-from ..ops.sweep import potential_rise
+from ..ops.sweep import potential_increase
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
@@ -204,9 +204,9 @@ class IncrementalPotential:
         """Each energy of single vertices with its part of the data [1 | B, n]."""
         energies = self.model.vertex_energies
         sizes = [e.count() * (self.model.num_vertices if e.per_vertex else 1) for e in energies]
-        parts = data.split(sizes, -1) if energies else ()
+        inputs = data.split(sizes, -1) if energies else ()
         return [
-            (e, part if e.per_vertex else of_vertices(part, self.x)) for e, part in zip(energies, parts, strict=True)
+            (e, part if e.per_vertex else of_vertices(part, self.x)) for e, part in zip(energies, inputs, strict=True)
         ]
 
 
@@ -218,7 +218,7 @@ def of_vertices(data: Tensor, x: Tensor) -> Tensor:
 # --- increase of the incremental potential of each body from one state to another, without grad -----------------------
 
 
-class RiseParts(NamedTuple):
+class IncreaseInputs(NamedTuple):
     """Common data of the comparisons of the potential in one step."""
 
     model: System
@@ -234,10 +234,10 @@ class RiseParts(NamedTuple):
     def admits(self, x: Tensor, to: Tensor) -> Tensor:
         """Whether the potential of each body lets it go from x to ``to`` [B, V, 3]: it does not rise by more than
         rounding, is a number, and ``to`` is not too near a plane; bool [B, bodies]."""
-        rise, size = rise_of_bodies(self, x, to).unbind(-1)
-        return rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # False where it is not a number
+        increase, size = increase_of_bodies(self, x, to).unbind(-1)
+        return increase <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # False where it is not a number
 
-    def raises(self, x: Tensor, to: Tensor) -> Tensor:
+    def increases_potential(self, x: Tensor, to: Tensor) -> Tensor:
         """Vertices of bodies whose potential does not let them go from x to ``to``, bool [B, V]."""
         admitted, bodies = self.admits(x, to), self.bodies
         if bodies.number == 0:
@@ -246,7 +246,7 @@ class RiseParts(NamedTuple):
         return moves > admitted[:, of]  # moves and not admitted, in one launch
 
 
-def rise_parts(model: System, fields: ops.SweepFields, time_step: float) -> RiseParts:
+def increase_inputs(model: System, fields: ops.SweepFields, time_step: float) -> IncreaseInputs:
     """fields: of the step's sweeps."""
     # contiguous: a state may be expanded over scenes
     fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore
@@ -258,13 +258,13 @@ def rise_parts(model: System, fields: ops.SweepFields, time_step: float) -> Rise
     for i, modulus in enumerate((fields.mu, fields.lam)):
         material[:, :, i] = modulus[..., None] if modulus.shape[1] == 1 else modulus[:, moving.tet]
     rest = moving.rest if fields.rest is None else fields.rest[:, moving.tet].transpose(-1, -2).contiguous()
-    return RiseParts(model, fields, material, rest, time_step)
+    return IncreaseInputs(model, fields, material, rest, time_step)
 
 
-def rise_of_bodies(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:
+def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
     """Increase of the potential of each body, and the sizes of its terms, float64 [B, bodies, 2]; infinite where
     a vertex comes too near a plane."""
-    model, moving = parts.model, parts.model._moving
+    model, moving = inputs.model, inputs.model._moving
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
-    return potential_rise(parts.fields, x, to.contiguous(), parts.material, parts.rest, index, model._data_count,
-                          parts.time_step)  # fmt: skip
+    return potential_increase(inputs.fields, x, to.contiguous(), inputs.material, inputs.rest, index, model._data_count,
+                              inputs.time_step)  # fmt: skip

@@ -65,12 +65,12 @@ def _run(*args: Any) -> tuple[Tensor, ...]:
 
 def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     """The same sweeps transposed in reverse order."""
-    fields, (packed_rest, plan, x, tape, corrections, cut) = ops.SweepFields(*saved[:_FIELDS]), saved[_FIELDS:]
+    fields, (packed_rest, plan, x, tape, corrections, limits) = ops.SweepFields(*saved[:_FIELDS]), saved[_FIELDS:]
     settings, tape_policy, x_bar = *rest[:2], bars[0]
     assert x_bar is not None
     wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
     with backward_memory(x, settings, tape_policy):
-        out = ops.sweep_backward(x_bar, x, tape, corrections, cut, fields, packed_rest, plan, settings, tape_policy,
+        out = ops.sweep_backward(x_bar, x, tape, corrections, limits, fields, packed_rest, plan, settings, tape_policy,
                                  wants)  # fmt: skip
     return [out.get(name) for name in fields._fields]
 
@@ -83,8 +83,8 @@ def _vmap(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tens
     full = (info.batch_size * scenes, *folded[0].shape[1:])
     folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
     packed_rest, plan, settings, *others = args[_FIELDS:]
-    x, tape, cut, none = apply(*folded, packed_rest, plan, _scenes_first(settings), *others)
-    return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes)), cut, none), (0, 0, None, None)
+    x, tape, limits, none = apply(*folded, packed_rest, plan, _scenes_first(settings), *others)
+    return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes)), limits, none), (0, 0, None, None)
 
 
 def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -95,7 +95,7 @@ def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tu
     _plain(fields)
     scenes, size = _scenes((x_bar, *fields), in_dims), info.batch_size
     folded: list[Any] = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
-    packed_rest, plan, x, tape, corrections, cut = saved[_FIELDS:]
+    packed_rest, plan, x, tape, corrections, limits = saved[_FIELDS:]
     x, tape = (
         t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
         for t in (_folded(t, d, size, scenes) for t, d in zip((x, tape), in_dims[_FIELDS + 3 :], strict=False))
@@ -106,7 +106,7 @@ def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tu
               for t, need in zip(folded, needs, strict=True)]  # fmt: skip
     spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
     out = apply(_folded(x_bar, in_dims[0], size, scenes).expand(full), *spread, packed_rest, plan, x, tape, corrections,
-                cut, (settings, tape_policy, *others), needs)  # fmt: skip
+                limits, (settings, tape_policy, *others), needs)  # fmt: skip
     out = out if isinstance(out, tuple) else (out,)
     needed = [(t, d) for t, d, need in zip(fields, in_dims[1:], needs, strict=False) if t is not None and need]
     shapes = [t.shape[0] if d is None else t.movedim(d, 0).shape[1] for t, d in needed]
@@ -162,9 +162,9 @@ def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: 
         packed_rest: The Model's own rest shape [1, slots, 4, lanes], where fields have none.
         tape_policy: What is kept for the backward; ops.NO_TAPE runs the step again there.
     """
-    x, _, cut, corrections = _sweep(*distinct(*fields), packed_rest, plan, settings, tape_policy, debug_step,
-                                          checked)  # fmt: skip
-    return x, cut, corrections
+    x, _, limits, corrections = _sweep(*distinct(*fields), packed_rest, plan, settings, tape_policy, debug_step,
+                                       checked)  # fmt: skip
+    return x, limits, corrections
 
 
 def _run_fused(*args: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -40,8 +40,8 @@ class Status:
         capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN. On
             the CPU, without a ``capacity`` of the PairBarrier, lists are as long as they must be, up to so many.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
-        hindered: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
-        cut: Truncated vertices, [scenes]: those that contact stopped on their way in the last sweep (at the start of
+        infeasible: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
+        truncated: Truncated vertices, [scenes]: those that contact limited in the last sweep (at the start of
             the step if there are no sweeps) or with their body in the last rigid correction. They lost velocity that
             no force took.
         smallest_gap: The smallest gap that a detection found [m], or the search distance, [scenes].
@@ -50,8 +50,8 @@ class Status:
     pairs: int
     capacity: int
     touching: int
-    hindered: int
-    cut: list[int]
+    infeasible: int
+    truncated: list[int]
     smallest_gap: list[float]
 
     @property
@@ -75,8 +75,8 @@ def status(model: Model) -> Status:
         pairs=int(counts[:, 0].max()),
         capacity=outcome.capacity,
         touching=int(counts[:, 1].sum()),
-        hindered=int(counts[:, 3].sum()),
-        cut=outcome.cut.sum(-1).tolist(),
+        infeasible=int(counts[:, 3].sum()),
+        truncated=outcome.truncated.sum(-1).tolist(),
         smallest_gap=outcome.smallest.min(0).values.tolist(),
     )
 

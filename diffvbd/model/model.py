@@ -193,12 +193,12 @@ class Model:
         return self._mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :].clone()
 
     @property
-    def most_room(self) -> float:
+    def max_trust_radius(self) -> float:
         """Largest displacement of a vertex relative to its island between two detections of the PairBarrier [m]."""
         surface, barrier = self.surface_of_contact, self.contact
         if surface is None or barrier is None:
             fail("model", "a PairBarrier among its energies", "none")
-        return float(surface.most_room.max())
+        return float(surface.max_trust_radius.max())
 
     @property
     def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:

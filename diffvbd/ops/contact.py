@@ -1,9 +1,9 @@
-"""The compiled operators of contact: searches, motions and rooms of bodies, the start of a part, what sweeps keep of
-the start of a step, the rigid correction; and the search for neighboring points.
+"""The compiled operators of contact: searches, motions and trust regions of bodies, the start of a substep, values
+lagged from the start of a step, the rigid correction; and the search for neighboring points.
 
 Sizes: B scenes that never mix, V vertices, Vc collider points, N = V + Vc corner points (vertices first), F triangles,
 E edges, P points, L planes, NB bodies of the mesh. Index tensors are int32; float tensors have the dtype of x; all are
-contiguous and on one device. What is wrong with a tensor raises ValueError. Rows of Differentiable are at the end.
+contiguous and on one device. A wrong tensor raises ValueError. The differentiable operators stand at the end.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .load import direct as raw
 
 
 class Detection(NamedTuple):
-    """Pairs of primitives that are, or may come, closer than the barrier's reach."""
+    """Pairs of primitives that are closer than the barrier's reach, or may come that close."""
 
     pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
     constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]; hints
@@ -37,39 +37,40 @@ class Detection(NamedTuple):
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
-                   triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
-                   room: Tensor, own_room: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool,
-                   dhat: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
-    """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
+                   triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor,
+                   trust_radius: Tensor, deformation_radius: Tensor, mesh_bodies: int, self_contact: bool,
+                   between_bodies: bool, dhat: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
+    """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
 
-    The vertices of a body may go as far as its room beside what its island does, and as far as its own room beside a
-    turn of at most a radian and a shift of the body; colliders have none. A pair is listed if its gap, less the rooms
-    of its two sides, is below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at
-    rest, 0.9 times their distance at rest; two sides of one body if it is below 1.15 times reach and both own rooms.
-    Two colliders make no pair, nor do four held corner points, nor two sides of one body that are one place at rest.
+    ``trust_radius`` bounds the displacement of a vertex relative to its island. ``deformation_radius`` bounds it
+    relative to the rigid motion of its body, of at most a radian. Colliders have neither. The barrier's reach is
+    ``dhat``; for two sides of one body that are closer at rest, it is 0.9 of their distance at rest. A pair of two
+    bodies is listed if its gap is below the reach and both trust-region radii. A pair of one body is listed if its gap
+    is below 1.15 times the reach and both deformation radii. Two colliders make no pair, nor do four pinned corner
+    points, nor two sides of one body that coincide at rest.
 
-    A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list holds some of the
-    pairs that it needs. Not differentiable; results repeat to the bit.
+    A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list is incomplete. Not
+    differentiable; results repeat to the bit.
 
     Args:
         x: [B, V, 3] positions [m], relative to ``origin`` [B, V, 3], one point for each body; or empty.
-        collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are those at the
-            latter, or now where they end behind the point; what is near them now is listed, too.
+        collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are taken at the
+            latter, or now where a plane would pass the point. What is near a plane now is listed, too.
         rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
-        body, held: [N]; labels from ``mesh_bodies`` on are colliders; held: bool, no sweep moves it.
-        room, own_room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest.
-        self_contact, between_bodies: Which pairs of mesh bodies to consider.
+        body, pinned: [N]; labels from ``mesh_bodies`` on are colliders; pinned: bool, no sweep moves the point.
+        trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
+        self_contact, between_bodies: Pairs of mesh bodies to consider.
         dhat: [m].
         capacity: Rows of the list.
-        trim: On the CPU, only as many rows as pairs fill: rows that none fills may cost more than the search. CUDA,
-            which would wait for their number, does not trim; torch.compile takes longer with sizes that it cannot know.
+        trim: On the CPU, return only rows with a pair: empty rows may cost more than the search. CUDA does not trim, as
+            it would have to wait for their number; torch.compile takes longer with unknown sizes.
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held,
-            room, own_room, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
+            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, pinned,
+            trust_radius, deformation_radius, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
         )
     )  # fmt: skip
 
@@ -83,156 +84,160 @@ class Intersections(NamedTuple):
 
 
 def contact_intersections(x: Tensor, origin: Tensor, collider: Tensor, rest: Tensor, radius: Tensor, triangles: Tensor,
-                          edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor, mesh_bodies: int,
+                          edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor, mesh_bodies: int,
                           self_contact: bool, between_bodies: bool, capacity: int) -> Intersections:  # fmt: skip
-    """Crossings that contact cannot undo, because distances do not show them: a start must have none.
+    """Crossings of surfaces. A start must have none: distances do not show them, so contact cannot undo them.
 
-    An edge crosses a triangle, with which it shares no vertex, when its ends lie on both sides of the plane and it
-    meets the closed triangle, border included. Signs are those of ``x + origin`` in double precision: an end that
-    rounding could bring to the other side does not count, a border that it could counts as met. What is not finite
-    crosses nothing. Pairs that :func:`contact_detect` does not consider do not count: two colliders, five held corner
-    points, bodies whose contact is off, and an edge and a triangle of one body with features that are one place at
-    rest. Not differentiable; results repeat to the bit.
+    An edge crosses a triangle, with which it shares no vertex, if its ends lie on both sides of the plane and it meets
+    the closed triangle. Signs are those of ``x + origin`` in double precision. An end within rounding of the plane does
+    not count as beyond it; a border within rounding counts as met. Points that are not finite cross nothing. Pairs
+    that :func:`contact_detect` leaves out do not count: two colliders, five pinned corner points, bodies without
+    contact, and features of one body that coincide at rest. Not differentiable; results repeat to the bit.
 
     Args:
-        x, origin, collider, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies, self_contact,
+        x, origin, collider, rest, radius, triangles, edges, points, planes, body, pinned, mesh_bodies, self_contact,
             between_bodies: As for :func:`contact_detect`, collider points and planes at one time.
         capacity: Rows of ``pairs``. Where ``counts[:, 0].sum()`` is more, CUDA lists any of them.
-
 
     Source: bounds of rounding after Shewchuk (1997).
     """
     return Intersections(
         *raw.contact_intersections(
-            x, origin, collider, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies, self_contact,
-            between_bodies, capacity,
+            x, origin, collider, rest, radius, triangles, edges, points, planes, body, pinned, mesh_bodies,
+            self_contact, between_bodies, capacity,
         )
     )  # fmt: skip
 
 
-# --- motions and rooms of bodies --------------------------------------------------------------------------------------
+# --- motions and trust regions of bodies ------------------------------------------------------------------------------
 
 
-class Ways(NamedTuple):
-    """How the vertices of each body want to go."""
+class Displacements(NamedTuple):
+    """Wanted displacements, by body."""
 
-    rigid: Tensor  # [B, V, 3] [m]  the rigid motion with the body's momentum, as a way; zero where a vertex is held
-    longest: Tensor  # [5, B, NB] [m]  the longest ways of a vertex, of the kinds of WAYS
-    sums: Tensor  # [B, NB, 4]  momentum times the time [kg m] and mass [kg] of the vertices that are free
+    rigid: Tensor  # [B, V, 3] [m]  the rigid motion with the body's momentum; zero where a vertex of it is pinned
+    longest: Tensor  # [5, B, NB] [m]  the longest displacements of a vertex, of the kinds of DISPLACEMENTS
+    sums: Tensor  # [B, NB, 4]  momentum times the time [kg m] and mass [kg] of the free vertices
 
 
-def contact_motion(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, fall: Tensor, held: Tensor,
-                   held_bodies: Tensor, order: Tensor, ptr: Tensor) -> Ways:  # fmt: skip
-    """The rigid motion that has each body's linear and angular momentum, and the longest ways.
+def contact_motion(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, gravity_move: Tensor, pinned: Tensor,
+                   pinned_bodies: Tensor, order: Tensor, ptr: Tensor) -> Displacements:  # fmt: skip
+    """Rigid motion with each body's linear and angular momentum, and the longest displacements.
 
-    Longest ways of a body are, of the vertices that are free, beside their mean way (bends), beside the rigid motion
-    (apart) and by ``fall`` (falls); of those that are held (driven); and how far the straight way of a turn ends from
-    the turned body (stretched). NaN where one is NaN. They are not differentiated; results repeat to the bit.
+    The longest displacements of a body: of a free vertex relative to their mean (bends), relative to the rigid motion
+    (apart) and by ``gravity_move`` (gravity); of a pinned vertex (driven); and from the end of a straight path to the
+    turned body (stretched). NaN where one is NaN. They are not differentiated; results repeat to the bit.
 
     Args:
         x, origin: As for :func:`contact_detect`.  mass: [1 | B, V] [kg].
-        move, fall: [B, V, 3] [m]; fall may be empty.
-        held, held_bodies: [V] or more, [NB] bool: what something else moves, and which bodies have such a vertex.
+        move, gravity_move: [B, V, 3] [m]; gravity_move may be empty.
+        pinned, pinned_bodies: [V] or more, [NB] bool: pinned or prescribed vertices, and bodies with one.
         order, ptr: Vertices by body [V], and the first of each body [NB + 1].
     """
-    return Ways(*raw.contact_motion(x, origin, mass, move, fall, held, held_bodies, order, ptr))
+    return Displacements(*raw.contact_motion(x, origin, mass, move, gravity_move, pinned, pinned_bodies, order, ptr))
 
 
-class RoomsOfBodies(NamedTuple):
-    """How far the vertices of bodies may go until pairs are found again. Index data."""
+class TrustRadii(NamedTuple):
+    """Trust-region radii of bodies until the next detection. Index data."""
 
-    island: Tensor  # smallest body of the island of each body [B, NB] int32; -1: a held vertex or collider stops it
+    island: Tensor  # of each body, as its smallest body [B, NB] int32; -1: a pinned vertex or a collider stops it
     u: Tensor  # translation of each body's island, rounded to a grid [B, NB, 3] [m]
-    room: Tensor  # beside the island's translation, and the largest of the scene [B, NB + 1] [m]
-    own_room: Tensor  # beside the rigid motion of their own body, [B, NB + 1] [m]
-    over: Tensor  # how far they want to go, or up to 2 what they ask for, over the most room they get [B, NB]
+    trust_radius: Tensor  # relative to the island's translation, and the largest of the scene [B, NB + 1] [m]
+    deformation_radius: Tensor  # relative to the body's rigid motion [B, NB + 1] [m]
+    over: Tensor  # wanted displacement, or up to 2 the wanted radius, over the largest radius [B, NB]
 
 
-def contact_rooms(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, held: Tensor, order: Tensor, ptr: Tensor,
-                  ways: Ways, floor: Tensor, collider: Tensor, collider_next: Tensor, planes: Tensor, body: Tensor,
-                  radius: Tensor, most: Tensor, most_alone: Tensor, most_own: Tensor, least_own: Tensor, dhat: float,
-                  share: float, least: float, self_contact: bool) -> RoomsOfBodies:  # fmt: skip
-    """Rooms follow from where a body wants to go: pairs that could meet within them are listed, and what does not want
-    to move relative to its neighbours lists few. Bodies whose boxes, swept by the translation of their island and grown
-    by room and dhat / 2, overlap are of one island. Not differentiable; results repeat to the bit.
+def contact_trust_radii(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, pinned: Tensor, order: Tensor,
+                        ptr: Tensor, displacements: Displacements, floor: Tensor, collider: Tensor,
+                        collider_next: Tensor, planes: Tensor, body: Tensor, radius: Tensor, most: Tensor,
+                        most_alone: Tensor, most_own: Tensor, least_own: Tensor, dhat: float, fraction: float,
+                        least: float, self_contact: bool) -> TrustRadii:  # fmt: skip
+    """Trust-region radii from the wanted displacements. A body that does not move relative to its neighbours gets a
+    small radius and lists few pairs. An island translates by the mean of ``move`` over the mass of its free vertices:
+    bodies whose boxes, swept by that translation and grown by radius and dhat / 2, overlap are of one island. Not
+    differentiable; results repeat to the bit.
 
     Args:
-        x, origin, mass, move, held, order, ptr: As for :func:`contact_motion`, held [N].  ways: What that returned.
+        x, origin, mass, move, pinned, order, ptr: As for :func:`contact_motion`, pinned [N].
+        displacements: Result of :func:`contact_motion`.
         floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
         collider, collider_next, planes, body, radius: As for :func:`contact_detect`.
-        most, most_alone, most_own, least_own: Bounds of the rooms of each body [NB] [m], see ContactSurface.
-        dhat: [m].  share, least: What a room is over a body's way beside its island, and beside that [m].
-        self_contact: Whether bodies have pairs, and so rooms, of their own.
+        most, most_alone, most_own, least_own: Bounds of the radii of each body [NB] [m], see ContactSurface.
+        dhat: [m].  fraction, least: Radius over a body's displacement relative to its island, and what is added [m].
+        self_contact: Whether a body has pairs of its own, and so a deformation radius.
     """
-    return RoomsOfBodies(
-        *raw.contact_rooms(
-            x, origin, mass, move, held, order, ptr, ways.longest, ways.sums, floor, collider, collider_next, planes,
-            body, radius, most, most_alone, most_own, least_own, dhat, share, least, self_contact,
+    return TrustRadii(
+        *raw.contact_trust_radii(
+            x, origin, mass, move, pinned, order, ptr, displacements.longest, displacements.sums, floor, collider,
+            collider_next, planes, body, radius, most, most_alone, most_own, least_own, dhat, fraction, least,
+            self_contact,
         )
     )  # fmt: skip
 
 
-def sweep_rooms(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, fall: Tensor, apart: Tensor, stretched: Tensor,
-                center: Tensor, room: Tensor, own_center: Tensor, own_room: Tensor, held: Tensor, body_order: Tensor,
-                body_ptr: Tensor, more: float, least: float) -> Tensor:  # fmt: skip
-    """How far sweeps may carry each vertex from x, [B, V] [m]; 0 where one is held, NaN where what it follows from is.
+def sweep_radii(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, gravity_move: Tensor, apart: Tensor,
+                stretched: Tensor, center: Tensor, trust_radius: Tensor, deformation_center: Tensor,
+                deformation_radius: Tensor, pinned: Tensor, body_order: Tensor, body_ptr: Tensor, more: float,
+                least: float) -> Tensor:  # fmt: skip
+    """Trust-region radius of each vertex in the sweeps, about x, [B, V] [m]; 0 where pinned, NaN where an input is.
 
-    A body wants as far as its vertices fall and go apart, a correction has moved them, and ``more`` times what pairs
-    have held up and it was stretched. A vertex has ``least`` and the most that a body of its scene wants, but no more
-    than what is left of its rooms. Not differentiable; results repeat to the bit.
+    A body asks for the sum of its gravity move, its deformation, its last correction, and ``more`` times its truncated
+    displacement and its stretch. A vertex gets ``least`` and the largest radius that a body of its scene asks for, but
+    stays within its trust region of the substep. Not differentiable; results repeat to the bit.
 
     Args:
-        x, start: [B, V, 3] [m], where sweeps begin, and where the start of the part led.
-        begin, move, fall: [B, V, 3] [m], where the part began, and what of its way each vertex wanted.
-        apart, stretched: [B, bodies] [m], longest way beside the rigid motion, and what straight ways stretch it by.
-        center, room, own_center, own_room: [B, V, 3] and [B, V] [m], how far from where a vertex may go, and the same
-            beside the rigid motion of its body; the latter empty where bodies have no pairs of their own.
-        held: [V] or more, bool.  body_order, body_ptr: Vertices by body [V], and the first of each [bodies + 1].
+        x, start: [B, V, 3] [m], positions before the sweeps, and those after the start of the substep.
+        begin, move, gravity_move: [B, V, 3] [m], positions before the substep, and wanted displacements.
+        apart, stretched: [B, bodies] [m], as of :func:`contact_motion`.
+        center, trust_radius, deformation_center, deformation_radius: [B, V, 3] and [B, V] [m], center and radius of the
+            trust region, and the same relative to the body's rigid motion; empty without pairs within bodies.
+        pinned: [V] or more, bool.  body_order, body_ptr: Vertices by body [V], and the first of each [bodies + 1].
     """
-    return raw.contact_sweep_rooms(x, start, begin, move, fall, apart, stretched, center, room, own_center, own_room,
-                                   held, body_order, body_ptr, more, least)  # fmt: skip
+    return raw.contact_sweep_radii(x, start, begin, move, gravity_move, apart, stretched, center, trust_radius,
+                                   deformation_center, deformation_radius, pinned, body_order, body_ptr, more,
+                                   least)  # fmt: skip
 
 
-# --- the start of a part ----------------------------------------------------------------------------------------------
+# --- the start of a substep -------------------------------------------------------------------------------------------
 
 
 def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
-            held: Tensor, body: Tensor, unit: Tensor, listed: Sequence[Tensor], careful: bool = True
+            pinned: Tensor, body: Tensor, unit: Tensor, listed: Sequence[Tensor], careful: bool = True
             ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Step fraction 1, 1/2, ... or 0 of ``move - u`` that each vertex may go at once with all others [B, V]; how many
-    pairs hinder what is prescribed, int64 [1]. Not differentiable.
+    """Step fraction 1, 1/2, ... or 0 of ``move - u`` of each vertex, all moving at once [B, V]; number of pairs that
+    make the prescribed motion infeasible, int64 [1]. Not differentiable.
 
     Args:
-        x, move: [B, V, 3], state and wanted motion [m].  u: Translation of each body's island [B, bodies, 3] [m].
+        x, move: [B, V, 3], state and wanted displacement [m].  u: Translation of each body's island [B, bodies, 3] [m].
         center: [B, V, 3], where the gaps of the pairs were taken, less u [m].
         unit: [V] int32, the vertex whose fraction each vertex has.
         listed: pairs, constants, ptr, entry of :func:`contact_detect`.
         careful: Whether the motion does not minimise the barrier.
     """
-    found, infeasible = raw.contact_advance(x, move, u, center, origin, collider, collider_next, held, body, unit,
+    found, infeasible = raw.contact_advance(x, move, u, center, origin, collider, collider_next, pinned, body, unit,
                                             *listed, careful)  # fmt: skip
     return found[:, unit], infeasible
 
 
-def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor
-           ) -> Tensor:  # fmt: skip
-    """``constants`` of listed pairs with their gaps at x in the last column, infinite where sides cannot come within
-    reach as long as no vertex goes farther than its room [B, V] [m]. Not differentiable."""
-    return raw.contact_narrow(x, origin, collider, room, pairs, constants, ptr)
+def refresh_gaps(x: Tensor, origin: Tensor, collider: Tensor, trust_radius: Tensor, pairs: Tensor, constants: Tensor,
+                 ptr: Tensor) -> Tensor:  # fmt: skip
+    """``constants`` of listed pairs with their gaps at x in the last column. A gap is infinite where the sides stay out
+    of reach within the trust-region radii of the vertices [B, V] [m]. Not differentiable."""
+    return raw.contact_refresh_gaps(x, origin, collider, trust_radius, pairs, constants, ptr)
 
 
 def gaps(x: Tensor, origin: Tensor, collider: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor) -> Tensor:
-    """Gaps of listed pairs with vertices at x and colliders at ``collider`` [pairs] [m]. Detection's own gaps of planes
-    are those at the end of the step. Not differentiable."""
-    room = torch.full_like(x[..., 0], torch.inf)  # all can come within reach
-    return narrow(x.detach(), origin, collider.detach(), room, pairs, constants, ptr)[:, -1]
+    """Gaps of listed pairs [pairs] [m], vertices at x and colliders at ``collider``. Detection takes gaps of planes at
+    the end of the step. Not differentiable."""
+    trust_radius = torch.full_like(x[..., 0], torch.inf)  # all may come within reach
+    return refresh_gaps(x.detach(), origin, collider.detach(), trust_radius, pairs, constants, ptr)[:, -1]
 
 
-def keep(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, ...]:
-    """The pairs of a list (pairs, constants, ptr, entry of :func:`contact_detect`) that ``rows`` names, bool [pairs]:
-    their indices, int64, and their list. exact: as long as they are many, which the CPU alone can say; else in room for
-    all, with -1 where there is none."""
-    return raw.contact_keep(rows, *listed, exact)
+def compact(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, ...]:
+    """Compact list of the pairs that ``rows`` selects, bool [pairs]: their indices, int64, and their list (pairs,
+    constants, ptr, entry of :func:`contact_detect`). exact: of their number, on the CPU only; else as long as the whole
+    list, and -1 in empty rows."""
+    return raw.contact_compact(rows, *listed, exact)
 
 
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------
@@ -241,69 +246,71 @@ def keep(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, .
 def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
                  moving: Tensor | None = None, alone: bool = False
                  ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """The turn and the shift of each body to where the step's potential is least, float64: centers of mass
-    [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factors of groups that touch [B, bodies, 6, 6 most_grouped()],
-    and groups int32 [B, 4, bodies], as csrc/contact/groups.h has them. Of no more than FEW bodies: one factor
-    [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. moving: bool [B, bodies]: only these
-    move, and what is in a group with one; of scenes without groups, what touches one. alone: in scenes of more than FEW
-    bodies only groups of one do; factors [B, bodies, 6, 6]."""
+    """Rigid motion of each body to the minimum of the step's potential, float64: centers of mass [B, bodies, 3] [m],
+    motion [B, bodies, 6] (rotation, translation), Cholesky factors of groups of touching bodies
+    [B, bodies, 6, 6 most_grouped()], and groups int32 [B, 4, bodies] (csrc/contact/islands.h). With at most FEW bodies:
+    one factor [B, 6 bodies, 6 bodies], and no groups.
+
+    friction_eps: [m], 0 without friction.  moving: bool [B, bodies]: these move, and their groups; without groups, the
+    bodies that touch one.  alone: With more than FEW bodies, only groups of one move; factors [B, bodies, 6, 6].
+    """
     moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, moving, alone)
 
 
 def left_alone(groups: Tensor) -> Tensor:
-    """Which bodies [B, bodies] are left alone, because those that touch are too many; of groups that are not empty."""
+    """Bodies [B, bodies] of groups that are too large to be corrected together; groups are not empty."""
     return groups[:, 3].gather(1, groups[:, 1].long()) < 0
 
 
 class Moved(NamedTuple):
-    """What :func:`rigid_move` returns."""
+    """Result of :func:`rigid_move`."""
 
     x: Tensor  # [B, V, 3]
-    share: Tensor  # float64 [B, bodies]: of its motion that each body took; beside `moving` zero where it has none
-    moved: Tensor  # bool [B, bodies]: whether it has a motion
-    held: Tensor  # bool [B, bodies]: whether it was held up, in a scene in which some of those that were have gone on
-    left: Tensor  # [B, bodies]: how much of its shift it did not take [m]
+    fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; with `moving`, zero where there is none
+    moved: Tensor  # bool [B, bodies]: the body has a motion
+    blocked: Tensor  # bool [B, bodies]: the body was blocked, in a scene where some blocked body has moved on
+    remaining: Tensor  # [B, bodies]: translation that was not taken [m]
 
 
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
                friction_eps: float, moving: Tensor | None = None) -> Moved:  # fmt: skip
-    """After each body has taken what it may of its motion [B, bodies, 6]. moving: As for :func:`rigid_system`."""
+    """State after the admissible fraction of each motion [B, bodies, 6]. moving: As for :func:`rigid_system`."""
     moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
     return Moved(*raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps, moving))
 
 
 class PairWork(NamedTuple):
-    """What :func:`rigid_backward` finds."""
+    """Result of :func:`rigid_backward`."""
 
-    by_x: Tensor  # [B, N, 3]: by where corner points are,
-    by_p: Tensor  # by p, without pairs of which no corner moves by p,
-    by_q: Tensor  # and by q
-    since: Tensor  # by_x of lagged pairs alone, which have it by how points have moved since the start; or empty
+    by_x: Tensor  # [B, N, 3]: derivative by the corner points
+    by_p: Tensor  # by p, without pairs of which no corner moves by p
+    by_q: Tensor  # by q
+    since: Tensor  # by_x of lagged pairs alone, by the motion since the start of the step; or empty
     by_kappa: Tensor  # [pairs], of each listed pair
-    lag_bar: Tensor  # [lagged, 9]: less the derivatives by what is lagged
+    lag_bar: Tensor  # [lagged, 9]: minus the derivatives by lagged values
 
 
 def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor, data_count: Sequence[int],
                    time_step: float, friction_eps: float) -> PairWork:  # fmt: skip
-    """What pairs add to the derivatives of p . (gradient + matrix q) of the Newton step, p and q being motions of all
-    corner points [B, N, 3], groups those of the step."""
+    """Contributions of pairs to the derivatives of p . (gradient + matrix q) of the Newton step. p, q: motions of all
+    corner points [B, N, 3].  groups: Those of the step."""
     return PairWork(*raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), groups, data_count, time_step,
                                                 friction_eps))  # fmt: skip
 
 
 class Made(NamedTuple):
-    """Corrections one after another, the first one first."""
+    """Corrections in their order."""
 
-    x: Sequence[Tensor]  # where each began [B, V, 3]
+    x: Sequence[Tensor]  # positions before each [B, V, 3]
     motion: Sequence[Tensor]
-    share: Sequence[Tensor]
+    fraction: Sequence[Tensor]
     factor: Sequence[Tensor]
     groups: Sequence[Tensor]
 
 
 class RigidAdjoints(NamedTuple):
-    """What :func:`rigid_reverse` finds, of each scene and pair."""
+    """Result of :func:`rigid_reverse`, of each scene and pair."""
 
     x: Tensor  # [B, V, 3], as are the next two
     x_prev: Tensor
@@ -313,15 +320,15 @@ class RigidAdjoints(NamedTuple):
     floor_lag: Tensor  # [B, V, planes, 4], or empty
     collider: Tensor  # [B, Vc, 3]
     collider_prev: Tensor
-    by_kappa: Tensor  # [pairs]: minus what each listed pair adds to the adjoint of kappa
+    by_kappa: Tensor  # [pairs]: minus the contribution of each listed pair to the adjoint of kappa
     lag: Tensor  # [lagged, 9]
 
 
 def rigid_reverse(fields: TouchingFields, made: Made, x_bar: Tensor, data_count: Sequence[int], time_step: float,
                   friction_eps: float, wants_data: bool) -> RigidAdjoints:  # fmt: skip
-    """The adjoint of corrections, of that of where the last one led, x_bar [B, V, 3]: of their ways, and of
-    -p . (gradient + matrix q), p and q being how points move by the adjoint of a motion and by the motion. fields: Of
-    all of them, but for x."""
+    """Adjoint of corrections, from x_bar [B, V, 3] of the state after the last one: of the displacements, and of
+    -p . (gradient + matrix q), where p moves points by the adjoint of a motion and q by the motion. fields: Of all
+    corrections, but for x."""
     x, x_prev, y, mass, shared, own, *rest = raw.contact_rigid_reverse(
         *fields, *(list(each) for each in made), x_bar.contiguous(), data_count, time_step, friction_eps, wants_data
     )
@@ -371,23 +378,23 @@ def neighbor_pairs(points: Tensor, radius: float, max_pairs: int, *, name: str =
 
 
 def unread(points: Tensor) -> bool:
-    """Whether results on the points' device must not be looked at now."""
+    """Whether the host must not read results on the points' device now."""
     return torch.compiler.is_compiling() or is_captured(points)
 
 
 def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
     """Adjoints by body [B, bodies, scalars of a scene] and by vertex [B, V, scalars of a vertex] -> of data [B, n]."""
     total = sum_to(shared, (shared.shape[0], 1, shared.shape[2]))[:, 0]
-    parts, at = [], {False: 0, True: 0}
+    blocks, at = [], {False: 0, True: 0}
     for energy, count in zip(VERTEX_ENERGIES, data_count, strict=True):
         rows, start = (own if energy.per_vertex else total), at[energy.per_vertex]
-        part = rows.narrow(-1, start, count)  # not rows[...] nor flatten(), which is_grads_batched cannot do
-        parts.append(part.reshape(part.shape[0], -1) if energy.per_vertex else part)
+        block = rows.narrow(-1, start, count)  # not rows[...] nor flatten(), which is_grads_batched cannot do
+        blocks.append(block.reshape(block.shape[0], -1) if energy.per_vertex else block)
         at[energy.per_vertex] += count
-    return torch.cat(parts, -1)
+    return torch.cat(blocks, -1)
 
 
-# --- what is differentiable -------------------------------------------------------------------------------------------
+# --- differentiable operators -----------------------------------------------------------------------------------------
 
 
 def _split(points: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -409,18 +416,18 @@ pair_lag = Differentiable(
 )  # fmt: skip
 
 
-def _rubbing_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
+def _friction_lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
     x, collider, kappa, friction, damping, origin = saved
     given = (x.new_empty((0,)) if bar is None else bar for bar in bars)
-    points, *others = raw.contact_rubbing_backward(*given, x, origin, collider, kappa, friction, damping, *rest)
+    points, *others = raw.contact_friction_lag_backward(*given, x, origin, collider, kappa, friction, damping, *rest)
     return *_split(points, x), *others
 
 
 # Friction coefficient times normal force [N], damping [N s/m], normal and weights of each pair [pairs, 9], and the
 # forces of pairs on corner points [B, N, 3] [N], of x, collider, kappa, friction, damping, origin; pairs, constants,
 # ptr, entry. friction, damping: [1 | B], or empty without.
-pair_rubbing = Differentiable(
-    lambda x, collider, kappa, friction, damping, origin, *listed: raw.contact_rubbing(x, origin, collider, kappa,
+pair_friction_lag = Differentiable(
+    lambda x, collider, kappa, friction, damping, origin, *listed: raw.contact_friction_lag(x, origin, collider, kappa,
                                                                                        friction, damping, *listed),
-    _rubbing_reverse, arguments=10, inputs=5, outputs=2, tensors=6,
+    _friction_lag_reverse, arguments=10, inputs=5, outputs=2, tensors=6,
 )  # fmt: skip

@@ -37,7 +37,8 @@ SWEEP_ADJOINTS, STEP_ADJOINTS, TOUCHING_ADJOINTS = (
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 THREAD = 1  # the regime whose tape has scenes last; twin of kThread in csrc/cuda/step.h
-WAYS = ("bends", "driven", "apart", "stretched", "falls")  # of vertices of a body, as Way in csrc/contact/motion.h
+# Of vertices of a body; twins of DisplacementKind in csrc/contact/motion.h.
+DISPLACEMENTS = ("bends", "driven", "apart", "stretched", "gravity")
 
 
 class SweepFields(NamedTuple):
@@ -69,7 +70,7 @@ class SweepFields(NamedTuple):
     lag_entry: Tensor | None = None
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     center: Tensor | None = None  # [B, V, 3] from where a vertex may go,
-    room: Tensor | None = None  # [B, V] as far as this [m]
+    trust_radius: Tensor | None = None  # [B, V] as far as this [m]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
     # [B, 9 cells]  Cholesky factors (CUDA: inverses), with vertex energies the matrices; its adjoint is the matrix's
@@ -121,7 +122,7 @@ class TouchingFields(NamedTuple):
     order: Tensor  # [V] int32, vertices by body
     ptr: Tensor  # [bodies + 1] int32
     free: Tensor  # [bodies] bool: nothing of it is pinned
-    held: Tensor  # [N] bool, of all corner points: pinned, or of a collider
+    pinned: Tensor  # [N] bool, of all corner points: pinned, or of a collider
     body: Tensor  # [N] int32
     collider: Tensor  # as in SweepFields, as are the rest
     collider_prev: Tensor
@@ -136,7 +137,7 @@ class TouchingFields(NamedTuple):
     lag_entry: Tensor
     floor_lag: Tensor
     center: Tensor
-    room: Tensor
+    trust_radius: Tensor
 
 
 class CoarseFields(NamedTuple):

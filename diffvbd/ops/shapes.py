@@ -18,6 +18,7 @@ from .fields import (
     CONSTANTS,
     COUNTS,
     CROSSING_ROW,
+    DISPLACEMENTS,
     FEW,
     LAG_SCALARS,
     LANES,
@@ -30,7 +31,6 @@ from .fields import (
     SWEEP_ADJOINTS,
     TET_READS_X_PREV,
     UNKNOWNS,
-    WAYS,
     CoarseSizes,
     corrections_shape,
     most_grouped,
@@ -67,8 +67,8 @@ def _sweep(a: Any) -> Any:
     x = a.x_start
     tape = new(x, *tape_shape(x, a.sizes, a.energies, a.sweeps, a.launch, a.tape_policy))
     done = corrections_shape(x, a.coarse, a.sweeps, a.energies) if a.coarse_plan.numel() else (0,)
-    cut = (x.shape[0] if a.energies & CONTACT else 0, a.sweeps, x.shape[1])
-    return torch.empty_like(x), tape, new(x, *cut, dtype=BYTE), new(x, *done)
+    limits = (x.shape[0] if a.energies & CONTACT else 0, a.sweeps, x.shape[1])
+    return torch.empty_like(x), tape, new(x, *limits, dtype=BYTE), new(x, *done)
 
 
 def _body_adjoints(x: Tensor, a: Any, wants: Sequence[bool]) -> list[Tensor]:
@@ -168,14 +168,14 @@ def _contact_detect(a: Any) -> Any:
             new(x, COUNTS, dtype=LONG), new(x, b))  # fmt: skip
 
 
-def _contact_keep(a: Any) -> Any:
+def _contact_compact(a: Any) -> Any:
     count, like = torch.library.get_ctx().new_dynamic_size() if a.exact else a.pairs.shape[0], a.constants
     return (new(like, count, dtype=LONG), new(like, count, a.pairs.shape[1], dtype=INT),
             new(like, count, like.shape[1]), new(like, *a.ptr.shape, dtype=INT),
             new(like, 4 * count, dtype=INT))  # fmt: skip
 
 
-def _contact_rooms(a: Any) -> Any:
+def _contact_trust_radii(a: Any) -> Any:
     b, n = a.x.shape[0], _bodies(a)
     return (new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1),
             new(a.x, b, n))  # fmt: skip
@@ -229,7 +229,7 @@ TABLE: dict[str, Row] = {
     "rigid_backward": _rigid_backward,
     "begin": _begin,
     "begin_backward": _begin_backward,
-    "potential_rise": lambda a: new(a.x, a.x.shape[0], a.ptr.shape[0] - 1, 2, dtype=DOUBLE),
+    "potential_increase": lambda a: new(a.x, a.x.shape[0], a.ptr.shape[0] - 1, 2, dtype=DOUBLE),
     "coarse_matrix": lambda a: new(a.x_prev, a.x_prev.shape[0], 9 * a.mass.shape[-1]),
     "coarse_matrix_backward": lambda a: (torch.empty_like(a.x_prev),
                                          new(a.x_prev, a.x_prev.shape[0], *a.stiffness.shape[1:]),
@@ -241,17 +241,17 @@ TABLE: dict[str, Row] = {
     "contact_detect": _contact_detect,
     "contact_intersections": lambda a: (new(a.x, a.capacity, CROSSING_ROW, dtype=INT),
                                         new(a.x, a.x.shape[0], 2, dtype=LONG), new(a.x, a.x.shape[0], 2, 2, dtype=INT)),
-    "contact_motion": lambda a: (torch.empty_like(a.x), new(a.x, len(WAYS), a.x.shape[0], _bodies(a)),
+    "contact_motion": lambda a: (torch.empty_like(a.x), new(a.x, len(DISPLACEMENTS), a.x.shape[0], _bodies(a)),
                                  new(a.x, a.x.shape[0], _bodies(a), 4)),
-    "contact_rooms": _contact_rooms,
-    "contact_sweep_rooms": lambda a: new(a.x, *a.x.shape[:2]),
+    "contact_trust_radii": _contact_trust_radii,
+    "contact_sweep_radii": lambda a: new(a.x, *a.x.shape[:2]),
     "contact_advance": lambda a: (new(a.x, *a.x.shape[:2]), new(a.x, 1, dtype=LONG)),
-    "contact_narrow": lambda a: torch.empty_like(a.constants),
-    "contact_keep": _contact_keep,
+    "contact_refresh_gaps": lambda a: torch.empty_like(a.constants),
+    "contact_compact": _contact_compact,
     "contact_lag": lambda a: new(a.x, a.pairs.shape[0], LAG_SCALARS),
     "contact_lag_backward": lambda a: (_points(a.x, a.collider), new(a.x, a.x.shape[0])),
-    "contact_rubbing": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), _points(a.x, a.collider)),
-    "contact_rubbing_backward": lambda a: (_points(a.x, a.collider), *(new(a.x, a.x.shape[0] if t.numel() else 0)
+    "contact_friction_lag": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), _points(a.x, a.collider)),
+    "contact_friction_lag_backward": lambda a: (_points(a.x, a.collider), *(new(a.x, a.x.shape[0] if t.numel() else 0)
                                                                        for t in (a.kappa, a.friction, a.damping))),
     "contact_rigid_system": _contact_rigid_system,
     "contact_rigid_move": _contact_rigid_move,

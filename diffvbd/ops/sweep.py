@@ -53,18 +53,18 @@ def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: Swee
     return raw.sweep(*given, plan, *settings, tape_policy, debug_step, checked)
 
 
-def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, cut: Tensor, fields: SweepFields,
-                   packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
-                   wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
+def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, limits: Tensor, fields: SweepFields,
+                   packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int, wants: dict[str, bool]
+                   ) -> dict[str, Tensor]:  # fmt: skip
     """Adjoints of the fields by name; an empty tape: the sweeps run again. ``wants``: of SWEEP_ADJOINTS."""
     given = listed(fields, packed_rest, plan, settings)
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
-        x, tape, cut, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
+        x, tape, limits, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
     material = wants["mu"] or wants["lam"] or wants["corners_prev"]
     flags = [material, wants["mass"], wants["rest"], wants["energy_data"], wants["coarse_factor"]]
     bars = raw.sweep_backward(
-        *given, x_bar.contiguous(), x, tape, corrections, cut, plan, *settings, tape_policy, flags
+        *given, x_bar.contiguous(), x, tape, corrections, limits, plan, *settings, tape_policy, flags
     )
     return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
 
@@ -90,8 +90,8 @@ def fused_step_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, t
     return dict(zip(STEP_ADJOINTS, bars, strict=True))
 
 
-def potential_rise(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor, rest: Tensor, index: Sequence[Tensor],
-                   data_count: Sequence[int], time_step: float) -> Tensor:  # fmt: skip
+def potential_increase(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor, rest: Tensor,
+                       index: Sequence[Tensor], data_count: Sequence[int], time_step: float) -> Tensor:  # fmt: skip
     """By how much the potential of each body rises from x to ``to`` [kg m^2, times h^2], and the sum of the sizes of
     its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may.
 
@@ -103,5 +103,5 @@ def potential_rise(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor,
     """
     absent = x.new_empty((0,))
     origin = absent if fields.origin is None else fields.origin
-    return raw.potential_rise(x, to, fields.x_prev, fields.y, fields.mass, fields.energy_data, origin, material, rest,
-                              *index, list(data_count), time_step)  # fmt: skip
+    return raw.potential_increase(x, to, fields.x_prev, fields.y, fields.mass, fields.energy_data, origin, material,
+                                  rest, *index, list(data_count), time_step)  # fmt: skip

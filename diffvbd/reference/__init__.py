@@ -4,13 +4,13 @@ It is the oracle of the exactness tests and the unrolled opponent in benchmarks.
 not from the pair scalars of the compiled sweep, and imports nothing compiled, so the two agree only if both are right.
 """
 
-from .contact import Part, contact_step
+from .contact import Substep, contact_step
 from .distance import intersections
 from .scene import build_layout
 from .sweep import Trajectory, incremental_potential, residual, rollout, step, stepper
 
 __all__ = [
-    "Part",
+    "Substep",
     "Trajectory",
     "build_layout",
     "contact_step",

@@ -178,9 +178,9 @@ class Coarse:
         for _ in range(HALVINGS):
             there = state + self._of_vertices(s) * p
             after = self._terms(there, y, x_prev)
-            rise = per_body([(b - a, body) for (a, body), (b, _) in zip(before, after, strict=True)])
+            increase = per_body([(b - a, body) for (a, body), (b, _) in zip(before, after, strict=True)])
             admitted = [admits(self.energies, there, state, moved) for moved in self.moved]
-            good = rise <= DECREASE * s * slope + slack
+            good = increase <= DECREASE * s * slope + slack
             if admitted:
                 good = good & torch.stack(torch.broadcast_tensors(*admitted), -1)
             found = found | good

@@ -1,8 +1,8 @@
 """One step with contact between bodies, in plain torch: barrier, damping and friction of pairs, starts, limits, rigid
 corrections.
 
-Which pairs there are, which bodies move together and what a step has decided are data (`Part`); everything that follows
-from them is computed here from positions and differentiated by autograd.
+Pairs, islands and decisions of a step are data (`Substep`). The rest is computed here from positions and differentiated
+by autograd.
 Source: Li et al. 2020 (barrier, mollifier, friction).
 """
 
@@ -22,34 +22,36 @@ from .scene import Scene, build_layout, build_scene, dot, outer6
 from .sweep import check_start, color_masses, executed, predictor, run_sweeps, started
 
 
-class Part(NamedTuple):
-    """One detection and what the part of a step has decided: data without gradient, of B scenes with N corner points,
-    mesh vertices before colliders."""
+class Substep(NamedTuple):
+    """One detection and the decisions of its substep: data without gradient, of B scenes with N corner points, mesh
+    vertices before colliders."""
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
     constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
-    shares: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
-    # [1 to 3, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    fractions: Tensor  # [2, B, V]: step fractions of the two displacements of the start
+    # [1 to 3, B, bodies]: step fractions of the rigid motions before and after the sweeps
     corrections: Tensor
-    limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
-    frames: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
+    limits: Tensor | None = None  # [K, B, V]: step fraction of each update
+    rigid_fraction: Tensor | None = None  # [B, bodies]: step fractions of the rigid motions of the start; None: none
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
-    lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
-    sweeps: int | None = None  # None: its share of those of the step
+    support_vertex: Tensor | None = (
+        None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
+    )
+    sweeps: int | None = None  # None: an even part of those of the step
     going: Tensor | None = None  # bool [B, 1, 1]: scenes that it is for; None: all
-    resting: Tensor | None = None  # bool [B, V]: vertices that begin without gravity's fall; None: none
+    resting: Tensor | None = None  # bool [B, V]: vertices that begin without their gravity move; None: none
 
 
 class Pairs:
-    """The listed pairs of a part, and for each color the (pair, local corner) of its vertices, sorted by pair.
+    """The listed pairs of a substep, and for each color the (pair, local corner) of its vertices, sorted by pair.
 
     order: permutation [Q] of the pairs, which changes only the order of summation.
     """
 
-    def __init__(self, scene: Scene, part: Part, order: Tensor | None) -> None:
-        order = torch.arange(len(part.pairs), device=part.pairs.device) if order is None else order
-        rows, constants = part.pairs[order], scene.tensor(part.constants)[order]
+    def __init__(self, scene: Scene, substep: Substep, order: Tensor | None) -> None:
+        order = torch.arange(len(substep.pairs), device=substep.pairs.device) if order is None else order
+        rows, constants = substep.pairs[order], scene.tensor(substep.constants)[order]
         self.corners, self.kind, self.batch = rows[:, :4], rows[:, 4], rows[:, 5]
         self.dhat, self.offset, self.threshold = constants[:, :3].unbind(1)
         self.lead = scene.like.shape[:-2]
@@ -94,7 +96,7 @@ class Pairs:
 
 
 class PairBarrier:
-    """e b(d - offset) over the pairs of a part.
+    """e b(d - offset) over the pairs of a substep.
 
     The block drops b' Hess d and the curvature of the mollifier e, and takes the stiffness of a pair once for each of
     its corners of the color: they move at once.
@@ -150,8 +152,8 @@ class LaggedPairForces:
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
         force = -e * first
         whole = force + FADE * kappa * pairs.dhat
-        share = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
-        self.damping = share * pairs.per_pair(scene.parameter(model.contact, "damping"))
+        fraction = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
+        self.damping = fraction * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
@@ -159,7 +161,7 @@ class LaggedPairForces:
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Approach n.m [n], which is damped (else 0), slip u [3, n] and weights [n, 4] of some pairs."""
+        """Approach n.m [n], which is damped (else 0), tangential motion u [3, n] and weights [n, 4] of some pairs."""
         slope, normal = self.slope[pair], self.normal[pair]
         weights = (slope * normal[:, None]).sum(-1)
         moved = self.pairs.positions(corner_points(x, self.colliders) - self.start, pair)
@@ -185,8 +187,8 @@ class LaggedPairForces:
 
     def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """As those of the barrier, of friction exactly."""
-        parts = self.damping_on_corners(x), self.friction_on_corners(x)
-        return parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]
+        damping, friction = self.damping_on_corners(x), self.friction_on_corners(x)
+        return damping[0] + friction[0], damping[1] + friction[1]
 
     def damping_on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
         along, _, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
@@ -221,7 +223,7 @@ def contact_step(
     *,
     mu: Any = 0.0,
     lam: Any = 0.0,
-    parts: Sequence[Part],
+    substeps: Sequence[Substep],
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
@@ -231,24 +233,22 @@ def contact_step(
     colliders_before: Tensor | None = None,
     order: Sequence[Tensor] | None = None,
     tet_order: Tensor | None = None,
-    chord: float = 1.0,
+    lookback: float = 1.0,
     **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
 
-    Arguments of `step`, and: parts, one for each detection, scenes counted in
+    Arguments of `step`, and: substeps, one for each detection, scenes counted in
     row-major order of x's leading dimensions; colliders and colliders_before: positions [..., Vc, 3] [m] of collider
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
-    permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation; chord:
-    how far back along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h.
-    parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction".
-    Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
-    Returns (x', v').
-    """
+    permutation of the pairs for each substep, tet_order one of the tets: they change only the order of summation;
+    lookback: distance back along h v at which a vertex counts as having been, over h v, 1 where v = (x - x_prev) / h.
+    parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction". Raises ValueError when an unpinned
+    vertex starts below a floor plane, or when substeps or order have another length. Returns (x', v')."""
     model, time_step, sweeps = executed(model, solver), solver.time_step, solver.sweeps
-    count = model.contact.detections or len(parts)
-    stages = model.contact.detections or 1  # of what is prescribed
-    for name, value in (("parts", parts), ("order", order)):
+    count = model.contact.detections or len(substeps)
+    prescribed_substeps = model.contact.detections or 1
+    for name, value in (("substeps", substeps), ("order", order)):
         if value is not None and len(value) != count:
             raise ValueError(f"{name}: expected one for each of {count} detections, got {len(value)}")
     scene = build_scene(
@@ -268,54 +268,60 @@ def contact_step(
     masses = color_masses(scene)
     end = _collider_rows(scene, model.collider_points if colliders is None else colliders)
     begin = end if colliders_before is None else _collider_rows(scene, colliders_before)
-    listed = [Pairs(scene, part, None if order is None else order[r]) for r, part in enumerate(parts)]
+    listed = [Pairs(scene, substep, None if order is None else order[r]) for r, substep in enumerate(substeps)]
 
     y = predictor(scene, x, v, force, gravity, prescribed).transpose(-1, -2)
     x_prev, pinned = x.transpose(-1, -2), model.pinned
     check_start(energies, x_prev)
     start = corner_points(x_prev, begin)
-    coasting = torch.where(pinned, y, x_prev + time_step * v.transpose(-1, -2))
-    way, lift, state = coasting - x_prev, y - coasting, x_prev
+    inertial = torch.where(pinned, y, x_prev + time_step * v.transpose(-1, -2))
+    displacement, h2a, state = inertial - x_prev, y - inertial, x_prev
     free = torch.zeros(int(model.body.max()) + 1).to(x).index_add(0, model.body, pinned.to(x))[model.body] == 0
-    way = left = coasted(scene, x_prev, way, free, chord)
-    for r, part in enumerate(parts):
-        before, now = (begin + min(1.0, n / stages) * (end - begin) for n in (r, r + 1))
-        move = left if stages == 1 else torch.where(pinned, way / stages, left)
-        fall = lift if r == 0 else torch.zeros_like(lift)
+    displacement = remaining = extrapolation(scene, x_prev, displacement, free, lookback)
+    for r, substep in enumerate(substeps):
+        before, now = (begin + min(1.0, n / prescribed_substeps) * (end - begin) for n in (r, r + 1))
+        move = remaining if prescribed_substeps == 1 else torch.where(pinned, displacement / prescribed_substeps,
+                                                                      remaining)  # fmt: skip
+        gravity_move = h2a if r == 0 else torch.zeros_like(h2a)
         if r == 0:
-            fall = lift = unsupported(scene, listed[0], floor, x_prev, before, lift)
-            if part.resting is not None:
-                fall = lift = torch.where(part.resting.reshape(*x.shape[:-2], 1, -1), 0.0, lift)
+            gravity_move = h2a = residual_acceleration(scene, listed[0], floor, x_prev, before, h2a)
+            if substep.resting is not None:
+                gravity_move = h2a = torch.where(substep.resting.reshape(*x.shape[:-2], 1, -1), 0.0, h2a)
         if model.starts_from == "inertia":
-            fall = torch.zeros_like(fall)
+            gravity_move = torch.zeros_like(gravity_move)
         begun = at = state
-        u = Translation(scene, part, state, move, floor).u
+        u = Translation(scene, substep, state, move, floor).u
         stopped = torch.zeros_like(x[..., 0], dtype=torch.bool)
-        for wanted, by, share in ((move, u, part.shares[0]), (fall, torch.zeros_like(u), part.shares[1])):
-            base, share = at + by, share.reshape(*x.shape[:-2], 1, -1).to(at)
+        for wanted, by, fraction in ((move, u, substep.fractions[0]),
+                                     (gravity_move, torch.zeros_like(u), substep.fractions[1])):  # fmt: skip
+            base, fraction = at + by, fraction.reshape(*x.shape[:-2], 1, -1).to(at)
             target = at + wanted
             if floor is not None:
                 target = base + started(energies, base, target - base)
-            if by is u and part.frames is not None:
-                frames = part.frames.to(at)[:, model.body].reshape(*x.shape[:-2], 1, -1)
-                beside = rigid_way(scene, state, move) - u
+            if by is u and substep.rigid_fraction is not None:
+                rigid_fraction = substep.rigid_fraction.to(at)[:, model.body].reshape(*x.shape[:-2], 1, -1)
+                relative = rigid_displacement(scene, state, move) - u
                 if floor is not None:
-                    beside, stopped = above_floor(floor, model, base, beside)
-                base = base + frames * beside
-            at = torch.where(pinned, at + wanted, base + share * (target - base))
+                    relative, stopped = above_floor(floor, model, base, relative)
+                base = base + rigid_fraction * relative
+            at = torch.where(pinned, at + wanted, base + fraction * (target - base))
         forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
         correct = Correction(scene, energies, forces, y, x_prev)
-        state = correct(at, part.corrections[0])
-        number = sweeps // count + (1 if r < sweeps % count else 0) if part.sweeps is None else part.sweeps
+        state = correct(at, substep.corrections[0])
+        number = sweeps // count + (1 if r < sweeps % count else 0) if substep.sweeps is None else substep.sweeps
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
-            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
-            for shares in part.corrections[1:]:  # of those that do not move again it is 0
-                state = correct(state, shares)
-        if part.going is not None:
-            state = torch.where(part.going.reshape(*x.shape[:-2], 1, 1), state, begun)
-        short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned & ~(stopped & free).unsqueeze(-2)
-        left = torch.where(short, x_prev + way + lift - state, 0.0)
+            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, substep)
+            for fractions in substep.corrections[1:]:  # of those that do not move again it is 0
+                state = correct(state, fractions)
+        if substep.going is not None:
+            state = torch.where(substep.going.reshape(*x.shape[:-2], 1, 1), state, begun)
+        truncated = (
+            (substep.fractions.amin(0) < TRUNCATED).reshape(*x.shape[:-2], 1, -1)
+            & ~pinned
+            & ~(stopped & free).unsqueeze(-2)
+        )
+        remaining = torch.where(truncated, x_prev + displacement + h2a - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()
     return x_new, (x_new - x) / time_step
 
@@ -332,49 +338,50 @@ def corner_points(x: Tensor, colliders: Tensor) -> Tensor:
 
 
 class Translation:
-    """Of the island of each vertex [..., 3, V]: the mean of where its vertices want to go, above the floor."""
+    """Translation of the island of each vertex [..., 3, V]: the mean wanted displacement, above the floor."""
 
-    def __init__(self, scene: Scene, part: Any, x: Tensor, wanted: Tensor, floor: FloorBarrier | None) -> None:
-        rows = wanted.transpose(-1, -2).reshape(len(part.island), x.shape[-1], 3)
-        u = self._mean(scene, part, rows).transpose(-1, -2).reshape(x.shape)
-        if floor is not None and part.lowest is not None:
-            u = self._above(floor, u, x, part.lowest[:, scene.model.body].reshape(*x.shape[:-2], x.shape[-1], -1))
+    def __init__(self, scene: Scene, substep: Any, x: Tensor, wanted: Tensor, floor: FloorBarrier | None) -> None:
+        rows = wanted.transpose(-1, -2).reshape(len(substep.island), x.shape[-1], 3)
+        u = self._mean(scene, substep, rows).transpose(-1, -2).reshape(x.shape)
+        if floor is not None and substep.support_vertex is not None:
+            support = substep.support_vertex[:, scene.model.body].reshape(*x.shape[:-2], x.shape[-1], -1)
+            u = self._above(floor, u, x, support)
         self.u = u
 
     @staticmethod
-    def _mean(scene: Scene, part: Any, wanted: Tensor) -> Tensor:
+    def _mean(scene: Scene, substep: Any, wanted: Tensor) -> Tensor:
         """u [B, V, 3]: mean of `wanted` [B, V, 3], weighted by mass, over the vertices of a vertex's island."""
         model = scene.model
-        label = part.island[:, model.body]
+        label = substep.island[:, model.body]
         moves = label >= 0
         label = label.clamp(min=0)
         mass = scene.mass.expand(scene.like.shape[:-1]).reshape(label.shape)
         mass = torch.where(model.pinned, 0.0, mass)
         columns = torch.cat((mass[..., None] * wanted, mass[..., None]), -1)
         index = label[..., None].expand_as(columns)
-        sums = columns.new_zeros(len(label), part.island.shape[1], 4).scatter_add(1, index, columns).gather(1, index)
+        sums = columns.new_zeros(len(label), substep.island.shape[1], 4).scatter_add(1, index, columns).gather(1, index)
         total = torch.where(moves, sums[..., 3], 1.0)
         return torch.where(moves[..., None], sums[..., :3] / total[..., None], 0.0)
 
     @staticmethod
-    def _above(floor: FloorBarrier, u: Tensor, x: Tensor, lowest: Tensor) -> Tensor:
-        """u [..., 3, V], down at most until the lowest vertex [..., V, planes] comes within dhat of a plane."""
+    def _above(floor: FloorBarrier, u: Tensor, x: Tensor, support_vertex: Tensor) -> Tensor:
+        """u [..., 3, V], limited so that the support vertex [..., V, planes] stays dhat above each plane."""
         lead, count = x.shape[:-2], x.shape[-1]
         gap = floor.gap(x)  # [..., planes, V]
-        room = (gap.gather(-1, lowest.transpose(-1, -2)) - floor.dhat).clamp(min=0)
+        allowance = (gap.gather(-1, support_vertex.transpose(-1, -2)) - floor.dhat).clamp(min=0)
         normal = floor.normal.expand(*lead, *floor.normal.shape[-3:]).expand(*lead, -1, 3, count)
         slack = 8 * torch.finfo(x.dtype).eps * dot(u, u).detach().sqrt().unsqueeze(-2)
-        for plane in range(room.shape[-2]):
+        for plane in range(allowance.shape[-2]):
             n = normal[..., plane, :, :]
-            u = u + (-dot(n, u) - room[..., plane, :]).clamp(min=0).unsqueeze(-2) * n
+            u = u + (-dot(n, u) - allowance[..., plane, :]).clamp(min=0).unsqueeze(-2) * n
         down = -dot(normal, u.unsqueeze(-3))
-        safe = (down <= room * (1 + 1e-6) + slack).all(-2)
+        safe = (down <= allowance * (1 + 1e-6) + slack).all(-2)
         return torch.where(safe.unsqueeze(-2), u, 0.0)
 
 
-def unsupported(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor, colliders: Tensor, lift: Tensor
-                ) -> Tensor:  # fmt: skip
-    """What barriers at the start of the step leave of the ways [..., 3, V] that bodies want to fall."""
+def residual_acceleration(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor, colliders: Tensor,
+                          h2a: Tensor) -> Tensor:  # fmt: skip
+    """Residual acceleration times h^2 [..., 3, V] of bodies after the barriers at the start of the step."""
     model, scenes, count = scene.model, len(colliders), int(scene.model.body.max()) + 1
     points = corner_points(x, colliders)
     gap, slope, e, _ = pairs.measures(points, torch.arange(len(pairs.kind), device=x.device))
@@ -385,32 +392,32 @@ def unsupported(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor,
     force = force[:, : x.shape[-1]]
     if floor is not None:
         _, slope, _ = log_barrier(floor.gap(x), floor.kappa, floor.dhat)
-        lifted = -(slope.unsqueeze(-2) * floor.normal).sum(-3)
-        force = force + lifted.transpose(-1, -2).reshape(force.shape)
+        floor_force = -(slope.unsqueeze(-2) * floor.normal).sum(-3)
+        force = force + floor_force.transpose(-1, -2).reshape(force.shape)
     mass = scene.mass.expand(*x.shape[:-2], x.shape[-1]).reshape(scenes, -1, 1)
-    way = lift.transpose(-1, -2).reshape(force.shape)
+    displacement = h2a.transpose(-1, -2).reshape(force.shape)
     free = ~model.pinned
-    columns = torch.where(free[:, None], torch.cat([mass * way, scene.time_step**2 * force, mass], -1), 0.0)
+    columns = torch.where(free[:, None], torch.cat([mass * displacement, scene.time_step**2 * force, mass], -1), 0.0)
     sums = columns.new_zeros(scenes, count, 7).index_add(1, model.body, columns)
     own, borne = (sums[..., i : i + 3] / sums[..., 6:].clamp(min=1e-300) for i in (0, 3))
     square = (borne**2).sum(-1, keepdim=True)
-    share = (-(own * borne).sum(-1, keepdim=True) / square.clamp(min=1e-300)).clamp(0, 1)
+    fraction = (-(own * borne).sum(-1, keepdim=True) / square.clamp(min=1e-300)).clamp(0, 1)
     pinned = torch.zeros(count, device=x.device).index_add(0, model.body, model.pinned.float()) > 0
-    taken = torch.where(pinned[:, None], 0.0, share * borne)[:, model.body]
-    way = torch.where(free[:, None], way + taken, way)
-    return way.transpose(-1, -2).reshape(x.shape)
+    taken = torch.where(pinned[:, None], 0.0, fraction * borne)[:, model.body]
+    displacement = torch.where(free[:, None], displacement + taken, displacement)
+    return displacement.transpose(-1, -2).reshape(x.shape)
 
 
-def rigid_way(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
-    """The shift and the linearised turn of each body that have the momenta of the ways [..., 3, V]."""
-    model, way, at = scene.model, move.transpose(-1, -2), x.transpose(-1, -2)
+def rigid_displacement(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
+    """Translation and linearised rotation of each body with the momenta of the displacements [..., 3, V]."""
+    model, displacement, at = scene.model, move.transpose(-1, -2), x.transpose(-1, -2)
     mass = scene.mass.expand(at.shape[:-1])[..., None]
     eye, out = torch.eye(3).to(x), torch.zeros_like(at)
     for body in range(int(model.body.max()) + 1):
         own = model.body == body
         if bool(model.pinned[own].any()):
             continue
-        m, d, p = mass[..., own, :], way[..., own, :], at[..., own, :]
+        m, d, p = mass[..., own, :], displacement[..., own, :], at[..., own, :]
         whole = m.sum(-2, keepdim=True)
         arm, shift = p - (m * p).sum(-2, keepdim=True) / whole, (m * d).sum(-2, keepdim=True) / whole
         spread = (m[..., None] * arm[..., None] * arm[..., None, :]).sum(-3)
@@ -421,42 +428,41 @@ def rigid_way(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
     return out.transpose(-1, -2)
 
 
-def coasted(scene: Scene, x: Tensor, way: Tensor, free: Tensor, chord: float) -> Tensor:
-    """The ways [..., 3, V] of free bodies without what stretches them. free: bool [V]."""
+def extrapolation(scene: Scene, x: Tensor, displacement: Tensor, free: Tensor, lookback: float) -> Tensor:
+    """Displacements [..., 3, V] without the stretch of free bodies. free: bool [V]."""
     model = scene.model
     mass = scene.mass.expand(x[..., 0, :].shape).unsqueeze(-2)
     for number in model.body[free].unique().tolist():
         own = (model.body == number).nonzero()[:, 0]
-        mine = turned(mass[..., own], x[..., own], way[..., own], chord)
-        way = way.index_copy(-1, own, mine)
-    return way
+        mine = turned(mass[..., own], x[..., own], displacement[..., own], lookback)
+        displacement = displacement.index_copy(-1, own, mine)
+    return displacement
 
 
-SHORT = 0.99  # share of a way that counts as all of it
+TRUNCATED = 0.99  # step fraction below which a displacement counts as truncated
 KEPT, DEEP, KEPT_DEEP = 0.9, 0.1, 0.1  # of a gap; of dhat, and of a gap below that
 
 
-def above_floor(floor: FloorBarrier, model: Any, x: Tensor, way: Tensor) -> tuple[Tensor, Tensor]:
-    """What the floor leaves of the ways [..., 3, V] of bodies as wholes, and which vertices are of bodies that it stops
-    [..., V]."""
-    lead, out, stopped = x.shape[:-2], way, torch.zeros_like(x[..., 0, :], dtype=torch.bool)
+def above_floor(floor: FloorBarrier, model: Any, x: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacements [..., 3, V] of whole bodies limited by the floor, and vertices of stopped bodies [..., V]."""
+    lead, out, stopped = x.shape[:-2], displacement, torch.zeros_like(x[..., 0, :], dtype=torch.bool)
     deep, gap = DEEP * floor.dhat, floor.gap(x)  # [..., planes, V]
-    room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
+    allowance = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
     normal = floor.normal.expand(*lead, *floor.normal.shape[-3:])  # [..., planes, 3, 1]
-    toward = -(normal * way.unsqueeze(-3)).sum(-2)
+    toward = -(normal * displacement.unsqueeze(-3)).sum(-2)
     for number in range(int(model.body.max()) + 1):
         own = (model.body == number) & ~model.pinned
         if not bool(own.any()):
             continue
-        off, left = toward[..., own] - room[..., own], room[..., own] / toward[..., own].clamp(min=1e-300)
+        off, left = toward[..., own] - allowance[..., own], allowance[..., own] / toward[..., own].clamp(min=1e-300)
         shift = (off.amax(-1).clamp(min=0)[..., None, None] * normal).sum(-3)  # [..., 3, 1]
-        share = torch.where(off > 0, left, 1.0).amin((-2, -1))
+        fraction = torch.where(off > 0, left, 1.0).amin((-2, -1))
         past = off - (normal * shift.unsqueeze(-3)).sum(-2)
         rounding = 1e-12 * (toward[..., own].abs() + shift.abs().sum(-2).unsqueeze(-2))
         good = (past <= rounding).all(-1).all(-1)[..., None, None]
-        mine = torch.where(good, way + shift, share[..., None, None] * way)
+        mine = torch.where(good, displacement + shift, fraction[..., None, None] * displacement)
         out = torch.where(model.body == number, mine, out)
-        stopped = stopped | ((model.body == number) & (share < SHORT)[..., None])
+        stopped = stopped | ((model.body == number) & (fraction < TRUNCATED)[..., None])
     return out, stopped
 
 
@@ -469,19 +475,19 @@ def in_cycles(
     y: Tensor,
     x_prev: Tensor,
     number: int,
-    part: Any,
+    substep: Any,
 ) -> Tensor:
     """The state [..., 3, V] after so many sweeps.
 
     swept(state, x_prev, sweeps, limits, relaxation): the state after some of them. forces: terms of pairs, each with
-    its `on_corners`. part: what has been decided, the Part of a detection.
+    its `on_corners`. substep: decisions.
     """
     lead, model = state.shape[:-2], scene.model
-    limits = None if part.limits is None else part.limits.reshape(number, *lead, 1, -1).to(state)
+    limits = None if substep.limits is None else substep.limits.reshape(number, *lead, 1, -1).to(state)
     last = None if getattr(model, "coarse", None) is None else min(model.relaxation, 1.0)
-    corrections = None if part.lengths is None else Corrections(scene, energies, forces, y, x_prev)
+    corrections = None if substep.lengths is None else Corrections(scene, energies, forces, y, x_prev)
     every = 1 if corrections is None else model.coarse.every
-    lengths: Any = part.lengths
+    lengths: Any = substep.lengths
     done, corrected = 0, 0
     while done < number:
         if corrections is not None and done:
@@ -497,7 +503,8 @@ def in_cycles(
 
 
 class Corrections:
-    """Coarse corrections of all bodies of a scene together, against which pairs, friction and vertex energies press."""
+    """Coarse corrections of all bodies of a scene together, with the stiffness of pairs, friction and vertex
+    energies."""
 
     def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
         self.coarse = Coarse(scene, energies, forces)
@@ -518,6 +525,6 @@ class Corrections:
             moved = torch.where(mesh[..., None], weight[torch.where(mesh, pairs.corners, 0)], 0.0)
             for n in range(len(out)):
                 own = pairs.batch == n
-                part = torch.einsum("qaf,qabij,qbg->figj", moved[own], stiffness[own], moved[own])
-                out = out.index_add(0, torch.tensor([n]), part[None])
+                block = torch.einsum("qaf,qabij,qbg->figj", moved[own], stiffness[own], moved[own])
+                out = out.index_add(0, torch.tensor([n]), block[None])
         return out.flatten(-4, -3).flatten(-2, -1).reshape(*state.shape[:-2], *self.matrix.shape[-2:])

@@ -16,16 +16,17 @@ from .scene import Scene, dot
 ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
 MOST_TURN = 0.7  # [rad] in a step, which the start leaves out
-# chords of ways that are tangents of a turn, of implicit Euler's, and of BDF2's after a step from tangents
+# lookback ratios of displacements that are tangents of a rotation, of implicit Euler's, and of BDF2's after a step from
+# tangents
 BETTER = (0.01, 1.0, -0.74)
-FITS = 0.25  # of the squares that one chord leaves: what one that fits better leaves at most
-TURNS = 0.15  # of the squares of all ways: what a wrong chord may leave of a turn alone
-STRETCH = 1e-8  # squared stretch of a step below which all chords are the same
-LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
+FITS = 0.25  # of the squares that one ratio leaves: a better one leaves at most so much
+TURNS = 0.15  # of the squares of all displacements: a wrong ratio may leave so much of a rotation
+STRETCH = 1e-8  # squared stretch of a step below which all ratios agree
+LEAST_FRACTION = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration from which on two more steps are taken
 ARRIVALS = 2
-ROUNDING = 1e-13  # relative rise of the energies that is rounding
+ROUNDING = 1e-13  # relative increase of the energies that is rounding
 FAR = 0.25  # squared angle of a Newton step to the nearest rotation, beyond which steps are shortened
 DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
@@ -70,31 +71,31 @@ class Correction:
             x = self._corrected(body, x, y, x_prev)
         return x
 
-    def coasted(self, body: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Tensor]:
-        """The vertices of one body on their ways from x [..., 3, n] without its turn, as far as all of them may go
-        together; and the share of it that this is [...]."""
-        own = bent(self.scene.mass[..., body].unsqueeze(-2), x, way, chord)[0]
-        to, share = self._toward(x, own)
-        kept, kept_share = self._toward(x, way)  # where planes hold the body back
-        held = share < 1
-        return torch.where(held[..., None, None], kept, to), torch.where(held, kept_share, share)
+    def extrapolation(self, body: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> tuple[Tensor, Tensor]:
+        """Vertices of one body after their displacements from x [..., 3, n] without its rotation, by one fraction that
+        all may take; and this fraction [...]."""
+        own = bent(self.scene.mass[..., body].unsqueeze(-2), x, displacement, lookback)[0]
+        to, fraction = self._toward(x, own)
+        kept, kept_fraction = self._toward(x, displacement)  # where planes block the body
+        blocked = fraction < 1
+        return torch.where(blocked[..., None, None], kept, to), torch.where(blocked, kept_fraction, fraction)
 
     def _toward(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertices after their ways, as far as all of them may go together, and the share of these."""
-        share, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
+        """Vertices after one fraction of their displacements that all may take, and this fraction."""
+        fraction, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
         floors = [e for e in self.energies if hasattr(e, "gap")]
         slack = 8 * torch.finfo(x.dtype).eps * step.detach().norm(dim=-2).unsqueeze(-2)
         for energy in floors:
-            room = ETA * (energy.gap(x) - energy.dhat).clamp(min=0)  # [..., planes, n]
+            allowance = ETA * (energy.gap(x) - energy.dhat).clamp(min=0)  # [..., planes, n]
             closing = -dot(energy.normal, step.unsqueeze(-3))
-            bites = closing.detach() > room.detach() + slack
-            part = torch.where(bites, room / torch.where(bites, closing, 1.0), 1.0)
-            share = torch.minimum(share, part.amin(-2).amin(-1, keepdim=True).unsqueeze(-1))
+            bites = closing.detach() > allowance.detach() + slack
+            own = torch.where(bites, allowance / torch.where(bites, closing, 1.0), 1.0)
+            fraction = torch.minimum(fraction, own.amin(-2).amin(-1, keepdim=True).unsqueeze(-1))
         for energy in floors:
-            moved = (x + share * step).detach()
+            moved = (x + fraction * step).detach()
             good = good & clear(energy, moved).all((-2, -1))[..., None, None]
-        share = torch.where(good, share, 0.0)
-        return x + share * step, share.detach()[..., 0, 0]
+        fraction = torch.where(good, fraction, 0.0)
+        return x + fraction * step, fraction.detach()[..., 0, 0]
 
     def _load(self, state: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient [..., 3, V] and block [..., V, 3, 3] of the vertex energies."""
@@ -152,75 +153,77 @@ class Correction:
                 decrease = -(gradient * step).sum(-1)
                 # steps that arrive are taken as well, and whole: they carry the derivative of a body at rest
                 arrives = ~(decrease > ARRIVED * (total * spread)[..., 0, 0])
-                share = self._share(running, arrives, step, turn, at, state, total, target, y_x, placed, body, x_prev)
-                share = torch.where(running, share, 0.0)
+                fraction = self._fraction(running, arrives, step, turn, at, state, total, target, y_x, placed, body,
+                                          x_prev)  # fmt: skip
+                fraction = torch.where(running, fraction, 0.0)
                 arrived = arrived + arrives.to(arrived.dtype)
-                running = running & (share > 0) & (arrived < ARRIVALS)
-            share = share[..., None]
-            turn = turn + _turned_by(share * step[..., :3]) @ turn
-            at = at + (share * step[..., 3:]).unsqueeze(-1)
+                running = running & (fraction > 0) & (arrived < ARRIVALS)
+            fraction = fraction[..., None]
+            turn = turn + _turned_by(fraction * step[..., :3]) @ turn
+            at = at + (fraction * step[..., 3:]).unsqueeze(-1)
             if not bool(running.any()):
                 break
         return torch.where(acts[..., None, None], placed(turn, at), closed)
 
-    def _share(self, running: Tensor, arrives: Tensor, step: Tensor, turn: Tensor, at: Tensor, state: Tensor,
-               total: Tensor, target: Tensor, y_x: Tensor, placed: Any, body: Tensor, x_prev: Tensor
-               ) -> Tensor:  # fmt: skip
-        """The largest of 1, 1/2, 1/4, ... that is admitted and, unless a step arrives, raises no potential; 0: none."""
-        share, found = torch.ones_like(running, dtype=state.dtype), torch.zeros_like(running)
+    def _fraction(self, running: Tensor, arrives: Tensor, step: Tensor, turn: Tensor, at: Tensor, state: Tensor,
+                  total: Tensor, target: Tensor, y_x: Tensor, placed: Any, body: Tensor, x_prev: Tensor
+                  ) -> Tensor:  # fmt: skip
+        """The largest of 1, 1/2, 1/4, ... that is admitted and, unless a step arrives, does not increase the potential;
+        0: none."""
+        fraction, found = torch.ones_like(running, dtype=state.dtype), torch.zeros_like(running)
         value = self._value(state, x_prev)
         for _ in range(HALVINGS):
-            w, t = share[..., None] * step[..., :3], (share[..., None] * step[..., 3:]).unsqueeze(-1)
+            w, t = fraction[..., None] * step[..., :3], (fraction[..., None] * step[..., 3:]).unsqueeze(-1)
             turned = _turned_by(w) @ turn
             there = placed(turn + turned, at + t)
-            rise = (total * dot(t, at - target + t / 2).unsqueeze(-1))[..., 0, 0] - (turned * y_x).sum((-2, -1))
-            rise = rise + self._value(there, x_prev) - value
-            good = admits(self.energies, there, state, body) & ((rise <= ROUNDING * value) | arrives)
+            increase = (total * dot(t, at - target + t / 2).unsqueeze(-1))[..., 0, 0] - (turned * y_x).sum((-2, -1))
+            increase = increase + self._value(there, x_prev) - value
+            good = admits(self.energies, there, state, body) & ((increase <= ROUNDING * value) | arrives)
             found = found | (good & running)
             if bool((found | ~running).all()):
                 break
-            share = torch.where(found, share, share / 2)
-        return torch.where(found, share, 0.0)
+            fraction = torch.where(found, fraction, fraction / 2)
+        return torch.where(found, fraction, 0.0)
 
 
-def bent(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The ways of the vertices of a body [..., 3, n] without its turn; its new shape, and the ends of its ways, both
-    about the center of mass. mass: [..., 1, n]. Where the ways have no rotation they stay as they are."""
+def bent(mass: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Displacements of the vertices of a body [..., 3, n] without its rotation; its new shape, and the ends of its
+    displacements, both about the center of mass. mass: [..., 1, n]. Without a rotation they stay as they are."""
     total = mass.sum(-1, keepdim=True)
-    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
-    r, beside = x - center, way - mean
-    change, left, turns = _straightened(mass, r, beside, chord)
-    size, all_ways = ((mass * a * a).detach().sum((-2, -1), keepdim=True) for a in (r, beside))
-    undecided = turns & (left > STRETCH * size) & (left < TURNS * all_ways)
-    for better in BETTER if chord < 0 else BETTER[:2]:
+    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, displacement))
+    r, beside = x - center, displacement - mean
+    change, left, turns = _straightened(mass, r, beside, lookback)
+    size, all_displacements = ((mass * a * a).detach().sum((-2, -1), keepdim=True) for a in (r, beside))
+    undecided = turns & (left > STRETCH * size) & (left < TURNS * all_displacements)
+    for better in BETTER if lookback < 0 else BETTER[:2]:
         other, less, also = _straightened(mass, r, beside, better)
         fits = undecided & also & (less < FITS * left)
         change, undecided = torch.where(fits, other, change), undecided & ~fits
     return mean + change, r + change, r + beside
 
 
-def _straightened(mass: Tensor, r: Tensor, beside: Tensor, chord: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The ways of a body beside that of its center, without its turn; their squares, by mass; whether it turns."""
-    before = r - chord * beside
-    turn, turns = _turn_or_none((mass * r) @ before.transpose(-1, -2), chord)
-    change = torch.where(turns, (r - turn @ before) / chord, beside)
+def _straightened(mass: Tensor, r: Tensor, beside: Tensor, lookback: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Displacements relative to the center without the rotation; their squares, by mass; whether the body rotates."""
+    before = r - lookback * beside
+    turn, turns = _turn_or_none((mass * r) @ before.transpose(-1, -2), lookback)
+    change = torch.where(turns, (r - turn @ before) / lookback, beside)
     return change, (mass * change * change).detach().sum((-2, -1), keepdim=True), turns
 
 
-def _turn_or_none(b: Tensor, chord: float) -> tuple[Tensor, Tensor]:
-    """The rotation closest to b, and whether there is one that a step may turn by over a share ``chord`` of it."""
+def _turn_or_none(b: Tensor, lookback: float) -> tuple[Tensor, Tensor]:
+    """The rotation closest to b, and whether a step may rotate by so much over the lookback ratio."""
     turn, turns = _polar_or_none(b)
     square = (turn - torch.eye(3, dtype=b.dtype, device=b.device)).detach().square().sum((-2, -1))
-    return turn, turns & (square < 2 * (MOST_TURN * chord) ** 2)[..., None, None]
+    return turn, turns & (square < 2 * (MOST_TURN * lookback) ** 2)[..., None, None]
 
 
-def turned(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> Tensor:
-    """The same, turned as a whole to where the ways point."""
+def turned(mass: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> Tensor:
+    """The same, rotated as a whole toward the ends of the displacements."""
     total = mass.sum(-1, keepdim=True)
-    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
-    _, shape, end = bent(mass, x, way, chord)
+    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, displacement))
+    _, shape, end = bent(mass, x, displacement, lookback)
     turn, turns = _turn_or_none((mass * end) @ shape.transpose(-1, -2), 1.0)
-    return torch.where(turns, mean + turn @ shape - (x - center), way)
+    return torch.where(turns, mean + turn @ shape - (x - center), displacement)
 
 
 def clear(energy: Any, x: Tensor) -> Tensor:
@@ -235,7 +238,7 @@ def admits(energies: list[Any], state: Tensor, before: Tensor, body: Tensor) -> 
     for energy in energies:
         if hasattr(energy, "gap"):
             x = state[..., body]
-            kept = energy.gap(x) >= LEAST_SHARE * energy.gap(before[..., body])
+            kept = energy.gap(x) >= LEAST_FRACTION * energy.gap(before[..., body])
             out = out & (clear(energy, x) & kept).all((-2, -1))
     return out
 

@@ -30,12 +30,12 @@ class Correction:
         pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
         self.free = ~pinned.to(y.device)
 
-    def __call__(self, x: Tensor, share: Tensor) -> Tensor:
-        """The state [..., 3, V] after each body [B, bodies] has taken its share of its motion."""
-        lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(share), -1, 3)
-        mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(share), -1)
-        total = mass.new_zeros(len(share), self.count).index_add(1, self.body, mass)
-        center = rows.new_zeros(len(share), self.count, 3).index_add(1, self.body, mass[..., None] * rows)
+    def __call__(self, x: Tensor, fraction: Tensor) -> Tensor:
+        """The state [..., 3, V] after each body [B, bodies] has taken its fraction of its motion."""
+        lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(fraction), -1, 3)
+        mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(fraction), -1)
+        total = mass.new_zeros(len(fraction), self.count).index_add(1, self.body, mass)
+        center = rows.new_zeros(len(fraction), self.count, 3).index_add(1, self.body, mass[..., None] * rows)
         arm = rows - (center / total[..., None])[:, self.body]
 
         def state(motion: Tensor) -> Tensor:
@@ -45,12 +45,12 @@ class Correction:
             )
             return moved.transpose(-1, -2).reshape(x.shape)
 
-        z = x.new_zeros(len(share), self.count, 6)
+        z = x.new_zeros(len(fraction), self.count, 6)
         jacobian = torch.cat([-_cross_matrix(arm), torch.eye(3).to(x).expand(*arm.shape, 3)], -1)  # [B, V, 3, 6]
         g, blocks = self._single(x, state, z, jacobian, mass)
         at = torch.arange(self.count, device=x.device)
-        matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
-        matrix = matrix.index_put((_scenes(len(share), at), at, at), blocks, accumulate=True)
+        matrix = x.new_zeros(len(fraction), self.count, self.count, 6, 6)
+        matrix = matrix.index_put((_scenes(len(fraction), at), at, at), blocks, accumulate=True)
         for term in self.forces:
             lagged = term.turns_its_body
             force, stiffness = term.damping_on_corners(x) if lagged else term.on_corners(x)
@@ -62,12 +62,12 @@ class Correction:
             """Gradient and matrix [B, bodies 6, bodies 6] after a motion [B, bodies, 6]."""
             moved = rows + (jacobian @ motion[:, self.body, :, None])[..., 0]
             turning = g + torch.einsum("bnmij,bmj->bni", matrix, motion) + LEAST_INERTIA * least * motion
-            turning, stiff = self._rubbed(moved.transpose(-1, -2).reshape(x.shape), jacobian, turning, matrix)
+            turning, stiff = self._with_friction(moved.transpose(-1, -2).reshape(x.shape), jacobian, turning, matrix)
             return self._of_free(turning, stiff, least)
 
-        return state(share.to(x)[..., None] * _least(system, z))
+        return state(fraction.to(x)[..., None] * _least(system, z))
 
-    def _rubbed(self, x: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+    def _with_friction(self, x: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
         """With friction at x."""
         for term in self.forces:
             if term.turns_its_body:
@@ -141,15 +141,15 @@ def _least(system: Callable[[Tensor], tuple[Tensor, Tensor]], motion: Tensor) ->
     with torch.no_grad():
         for _ in range(ITERATIONS):
             g, step = newton(motion)
-            fall, low, high = -(g * step).sum((-2, -1)), torch.zeros(len(g)).to(g), torch.ones(len(g)).to(g)
-            way = step.reshape(motion.shape)
-            over = slope(motion + way, step) > 0.1 * fall
+            decrease, low, high = -(g * step).sum((-2, -1)), torch.zeros(len(g)).to(g), torch.ones(len(g)).to(g)
+            displacement = step.reshape(motion.shape)
+            over = slope(motion + displacement, step) > 0.1 * decrease
             for _ in range(HALVINGS if over.any() else 0):
                 middle = (low + high) / 2
-                falls = slope(motion + middle[:, None, None] * way, step) < 0
-                low, high = torch.where(falls, middle, low), torch.where(falls, high, middle)
-            motion = motion + torch.where(over, high, 1.0)[:, None, None] * way
-            if way.abs().amax() <= SETTLED * motion.abs().amax():
+                descends = slope(motion + middle[:, None, None] * displacement, step) < 0
+                low, high = torch.where(descends, middle, low), torch.where(descends, high, middle)
+            motion = motion + torch.where(over, high, 1.0)[:, None, None] * displacement
+            if displacement.abs().amax() <= SETTLED * motion.abs().amax():
                 break
     return motion + newton(motion)[1].reshape(motion.shape)
 

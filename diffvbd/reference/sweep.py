@@ -112,12 +112,12 @@ def stepper(
     density: Any,
     parameters: dict[str, Any] | None,
     layout: Layout,
-    chord: float = 1.0,
+    lookback: float = 1.0,
 ) -> Callable[..., tuple[Tensor, Tensor]]:
     """Do what is common to all steps of a run, and return the function
     (x, v, force, gravity, prescribed, given=(None, None), record=None) -> (x', v') that makes one.
-    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`; chord: how far back
-    along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h."""
+    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`; lookback: distance back
+    along h v at which a vertex counts as having been, over h v, 1 where v = (x - x_prev) / h."""
     scene = build_scene(
         model,
         layout,
@@ -146,16 +146,17 @@ def stepper(
         record: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         y = predictor(scene, x, v, force, gravity, prescribed)
-        coasting = torch.where(model.pinned[:, None], y, x + time_step * v)
-        x_prev, y, coasting = (a.transpose(-1, -2).contiguous() for a in (x, y, coasting))
+        inertial = torch.where(model.pinned[:, None], y, x + time_step * v)
+        x_prev, y, inertial = (a.transpose(-1, -2).contiguous() for a in (x, y, inertial))
         check_start(energies, x_prev)
-        begun = _start(scene, energies, x_prev, coasting if model.starts_from == "inertia" else y)
+        begun = _start(scene, energies, x_prev, inertial if model.starts_from == "inertia" else y)
         if model.starts_from == "auto":
-            begun = _lower(scene, energies, begun, _start(scene, energies, x_prev, coasting), y, x_prev, correct.others)
+            begun = _lower(scene, energies, begun, _start(scene, energies, x_prev, inertial), y, x_prev, correct.others)
         held = []
         for body in correct.bodies:
-            coasted, share = correct.coasted(body, take(x_prev, body), take(coasting - x_prev, body), chord)
-            begun, held = put(begun, body, coasted), [*held, share < 1]
+            extrapolated, fraction = correct.extrapolation(body, take(x_prev, body), take(inertial - x_prev, body),
+                                                           lookback)  # fmt: skip
+            begun, held = put(begun, body, extrapolated), [*held, fraction < 1]
         state = correct(begun, y, x_prev)
         if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):
             state = _apart(scene, energies, state, _start(scene, energies, x_prev, y), y, x_prev, correct.bodies, held)
@@ -247,7 +248,7 @@ def _lower(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tenso
     out = one
     for body in bodies:
         with torch.no_grad():
-            lower = _rise(scene, energies, one, put(one, body, take(two, body)), y, x_prev) < 0
+            lower = _increase(scene, energies, one, put(one, body, take(two, body)), y, x_prev) < 0
         out = torch.where(lower[..., None, None], put(out, body, take(two, body)), out)
     return out
 
@@ -259,21 +260,23 @@ def _apart(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tenso
     for body, back in zip(bodies, held, strict=True):
         with torch.no_grad():
             exchanged = put(one, body, take(two, body))
-            way, none = exchanged - one, torch.zeros_like(one[..., 0, 0])
-            square = scene.mass * (way**2).sum(-2)
+            displacement, none = exchanged - one, torch.zeros_like(one[..., 0, 0])
+            square = scene.mass * (displacement**2).sum(-2)
             inertia = torch.stack([square[..., corner] for corner in scene.layout.tets]).sum(0)
             size = weighed = none
             for energy in elastic:
-                line = torch.func.jvp(energy.of_tets, (one.detach(),), (way,))  # the energy at one, and its slope
+                line = torch.func.jvp(
+                    energy.of_tets, (one.detach(),), (displacement,)
+                )  # the energy at one, and its slope
                 bend = 2 * (energy.of_tets(exchanged) - line[0] - line[1])  # d . K d, K averaged over the way
                 size = size + bend.abs().sum(-1)
                 weighed = weighed + torch.where(inertia > 0, bend**2 / inertia, 0.0).sum(-1)
-            parts = back & (weighed <= SOFT * size) & (_rise(scene, energies, one, exchanged, y, x_prev) < 0)
+            parts = back & (weighed <= SOFT * size) & (_increase(scene, energies, one, exchanged, y, x_prev) < 0)
         out = torch.where(parts[..., None, None], put(out, body, take(two, body)), out)
     return out
 
 
-def _rise(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
+def _increase(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
     """By how much the incremental potential of the state two lies above that of one, [...]."""
 
     def potential(x: Tensor) -> Tensor:
@@ -373,11 +376,11 @@ def _descending(energies: list[Any], hessian: Tensor, raw: Tensor, update: Tenso
     fraction, found = torch.ones_like(near + whole), torch.zeros_like(near + whole, dtype=torch.bool)
     for _ in range(HALVINGS):
         t, step = fraction * ratio, fraction.unsqueeze(-2) * update
-        rise, size = t**2 / 2 * own - t * whole, t**2 / 2 * own + t * whole
+        increase, size = t**2 / 2 * own - t * whole, t**2 / 2 * own + t * whole
         for barrier in barriers:
             change, of_terms = barrier.change(x, step, x_prev)
-            rise, size = rise + change, size + of_terms
-        found = found | ~(rise > ROUNDING * torch.finfo(x.dtype).eps * size)
+            increase, size = increase + change, size + of_terms
+        found = found | ~(increase > ROUNDING * torch.finfo(x.dtype).eps * size)
         fraction = torch.where(found, fraction, fraction / 2)
     return torch.where(near, torch.where(found, fraction, 0.0), 1.0)
 

@@ -22,7 +22,7 @@ from ..model.system import System
 from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
 from ..step.arguments import Prepared, acceleration_of, collider_state
-from ..step.contact import CUT, outcomes
+from ..step.contact import TRUNCATED, outcomes
 from ..step.integrators import Solve
 from ..step.predict import begin, energy_data
 from ..step.residual import (
@@ -474,13 +474,13 @@ def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Ten
     cuts: cut_share() after each step. The others: of the last step, as above.
     """
     shares = torch.stack(cuts).tolist()
-    cut = max(shares)
+    truncated = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
-    if cut > CUT:
+    if truncated > TRUNCATED:
         warn(
-            f"contact: pairs truncated {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
-            f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
-            f"{percent(CUT)}); " + what_helps(model),
+            f"contact: pairs truncated {percent(truncated)} of the vertices in step {shares.index(truncated)}, which "
+            f"lost velocity and momentum (in {sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than "
+            f"{percent(TRUNCATED)}); " + what_helps(model),
         )
     if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
         faster = ' subspace="coarse",' if model.coarse is None else ""

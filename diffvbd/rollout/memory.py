@@ -20,7 +20,7 @@ from ..model.model import Model
 from ..model.solver import BDF2, VBD
 from ..model.system import System, system_of
 from ..step.advance import cuda_scratch
-from ..step.contact import sweeps_of_parts
+from ..step.contact import sweeps_of_substeps
 from ..step.integrators import solves_of
 
 
@@ -149,7 +149,7 @@ def coarse_scalars(model: System, sweeps: int) -> int:
 
 def _parts(model: System, sweeps: int) -> list[int]:
     """Sweeps of each part of a step: one for each detection of pairs. More parts have fewer cycles, and need less."""
-    return sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections or 1)
+    return sweeps_of_substeps(sweeps, 1 if model.contact is None else model.contact.detections or 1)
 
 
 def _cpu_scratch(model: System, scenes: int, material: bool, rest: bool) -> int:

@@ -33,7 +33,7 @@ from ..step.arguments import (
 )
 from ..step.contact import check_start as refuse_start
 from ..step.integrators import History, check_history, check_staged, solves_of, take
-from ..step.residual import ErrorEstimate, cut_share, error_of, of_steps
+from ..step.residual import ErrorEstimate, error_of, of_steps, truncated_fraction
 from ..step.stability import proven, warn_of_sweeps
 from .checks import Checks, check_checks, checks_contact, look_at_end, look_at_energy, warn_of_contact, warn_of_last_end
 from .memory import BinomialCheckpoints, Segment, choose_schedule, run_segments
@@ -193,7 +193,7 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
             if ending is not None:
                 ending.see(k + 1, now, given["force"], solve, v_before, x, v)
             if looks and not last:  # not in a segment that runs again
-                cuts.append(cut_share(model))
+                cuts.append(truncated_fraction(model))
             if looks and k + 1 == steps and not last:
                 last.extend(((solve.x, solve.v), x, solve.prepared, solve.given))
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):

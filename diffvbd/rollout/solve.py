@@ -225,7 +225,7 @@ class _Sweeping:
         if self.where is None:
             return "with the exact block a relaxation between 1.5 and 1.7"
         outcome = outcomes.get(self.model.model)
-        if outcome is not None and bool(outcome.cut.any()):
+        if outcome is not None and bool(outcome.truncated.any()):
             return "more detections or a larger reach of the PairBarrier, whose pairs have held this step up"
         unused = 'subspace="coarse" or ' if self.model.coarse is None else ""
         return unused + "a larger Friction(velocity=)"

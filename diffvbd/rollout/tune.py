@@ -25,7 +25,7 @@ from ..model.system import system_of
 from ..model.warnings import is_nearly_incompressible
 from ..step.arguments import GRAVITY, Prepared, check_state, given_of, material_of, prepare
 from ..step.integrators import SAME_TIME_STEP
-from ..step.residual import cut_share
+from ..step.residual import truncated_fraction
 from .checks import NONE, mechanical_energy, unbalanced_friction
 from .refine import (
     MOST_SWEEPS,
@@ -984,7 +984,7 @@ class ErrorBudget:
         solver: Whose error it is.
         shares: One for each cause, the largest first, then "all but mesh" together, which need not be their sum.
         duration: Of the motion that was looked at [s].
-        cut: The largest share of vertices that pairs truncated in a step [-]; None without pairs.
+        truncated: The largest fraction of vertices that pairs truncated in a step [-]; None without pairs.
         friction: The share of the friction that the last step left unbalanced [-]; None without friction.
         reached: Whether all runs that others are compared with have steps that balance their forces, to 1 %. Where one
             has not, its note says so, and what is compared with it says little.
@@ -993,7 +993,7 @@ class ErrorBudget:
     solver: VBD
     shares: tuple[Share, ...]
     duration: float
-    cut: float | None
+    truncated: float | None
     friction: float | None
     reached: bool = True
 
@@ -1014,8 +1014,8 @@ class ErrorBudget:
         rows = [(s.cause, shown(s.motion), shown(s.quantity), shown(s.gradient), f"{s.seconds:.2g}", s.note)
                 for s in self.shares]  # fmt: skip
         lines = [f"{self.solver}, {self.duration:.3g} s of motion", *aligned([header, *rows])]
-        if self.cut is not None:
-            lines.append(f"pairs truncated at most {percent(self.cut)} of the vertices in a step")
+        if self.truncated is not None:
+            lines.append(f"pairs truncated at most {percent(self.truncated)} of the vertices in a step")
         if self.friction is not None:
             lines.append(f"{percent(self.friction)} of the friction is not balanced in the last step")
         return "\n".join(lines)
@@ -1079,16 +1079,16 @@ class _Budget:
     def run(self, mesh: bool) -> ErrorBudget:
         p = self.trials
         run = self._run(p, self.own, self.steps)
-        cut, friction = self._contact_of()
+        truncated, friction = self._contact_of()
         self._precision(run)
         converged = self._sweeps(run)
-        self._contact(converged, cut)
+        self._contact(converged, truncated)
         best = self._time(run, converged)
         if mesh:
             self._mesh(converged)
         shares = sorted(self.shares, key=lambda s: -s.motion)
         whole = self._share("all but mesh", run, best, 0.0, f"{best.settings}")
-        return ErrorBudget(self.own, (*shares, whole), p.duration, cut, friction, not self.failed)
+        return ErrorBudget(self.own, (*shares, whole), p.duration, truncated, friction, not self.failed)
 
     @staticmethod
     def _run(trials: TrialRuns, settings: VBD, steps: int) -> TrialRun:
@@ -1140,12 +1140,12 @@ class _Budget:
                          quantity=None if run.quantity is None else run.quantity.double())  # fmt: skip
         self.shares.append(self._share("precision", single, done, seconds, "the same in float64"))
 
-    def _contact(self, converged: TrialRun, cut: float | None) -> None:
+    def _contact(self, converged: TrialRun, truncated: float | None) -> None:
         """Detections share the sweeps of a step: only where each has enough do they tell what pairs have truncated."""
         model, seconds, done, note = self.trials.model, 0.0, converged, "pairs truncated nothing"
-        if cut is None:
+        if truncated is None:
             return
-        if cut > 0:
+        if truncated > 0:
             energies = [replace(e, detections=DETECTIONS) if isinstance(e, PairBarrier) else e for e in model.energies]
             others = replace(self.trials, model=model.replace(energies=energies))
             done, note = self._settled(others, converged.settings, self.steps, "contact")
@@ -1163,18 +1163,18 @@ class _Budget:
         system = system_of(model, settings)
 
         def look(step: int, x: Tensor, v: Tensor) -> None:
-            cuts.append(cut_share(system))
+            cuts.append(truncated_fraction(system))
             if step == self.steps - 1:
                 before[0] = (x, v)
 
         given = p.at_steps(dict(p.given), settings.time_step, self.steps, 0.0)
         end = p.execute(model, p.x, p.v, settings, steps=self.steps, save="last", observe=look, checks=NONE, **given)
-        cut = None if model.contact is None else float(torch.stack(cuts).max())
+        truncated = None if model.contact is None else float(torch.stack(cuts).max())
         if model.friction is None or changes(p.given) or not isinstance(settings.integrator, ImplicitEuler):
-            return cut, None
+            return truncated, None
         inputs = given_of(system, p.given)
         prepared = prepare(system, tuple(p.x.shape[:-2]), inputs, time_step=settings.time_step, sweeps=settings.sweeps)
-        return cut, unbalanced_friction(system, before[0], end.x[-1], prepared, inputs.loads)
+        return truncated, unbalanced_friction(system, before[0], end.x[-1], prepared, inputs.loads)
 
     def _sweeps(self, run: TrialRun) -> TrialRun:
         """The same steps with sweeps enough that more change little."""
@@ -1214,9 +1214,9 @@ class _Budget:
         finer = finer_mesh(p)
         fine, note = self._settled(finer, converged.settings, self.steps, "mesh")
         assert fine.x is not None
-        cut = replace(fine, x=fine.x[..., :vertices, :], gradient=(), quantity=None)
+        truncated = replace(fine, x=fine.x[..., :vertices, :], gradient=(), quantity=None)
         note = f"{finer.model.num_tets} tets, {note}"
-        self.shares.append(self._share("mesh", replace(converged, gradient=()), cut, self._counted(finer), note))
+        self.shares.append(self._share("mesh", replace(converged, gradient=()), truncated, self._counted(finer), note))
 
 
 def _of_parts(value: Any, tets: int) -> Any:

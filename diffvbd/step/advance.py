@@ -65,7 +65,7 @@ def advance(
             count = prepared.settings.sweeps if checking() else 0
             looked_at = replaced(prepared, settings=replaced(prepared.settings, sweeps=count), coarse=None)
             swept(model, begun.detached(), looked_at, given, index=index)
-        return prepared.unrolled(*prepared.time_step_and_sweeps, prepared.chord)(x, v, force, gravity, prescribed)
+        return prepared.unrolled(*prepared.time_step_and_sweeps, prepared.lookback)(x, v, force, gravity, prescribed)
     x_end = swept(model, begun, prepared, given, adjoint, index, where)
     # GlobalAdjoint corrects before it takes the end as the solution
     x_end, v_end = begun.finish(x_end, model, prepared, corrects=not isinstance(adjoint, GlobalAdjoint))

@@ -41,7 +41,7 @@ GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 SCENE_TET = ("scene", "tet")  # what the dimensions of values of tets count
 
 
-CHORD = 1.0  # of implicit Euler, whose velocities are (x - x_prev) / h
+LOOKBACK = 1.0  # of implicit Euler, whose velocities are (x - x_prev) / h
 
 
 class Prepared(NamedTuple):
@@ -54,15 +54,15 @@ class Prepared(NamedTuple):
     parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
     settings: ops.SweepSettings
     coarse: CoarseParts | None = None  # what the coarse corrections of all steps have in common
-    # of a time step, sweeps and a chord, the reference's step, where autograd unrolls it
+    # of a time step, sweeps and a lookback ratio, the reference's step, where autograd unrolls it
     unrolled: Callable[[float, int, float], Callable[..., tuple[Tensor, Tensor]]] | None = None
-    chord: float = CHORD  # how far back along its way h v a vertex is taken to have been (csrc/rigid/coast.h)
-    euler: Tensor | None = None  # bool [B, V]: who takes implicit Euler in a step of another scheme, and its chord
+    lookback: float = LOOKBACK  # over h v; see csrc/sweep/extrapolation.h
+    euler: Tensor | None = None  # bool [B, V]: vertices that take implicit Euler in a step of another scheme
 
-    def ways(self, of: Callable[[float], Tensor]) -> Tensor:
-        """of(chord) [B, V, 3], each vertex by the chord of its scheme."""
-        own = of(self.chord)
-        return own if self.euler is None else torch.where(self.euler[..., None], of(CHORD), own)
+    def displacements(self, of: Callable[[float], Tensor]) -> Tensor:
+        """of(lookback) [B, V, 3], each vertex by the lookback ratio of its scheme."""
+        own = of(self.lookback)
+        return own if self.euler is None else torch.where(self.euler[..., None], of(LOOKBACK), own)
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -195,9 +195,10 @@ def prepare(
 
 
 def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
-              layout: Any, time_step: float, sweeps: int, chord: float
+              layout: Any, time_step: float, sweeps: int, lookback: float
               ) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
-    return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout, chord)
+    return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout,
+                             lookback)  # fmt: skip
 
 
 def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:

@@ -1,5 +1,5 @@
-"""The executed step with contact: R times detection, start, correction, sweeps and correction (docs/method.md, sections
-12 and 18)."""
+"""The executed step with contact: R substeps of detection, start, correction, sweeps and correction (docs/method.md,
+sections 12 and 18)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from .._common.context import MorePairs, checking, in_segment, is_captured, not_
 from .._contact import detection as search
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
-from .._contact.start import PartStart, start_above, start_between
+from .._contact.start import SubstepStart, start_above, start_between
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
-from ..adjoint.contact import Pairs, no_pairs, rubbing, some_of
-from ..adjoint.potential import RiseParts, of_vertices, rise_parts
+from ..adjoint.contact import Pairs, friction_lag, no_pairs, some_of
+from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
 from ..adjoint.sweep import no_transforms, sweep
 from ..model.inputs import parameter_of
 from ..model.model import Model
@@ -31,14 +31,23 @@ from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
-from ..ops.contact import RoomsOfBodies, contact_rooms, sweep_rooms
-from ..ops.fields import WAYS
+from ..ops.contact import TrustRadii, contact_trust_radii, sweep_radii
+from ..ops.fields import DISPLACEMENTS
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
-from .contact_corrections import Corrections, Scenes, Trials, bodies_of, corrected, corrected_after, is_cut, touching
+from .contact_corrections import (
+    Corrections,
+    Scenes,
+    Trials,
+    bodies_of,
+    corrected,
+    corrected_after,
+    is_blocked,
+    touching,
+)
 from .predict import Begun
 
-CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
+CLOSE = 1e-3  # of dhat: pairs with so much more gap do not push, however it is rounded
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
         "time_step or softer materials, or look with diffvbd.debug_checks()")  # fmt: skip
@@ -62,7 +71,7 @@ class ContactStep:
             plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=())
             with torch.no_grad():
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
-        self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
+        self.substeps: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
         self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_kappa")
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
@@ -88,14 +97,14 @@ class ContactStep:
         normal = broadcast(normal, (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
-    def _rub(self, listed: Pairs, collider: Tensor) -> None:
-        """Notes friction and damping of the pairs at the start of the step, where there are any."""
-        if not self._rubs:
+    def _lag_friction(self, listed: Pairs, collider: Tensor) -> None:
+        """Lags friction and damping of the pairs at the start of the step, where there are any."""
+        if not self._has_lag:
             return
         none = self.kappa.new_empty
         friction = self._parameter("friction") if self.model.friction is not None else none((0,))
         damping = self._parameter("pair_damping") if self._damps else none((0,))
-        self.lag, _ = rubbing(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
+        self.lag, _ = friction_lag(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
         self.lagged = listed
 
     @property
@@ -105,13 +114,13 @@ class ContactStep:
         return barrier is not None and (barrier.damping > 0 or "pair_damping" in self.prepared.parameters)
 
     @property
-    def _rubs(self) -> bool:
-        """Whether sweeps need what pairs were at the start of the step."""
+    def _has_lag(self) -> bool:
+        """Whether sweeps need lagged values of pairs."""
         return self.model.friction is not None or self._damps
 
     @staticmethod
     def _reads(x: Tensor) -> bool:
-        """Whether values may decide sizes: on CUDA that would wait."""
+        """Whether values may decide sizes; on CUDA the host would wait."""
         return not x.is_cuda
 
     def gaps_before(self, listed: Pairs) -> Tensor:
@@ -121,24 +130,26 @@ class ContactStep:
         return ops_start.gaps(self.x_prev, self.origin, self.before, *listed[:3])
 
     def _pushing(self, listed: Pairs) -> Pairs:
-        """The pairs that may push at the start: the same of a scene in any batch. On CUDA they are found if sweeps go
-        through them, too."""
-        if not (self._rubs or self._reads(self.x_prev)):
+        """Pairs that may push at the start, the same of a scene in any batch. On CUDA they are selected only if sweeps
+        read them."""
+        if not (self._has_lag or self._reads(self.x_prev)):
             return listed
         gap = self.gaps_before(listed)
         return some_of(listed, (gap < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 
-    def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
-        """The pairs that can matter as long as no vertex goes farther than its room [B, V] from x, with their gaps
-        there; and which of the listed these are, where that may be read."""
+    def _refreshed(
+        self, listed: Pairs, x: Tensor, collider: Tensor, trust_radius: Tensor
+    ) -> tuple[Pairs, Tensor | None]:
+        """Pairs that can matter within the trust-region radii [B, V] about x, with their gaps there; and their rows in
+        the list, where these may be read."""
         with torch.no_grad():
-            constants = ops_start.narrow(x.detach().contiguous(), self.origin, collider.detach().contiguous(), room,
-                                         listed.pairs, listed.constants, listed.ptr)  # fmt: skip
+            constants = ops_start.refresh_gaps(x.detach().contiguous(), self.origin, collider.detach().contiguous(),
+                                               trust_radius, listed.pairs, listed.constants, listed.ptr)  # fmt: skip
         near, rows = some_of(replaced(listed, constants=constants), (constants[:, -1] < torch.inf).contiguous())
         return near, rows if self._reads(x) else None
 
     def run(self, policy: int, debug_step: int) -> Tensor:
-        """Positions after all parts [B, V, 3]; raises where detection did not hold."""
+        """Positions after all substeps [B, V, 3]; raises where a detection is not valid."""
         settings = self.prepared.settings
         barrier, surface = self.barrier, self.surface
         if barrier is None or surface is None:
@@ -148,167 +159,171 @@ class ContactStep:
             refuse_intersections(self.model, self.x_prev, self.origin, self.before)
         pinned, pins = self.model._pinned[:, None], self.model.num_active < self.model.num_vertices
         x, y = self.x_prev, self.begun.y
-        acceleration = broadcast(self.begun.lift, y.shape)
-        acceleration = torch.where(pinned, 0.0, acceleration) if pins else acceleration
-        way, resting = self._wanted(acceleration)
-        left, met = way, Met()
-        stages, r = self.parts or 1, 0  # of what is prescribed
-        planned, going = self.parts, None
-        while r < (self.parts or 1):
-            was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
-            move = torch.where(pinned, way / stages, left) if pins and stages > 1 else left
-            motion = motion_of(surface, x, self.origin, self.fields.mass, move, acceleration)
-            within = self._rooms(x, was, now, motion)
+        h2a = broadcast(self.begun.h2a, y.shape)
+        h2a = torch.where(pinned, 0.0, h2a) if pins else h2a
+        displacement, resting = self._wanted(h2a)
+        remaining, records = displacement, Records()
+        prescribed_substeps, r = self.substeps or 1, 0
+        planned, going = self.substeps, None
+        while r < (self.substeps or 1):
+            was, now = (self._colliders_at(min(1.0, n / prescribed_substeps)) for n in (r, r + 1))
+            # the whole displacement in the first substep; prescribed motion and truncated displacements go on later
+            move = remaining
+            if pins and prescribed_substeps > 1:
+                move = torch.where(pinned, displacement / prescribed_substeps, remaining)
+            motion = motion_of(surface, x, self.origin, self.fields.mass, move, h2a)
+            within = self._trust_radii(x, was, now, motion)
             if planned is None:
-                self.parts = planned = 1 if is_captured(x) else parts_of(within.over)
-            assert self.parts is not None
+                self.substeps = planned = 1 if is_captured(x) else substeps_of(within.over)
+            assert self.substeps is not None
             detection = self._detect(x, was, now, within)
-            sweeps = sweeps_of_part(settings.sweeps, planned, r)
-            met.found.append(detection)
-            met.counts.append(detection.counts)
+            sweeps = sweeps_of_substep(settings.sweeps, planned, r)
+            records.found.append(detection)
+            records.counts.append(detection.counts)
             if self._reads(x):  # before any work
-                self._check(r, met.counts[r].tolist(), met)
+                self._check(r, records.counts[r].tolist(), records)
             if r == 0:
-                self._rub(self._pushing(detection.listed), was)
-            start = start_between(x, move, was, now, self.floor_data, self.origin, detection, surface, motion.rigid,
-                                  barrier.self_contact)  # fmt: skip
-            met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
+                self._lag_friction(self._pushing(detection.listed), was)
+            start = start_between(x, move, was, now, self.floor_data, self.origin, detection, surface,
+                                  motion.displacements.rigid, barrier.self_contact)  # fmt: skip
+            records.counts[r] = torch.cat([detection.counts[:3], start.infeasible])
             if self._reads(x):
-                self._check(r, met.counts[r].tolist(), met)
+                self._check(r, records.counts[r].tolist(), records)
             begin = x
             x, taken, _ = corrected(self, start.x, now, start, detection.listed)
             if start.own:
                 start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
-            room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
-            near, kept = self._narrowed(detection.listed, x, now, room)
-            swept_from = replaced(start, center=x.detach(), room=room)
-            limits, lengths, held, cut = None, None, start.short, start.short
+            trust_radius = radii_of_sweeps(motion, surface, barrier, start, x, begin)
+            near, kept = self._refreshed(detection.listed, x, now, trust_radius)
+            swept_from = replaced(start, center=x.detach(), trust_radius=trust_radius)
+            limits, lengths, blocked, truncated = None, None, start.truncated, start.truncated
             if sweeps:
-                part = replaced(settings, sweeps=sweeps)
-                swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
-                met.swept.append(swept)
+                own = replaced(settings, sweeps=sweeps)
+                swept = swept_substep(self, x, swept_from, now, near, own, policy, debug_step)
+                records.swept.append(swept)
                 x, limits, lengths = swept
-                x, shares, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.parts)
-                taken.extend(shares)
-                # what the start has held up, sweeps may have made good, and corrections, what these have
-                held = is_cut(self, x, back)
-                cut = (limits[:, -1] > 0) | held
-            if going is not None:  # what it does not help stays as it is; others, too: the same bits in any batch
+                x, fractions, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.substeps)
+                taken.extend(fractions)
+                # sweeps may have recovered what the start truncated, and corrections what sweeps did
+                blocked = is_blocked(self, x, back)
+                truncated = (limits[:, -1] > 0) | blocked
+            if going is not None:  # other scenes stay as they are: the same bits in any batch
                 going = going & ~self._inverted(x)[:, None, None]
-                met.swept[-1] = of_going(met.swept[-1], going)
-                assert met.cut is not None
-                x, cut = torch.where(going, x, begin), torch.where(going[..., 0], cut, met.cut)
-                held = held & going[..., 0]
-            met.cut = cut
-            met.found[r] = replaced(detection, shares=start.shares, corrections=tuple(taken), limits=limits,
-                                    kept=kept, lengths=lengths, sweeps=sweeps, going=going,
-                                    resting=resting)  # fmt: skip
+                records.swept[-1] = of_going(records.swept[-1], going)
+                assert records.truncated is not None
+                x, truncated = torch.where(going, x, begin), torch.where(going[..., 0], truncated, records.truncated)
+                blocked = blocked & going[..., 0]
+            records.truncated = truncated
+            records.found[r] = replaced(detection, fractions=start.fractions, corrections=tuple(taken), limits=limits,
+                                        kept=kept, lengths=lengths, sweeps=sweeps, going=going,
+                                        resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
-            if may_go_on and r == self.parts < MOST_DETECTIONS:
-                asked = held.any(-1) | (cut.sum(-1) > CUT * self.model.num_active)  # pairs still hold up some
-                asked = asked & ~self._inverted(x)  # through what is inside out another body might pass
+            if may_go_on and r == self.substeps < MOST_DETECTIONS:
+                asked = blocked.any(-1) | (truncated.sum(-1) > TRUNCATED * self.model.num_active)  # still truncated
+                asked = asked & ~self._inverted(x)  # another body might pass through an inverted one
                 going = asked[:, None, None] if going is None else going & asked[:, None, None]
-                self.parts += int(going.any())
-            if r < self.parts:
-                left = torch.where(start.short[..., None], y - x, 0.0)
-        x = self._judged(x, met)
-        for found in recorders():  # a step that is done again, with room for more pairs, counts once
-            found.extend(met.found)
+                self.substeps += int(going.any())
+            if r < self.substeps:
+                remaining = torch.where(start.truncated[..., None], y - x, 0.0)
+        x = self._judged(x, records)
+        for found in recorders():  # a step that runs again, with a larger capacity, counts once
+            found.extend(records.found)
         return x
 
     @functools.cached_property
-    def potential_parts(self) -> RiseParts:
+    def increase_inputs(self) -> IncreaseInputs:
         """Common data of the step's comparisons of potentials."""
-        return rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
+        return increase_inputs(self.model, self.fields, self.prepared.settings.numbers.time_step)
 
     def _inverted(self, x: Tensor) -> Tensor:
         """Scenes with an inverted tet, bool [B]."""
         return inside_out(self.model.tets, x if self.begun.origin is None else x.detach() + self.origin).any(-1)
 
-    def _wanted(self, acceleration: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _wanted(self, h2a: Tensor) -> tuple[Tensor, Tensor | None]:
         """Displacement that each vertex starts with, ``h v`` [B, V, 3] [m], and the vertices of partly pinned bodies
-        that go without gravity's, bool [B, V]. A free body's correction adds ``acceleration`` = h^2 a; a body with pins
-        adds it here unless its own potential would rise: elasticity bears a body at rest."""
-        surface, way = self.surface, self.begun.y - self.x_prev - acceleration
-        if surface is None or surface.partly_held is None or self.model.starts_from != "predictor":
-            return way, None
-        resting = ~surface.partly_held.expand(way.shape[:2])
+        that go without gravity's, bool [B, V]. The correction of a free body adds ``h2a`` = h^2 a. A partly pinned body
+        adds it here unless its own potential would increase: elasticity bears a body at rest."""
+        surface, displacement = self.surface, self.begun.y - self.x_prev - h2a
+        if surface is None or surface.partly_pinned is None or self.model.starts_from != "predictor":
+            return displacement, None
+        resting = ~surface.partly_pinned.expand(displacement.shape[:2])
         if self.model.start == "auto":
             with torch.no_grad():
-                at = self.x_prev + way
-                resting = resting | self.potential_parts.raises(at, at + acceleration)
-        return way + torch.where(resting[..., None], 0.0, acceleration), resting
+                at = (self.x_prev + displacement).contiguous()
+                resting = resting | self.increase_inputs.increases_potential(at, at + h2a)
+        return displacement + torch.where(resting[..., None], 0.0, h2a), resting
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
-        """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
+        """The step with friction on a floor and without pairs: only the floor limits motion."""
         x, none = self.x_prev, no_pairs(self.x_prev, math.prod(self.x_prev.shape[:2]))
-        free, held, body = bodies_of(self.model)[2:]
+        free, pinned, body = bodies_of(self.model)[2:]
         body = body[: x.shape[1]].long()
-        start = start_above(x, self.begun.y - x - broadcast(self.begun.lift, x.shape), self.floor_data, self.origin,
-                            held, units(body, ~free))  # fmt: skip
+        start = start_above(x, self.begun.y - x - broadcast(self.begun.h2a, x.shape), self.floor_data, self.origin,
+                            pinned, units(body, ~free))  # fmt: skip
         x = torch.where(free[body, None], start.x, self.begun.x_start)
         x = corrected(self, x, self.colliders, start, none).x
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
-            swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
+            swept = swept_substep(self, x, start, self.colliders, none, settings, policy, debug_step)
             x = corrected_after(self, swept.x, self.colliders, start, none, True).x
-            record_parts(self.model, x, [swept])
+            record_substeps(self.model, x, [swept])
         return self._finite(x)
 
-    def _colliders_at(self, share: float) -> Tensor:
+    def _colliders_at(self, fraction: float) -> Tensor:
         if self.colliders is self.before:
             return self.before
-        return self.before + share * (self.colliders - self.before)
+        return self.before + fraction * (self.colliders - self.before)
 
-    def _sweep(self, x: Tensor, center: Tensor, room: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings,
-               policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def _sweep(self, x: Tensor, center: Tensor, trust_radius: Tensor, collider: Tensor, listed: Pairs,
+               settings: SweepSettings, policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
-        fields = replaced(self.fields,
-            x_start=x, center=center, room=room, collider=collider, collider_prev=self.before, kappa=self.kappa,
-            **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
-            floor_lag=self.floor_lag,
-        )  # fmt: skip
+        fields = replaced(self.fields, x_start=x, center=center, trust_radius=trust_radius, collider=collider,
+                          collider_prev=self.before, kappa=self.kappa, **listed._asdict(), lag=self.lag,
+                          lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
+                          floor_lag=self.floor_lag)  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
     def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> Detection:
-        """The pairs that can matter on the ways from x."""
-        return self._detect(x, was, now, self._rooms(x, was, now, motion))
+        """Pairs that can matter for a motion from x."""
+        return self._detect(x, was, now, self._trust_radii(x, was, now, motion))
 
-    def _rooms(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> RoomsOfBodies:
+    def _trust_radii(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> TrustRadii:
         assert self.surface is not None and self.barrier is not None
-        return rooms(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now, self.floor_data)
+        return trust_radii(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now,
+                           self.floor_data)  # fmt: skip
 
     @torch.no_grad()
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: RoomsOfBodies) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: TrustRadii) -> Detection:
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
-        x, room, own_room = x.detach(), within.room, within.own_room
+        x, trust_radius, deformation_radius = x.detach(), within.trust_radius, within.deformation_radius
         *index, corners, values, counts, smallest = search.detect(
-            x, self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, room, own_room
-        )
-        return Detection(Pairs(*index), corners, values, counts, smallest, within.u, room, own_room)
+            x, self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, trust_radius,
+            deformation_radius,
+        )  # fmt: skip
+        return Detection(Pairs(*index), corners, values, counts, smallest, within.u, trust_radius, deformation_radius)
 
-    def _record(self, met: Met) -> Tensor:
-        """Notes what became of the step; its counts [parts, 4]."""
-        outcomes[self.model.model] = outcome = met.outcome(self.capacity, self.x_prev)
+    def _record(self, records: Records) -> Tensor:
+        """Records the outcome of the step; its counts [substeps, 4]."""
+        outcomes[self.model.model] = outcome = records.outcome(self.capacity, self.x_prev)
         return outcome.counts
 
-    def _judged(self, x: Tensor, met: Met) -> Tensor:
-        """x, or NaN where a captured step, which cannot raise, must not be trusted."""
-        table = self._record(met)
-        record_parts(self.model, x, met.swept)
+    def _judged(self, x: Tensor, records: Records) -> Tensor:
+        """x; NaN where a captured step, which cannot raise, is not valid."""
+        table = self._record(records)
+        record_substeps(self.model, x, records.swept)
         if is_captured(x):
-            needed, touching, _, hindered = table.unbind(1)
-            good = ((needed <= self.capacity) & (touching + hindered == 0)).all()
+            needed, touching, _, infeasible = table.unbind(1)
+            good = ((needed <= self.capacity) & (touching + infeasible == 0)).all()
             return torch.where(good, x, torch.nan)
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
-                self._check(r, row, met)
+                self._check(r, row, records)
         return self._finite(x)
 
     def _finite(self, x: Tensor) -> Tensor:
-        """x; raises where it holds what is not finite, if that may be read."""
+        """x; raises where it is not finite, if it may be read."""
         if self._reads(x) and not bool(torch.isfinite(x).all()):
             self._refuse_what_is_not_finite()
             raise RuntimeError(LOST.format("in the step"))
@@ -316,21 +331,20 @@ class ContactStep:
 
     @property
     def capacity(self) -> int:
-        """Pairs of all scenes that fit."""
+        """Pairs of all scenes that fit in a list."""
         surface, barrier, scenes = self.surface, self.barrier, self.x_prev.shape[0]
         assert surface is not None and barrier is not None
         if barrier.capacity is None and not self.x_prev.is_cuda:
             return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, LEAST_CAPACITY if scenes and barrier.capacity is None else 0)
 
-    def _check(self, r: int, counts: list[int], met: Met) -> None:
-        """Raises where a detection found more than fits, surfaces that touch, or a way that pairs close to what is
-        prescribed."""
+    def _check(self, r: int, counts: list[int], records: Records) -> None:
+        """Raises where a detection found more pairs than fit, surfaces that touch, or infeasible prescribed motion."""
         surface = self.surface
         assert surface is not None and self.barrier is not None
-        needed, touching, pair, hindered = counts
-        if needed > self.capacity or touching or hindered:
-            self._record(met)  # the status of a step that raises says why
+        needed, touching, pair, infeasible = counts
+        if needed > self.capacity or touching or infeasible:
+            self._record(records)  # the status of a step that raises says why
         scenes = self.x_prev.shape[0]
         if needed > self.capacity:
             raise TooManyPairs(
@@ -353,11 +367,11 @@ class ContactStep:
                 + f", one of the corner points {corners} of {owners} in scene {scene}: "
                 + advice_to_part(self.x_prev, self.origin, self.barrier.dhat)
             )
-        if hindered:
+        if infeasible:
             raise ValueError(
-                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in substep "
-                f"{r} of {self.parts} that it would bring too close: spread a long way over more steps (per_step), "
-                "give PairBarrier a larger number of detections, or use a smaller time_step"
+                f"prescribed or colliders: expected feasible motion, got {infeasible} pairs in substep "
+                f"{r} of {self.substeps} that it would bring too close: spread a long motion over more steps "
+                "(per_step), give PairBarrier a larger number of detections, or use a smaller time_step"
             )
 
     def _refuse_what_is_not_finite(self) -> None:
@@ -384,7 +398,7 @@ def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor,
             barrier, surface = model.contact, model.surface_of_contact
             if barrier is None or surface is None or barrier.capacity is not None or 2 * error.needed > MOST_CAPACITY:
                 raise
-            # nobody has said how many there may be: again, with room for them
+            # without a given capacity: again, with a larger one
             model.model.surface_of_contact = replace(surface, capacity=2 * error.needed)
             if in_segment():  # which begins again
                 raise MorePairs from None
@@ -392,12 +406,12 @@ def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor,
 
 # --- the sweeps of a part of a step with pairs or friction, in cycles, with the coarse correcti -----------------------
 
-# Of a step that nobody has given a number: by how far bodies want to go, and with more of them while pairs hold some up
+# Substeps of a step without a given number: by the wanted displacements, and more while pairs truncate motion.
 MOST_PLANNED, MOST_DETECTIONS = 4, 8
-CUT = 0.01  # share of the vertices that pairs may hold up, beside whole bodies, before it goes on, and a rollout warns
+TRUNCATED = 0.01  # fraction of vertices, besides blocked bodies, above which a step goes on and a rollout warns
 
 
-class SweptPart(NamedTuple):
+class SweptSubstep(NamedTuple):
     """Result of the sweeps of a substep."""
 
     x: Tensor  # [B, V, 3]
@@ -405,35 +419,35 @@ class SweptPart(NamedTuple):
     lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
 
 
-def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
+def sweeps_of_substeps(sweeps: int, substeps: int) -> list[int]:
     """Numbers of sweeps of R substeps: K spread evenly, the first ones taking the remainder."""
-    return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
+    return [sweeps // substeps + (1 if r < sweeps % substeps else 0) for r in range(substeps)]
 
 
-def sweeps_of_part(sweeps: int, planned: int, part: int) -> int:
-    """And how many a part has; one beyond those that were planned, as many as the last of these, or one."""
-    shared = sweeps_of_parts(sweeps, planned)
-    return shared[part] if part < planned else max(shared[-1], min(sweeps, 1))
+def sweeps_of_substep(sweeps: int, planned: int, substep: int) -> int:
+    """Number of sweeps of one substep. One beyond the planned ones has as many as the last of these, at least one."""
+    shared = sweeps_of_substeps(sweeps, planned)
+    return shared[substep] if substep < planned else max(shared[-1], min(sweeps, 1))
 
 
-def parts_of(over: Tensor) -> int:
-    """Number of substeps of a step without a given number: one, and one more each time that bodies want to go
-    twice as far as the most room that they get. over: of RoomsOfBodies."""
+def substeps_of(over: Tensor) -> int:
+    """Number of substeps of a step without a given number: one, and one more each time that the wanted displacement
+    over the largest radius doubles. over: Of TrustRadii."""
     most = float(over.max()) if over.numel() else 0.0
     return min(MOST_PLANNED, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
 
 
-def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, listed: Pairs, settings: SweepSettings,
-               policy: int, debug_step: int) -> SweptPart:  # fmt: skip
-    """Positions [B, V, 3] after the sweeps of a part that begin at x, in the rooms of its start."""
+def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Tensor, listed: Pairs,
+                  settings: SweepSettings, policy: int, debug_step: int) -> SweptSubstep:  # fmt: skip
+    """Result of the sweeps of a substep from x, in the trust regions of its start."""
 
     def sweep(x: Tensor, settings: SweepSettings) -> tuple[Tensor, Tensor]:
-        return of._sweep(x, start.center, start.room, collider, listed, settings, policy, debug_step)
+        return of._sweep(x, start.center, start.trust_radius, collider, listed, settings, policy, debug_step)
 
-    settings = replaced(settings, coarse=())  # which the operator would make, without pairs
+    settings = replaced(settings, coarse=())  # the operator would correct without pairs
     cycles = _cycles(of.model, settings.sweeps)
     if len(cycles) <= 1:
-        return SweptPart(*sweep(x, settings))
+        return SweptSubstep(*sweep(x, settings))
     corrections = None
     if of.coarse_matrix is not None:
         judge = _trials(of, start, collider, listed)
@@ -448,40 +462,40 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
             lengths.append(length)
         x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))
         limits.append(limit)
-    return SweptPart(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None)
+    return SweptSubstep(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None)
 
 
 def _cycles(model: System, sweeps: int) -> list[int]:
-    """Sweeps of each cycle of a part, with corrections the first sweep alone; [sweeps] where nothing is done between
-    them."""
+    """Sweeps of each cycle of a substep; the first sweep stands alone. Without coarse corrections [sweeps]."""
     if model.coarse is None or not model.coarse_geometry.bodies:
         return [sweeps]
     every, after = model.coarse.every, sweeps - 1
     return [1, *(min(every, after - begun) for begun in range(0, after, every))]
 
 
-def _scenes(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Scenes:
+def _scenes(of: ContactStep, start: SubstepStart, collider: Tensor, listed: Pairs) -> Scenes:
     numbers = of.prepared.settings.numbers
     fields = touching(of, of.x_prev, collider, start, listed)
     return Scenes(of.model, fields, numbers.time_step, numbers.friction_eps)
 
 
-def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Trials:
+def _trials(of: ContactStep, start: SubstepStart, collider: Tensor, listed: Pairs) -> Trials:
     s = _scenes(of, start, collider, listed)
     s = replaced(s, fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
-    return Trials(s, of.potential_parts)
+    return Trials(s, of.increase_inputs)
 
 
-def of_going(part: SweptPart, going: Tensor) -> SweptPart:
+def of_going(substep: SweptSubstep, going: Tensor) -> SweptSubstep:
     """Result of a substep in the scenes that go on, bool [B, 1, 1]; in others it is discarded."""
-    return part if part.lengths is None else replaced(part, lengths=torch.where(going[:, 0], part.lengths, 0.0))
+    lengths = substep.lengths
+    return substep if lengths is None else replaced(substep, lengths=torch.where(going[:, 0], lengths, 0.0))
 
 
-def record_parts(model: System, x: Tensor, parts: Sequence[SweptPart]) -> None:
-    """For record("subspace"): what the parts of a step that ends at x have done."""
+def record_substeps(model: System, x: Tensor, substeps: Sequence[SweptSubstep]) -> None:
+    """For record("subspace"): lengths of the coarse corrections of a step that ends at x."""
     if model.coarse is not None:
         for found in recorders("subspace"):
-            lengths = [part.lengths for part in parts if part.lengths is not None]
+            lengths = [substep.lengths for substep in substeps if substep.lengths is not None]
             empty = x.new_empty((0, len(x), model.coarse_geometry.bodies))
             found.append(torch.cat([empty, *lengths]).movedim(0, 1))
 
@@ -490,28 +504,28 @@ def record_parts(model: System, x: Tensor, parts: Sequence[SweptPart]) -> None:
 
 
 class Detection(NamedTuple):
-    """One search for pairs, and what its part of the step has decided. Index data; the step differentiates the values
-    anew. N corner points: vertices, then those of colliders.
+    """One detection, and the decisions of its substep. Index data; the step computes differentiable values again. N
+    corner points: vertices, then those of colliders.
 
     Attributes:
-        listed: The pairs that may matter: ``pairs`` [capacity, 6], four corner points, kind (0 point and triangle, 1
-            two edges, 2 point and plane) and scene, or -1; ``constants`` [capacity, 8]; those of each corner point by
-            ``ptr`` [B N + 1] and ``entry`` [4 capacity].
+        listed: Pairs that may matter: ``pairs`` [capacity, 6], four corner points, kind (0 point and triangle, 1 two
+            edges, 2 point and plane) and scene, or -1; ``constants`` [capacity, 8]; pairs by corner point in ``ptr``
+            [B N + 1] and ``entry`` [4 capacity].
         near_corners: Corner points and kind of the nearest pair of each corner point, int [B, N, 5]; -1: none.
         near_values: Its weights, normal and gap [m], [B, N, 8].
         counts: int64 [4]: pairs that the list needs, pairs that touch, key of one of those or -1, 0.
-        smallest: Smallest gap of each scene, or how far was looked [m], [B].
+        smallest: Smallest gap of each scene, or the search distance [m], [B].
         u: Translation of each body's island, rounded to a grid [B, bodies, 3] [m].
-        room: How far the vertices of each body may go beside its island, and the largest [m], [B, bodies + 1].
-        own_room: The same beside the rigid motion of the body [m].
-        shares: Step fraction of each vertex at the start [B, V].
-        corrections: Shares of the rigid corrections before and after the sweeps, [B, bodies] each.
-        limits: By how often each update was halved, uint8 [B, K, V]; 8: it was not made.
+        trust_radius: Trust-region radius of each body relative to its island, and the largest [m], [B, bodies + 1].
+        deformation_radius: The same relative to the body's rigid motion [m].
+        fractions: Step fraction of each vertex at the start [B, V].
+        corrections: Step fractions of the rigid corrections before and after the sweeps, [B, bodies] each.
+        limits: Number of halvings of each update, uint8 [B, K, V]; 8: it was not made.
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
-        kept: Rows of the listed pairs that sweeps can reach; None where that would have to be read, as on CUDA.
-        sweeps: How many sweeps the part has.
-        going: Scenes that go on in a part beyond those that were planned, bool [B, 1, 1]; None: all, as planned.
-        resting: Vertices of held bodies that begin without gravity's fall, bool [B, V]; None: none.
+        kept: Rows of the listed pairs that sweeps can reach; None where the host must not read them, as on CUDA.
+        sweeps: Number of sweeps of the substep.
+        going: Scenes that go on in a substep beyond the planned ones, bool [B, 1, 1]; None: all, as planned.
+        resting: Vertices of partly pinned bodies that begin without their gravity move, bool [B, V]; None: none.
     """
 
     listed: Pairs
@@ -520,10 +534,10 @@ class Detection(NamedTuple):
     counts: Tensor
     smallest: Tensor
     u: Tensor
-    room: Tensor
-    own_room: Tensor
-    # what the part has decided
-    shares: Tensor | None = None
+    trust_radius: Tensor
+    deformation_radius: Tensor
+    # decisions of the substep
+    fractions: Tensor | None = None
     corrections: tuple[Tensor, ...] | None = None
     limits: Tensor | None = None
     lengths: Tensor | None = None
@@ -536,9 +550,9 @@ class Detection(NamedTuple):
 class Outcome(NamedTuple):
     """Record of the latest step of a Model, on its device; read by diffvbd.contact.status."""
 
-    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
+    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, infeasible pairs
     capacity: int  # pairs of all scenes
-    cut: Tensor  # [B, V] bool: limited in the last sweep; without any, held up at the start
+    truncated: Tensor  # [B, V] bool: limited in the last sweep or, without sweeps, at the start
     smallest: Tensor  # [R, B] [m]
 
 
@@ -550,24 +564,24 @@ class TooManyPairs(RuntimeError):
         self.needed = needed
 
 
-class Met:
+class Records:
     """Records of the substeps, one after another."""
 
     def __init__(self) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
-        self.swept: list[SweptPart] = []
-        self.cut: Tensor | None = None  # before the first part is over
+        self.swept: list[SweptSubstep] = []
+        self.truncated: Tensor | None = None  # until the first substep ends
 
     def outcome(self, capacity: int, x: Tensor) -> Outcome:
         """capacity: Pairs of all scenes that fit.  x: [B, V, 3] at the start of the step."""
         smallest, counts = _stack([d.smallest for d in self.found]), _stack(self.counts)
-        cut = torch.zeros_like(x[..., 0], dtype=torch.bool) if self.cut is None else self.cut
-        return Outcome(counts, capacity, cut, smallest)
+        truncated = torch.zeros_like(x[..., 0], dtype=torch.bool) if self.truncated is None else self.truncated
+        return Outcome(counts, capacity, truncated, smallest)
 
 
-def _stack(parts: list[Tensor]) -> Tensor:
-    return parts[0][None] if len(parts) == 1 else torch.stack(parts)  # one is not copied: on CUDA that is a launch
+def _stack(rows: list[Tensor]) -> Tensor:
+    return rows[0][None] if len(rows) == 1 else torch.stack(rows)  # one is not copied: on CUDA that is a launch
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
@@ -643,46 +657,46 @@ def refuse_intersections(model: System, x: Tensor, origin: Tensor, colliders: Te
 
 # --- trust regions ----------------------------------------------------------------------------------------------------
 
-ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
-LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compressed may push
+RADIUS_FACTOR = 1.5  # trust-region radius over the longest wanted displacement of the body
+LEAST_RADIUS = 1.0  # of dhat, added to it: a compressed barrier may push so far
 
 
 @torch.no_grad()
-def rooms(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
-          was: Tensor, now: Tensor, floor: Tensor | None) -> RoomsOfBodies:  # fmt: skip
+def trust_radii(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
+                was: Tensor, now: Tensor, floor: Tensor | None) -> TrustRadii:  # fmt: skip
     """Trust-region radii of bodies until pairs are found again. Index data.
 
     Args:
-        motion: Where each vertex wants to go.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
+        motion: Wanted displacements.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
         was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or None.
     """
     s, dhat = surface, barrier.dhat
     floor = x.new_empty((0,)) if floor is None else floor.detach().contiguous()
-    return contact_rooms(
-        x.detach(), origin, mass.detach().contiguous(), motion.move, s.held, s.body_order,
-        s.body_ptr, motion.ways, floor, was.detach(), now.detach(), s.planes, s.body, s.radius, s.most_room,
-        s.most_room_alone, s.most_own_room, s.least_own_room, dhat, ROOM, LEAST_ROOM * dhat,
-        barrier.self_contact,
+    return contact_trust_radii(
+        x.detach(), origin, mass.detach().contiguous(), motion.move, s.pinned, s.body_order,
+        s.body_ptr, motion.displacements, floor, was.detach(), now.detach(), s.planes, s.body, s.radius,
+        s.max_trust_radius, s.max_trust_radius_alone, s.max_deformation_radius, s.min_deformation_radius, dhat,
+        RADIUS_FACTOR, LEAST_RADIUS * dhat, barrier.self_contact,
     )  # fmt: skip
 
 
 @torch.no_grad()
-def rooms_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor,
+def radii_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrier, start: SubstepStart, x: Tensor,
                     begin: Tensor) -> Tensor:  # fmt: skip
-    """Largest displacement of a vertex by the sweeps [B, V] [m]: as far as a barrier pushes, weight
-    pulls, elasticity takes back what bodies deform by on the way and, of what pairs have held up, all; the most of a
-    scene, since bodies push one another. Index data.
+    """Trust-region radii of the sweeps [B, V] [m]. They allow for barriers, weight, the elastic recovery of
+    deformation, and truncated displacements. The largest of a scene counts, since bodies push one another. Index data.
 
     Args:
-        motion: What the part wanted.  start: Its start, whose rooms bound the whole way.
-        x, begin: Where the sweeps begin, and where the part began, [B, V, 3] [m].
+        motion: Wanted displacements of the substep.  start: Its start, whose trust regions bound the sum.
+        x, begin: Positions before the sweeps, and before the substep, [B, V, 3] [m].
     """
     s, none = surface, x.new_empty((0,))
-    own_center, own_room = start.own or (none, none)
+    deformation_center, deformation_radius = start.own or (none, none)
     x, led, begin = (t.detach().contiguous() for t in (x, start.x, begin))
-    return sweep_rooms(
-        x, led, begin, motion.move, motion.fall, motion.apart, motion.stretched, start.center, start.room, own_center,
-        own_room, s.held, s.body_order, s.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
+    return sweep_radii(
+        x, led, begin, motion.move, motion.gravity_move, motion.apart, motion.stretched, start.center,
+        start.trust_radius, deformation_center, deformation_radius, s.pinned, s.body_order, s.body_ptr, RADIUS_FACTOR,
+        LEAST_RADIUS * barrier.dhat,
     )  # fmt: skip
 
 
@@ -690,35 +704,31 @@ def rooms_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrie
 
 
 class Motion(NamedTuple):
-    """The ways that vertices want to go in a part of a step."""
+    """Wanted displacements of a substep. Index data."""
 
     move: Tensor  # [B, V, 3] [m]
-    fall: Tensor  # [B, V, 3] [m]: what acceleration adds
-    ways: ops_contact.Ways  # index data
-
-    @property
-    def rigid(self) -> Tensor:
-        """Of ``move`` a shift and a turn of each body, which brings no two points of it closer [B, V, 3] [m]."""
-        return self.ways.rigid
+    gravity_move: Tensor  # [B, V, 3] [m]: h^2 a, which corrections and sweeps add
+    displacements: ops_contact.Displacements
 
     @property
     def apart(self) -> Tensor:
-        """The longest way of a free vertex of each body beside its rigid motion [B, bodies] [m]."""
-        return self.ways.longest[WAYS.index("apart")]
+        """Longest displacement of a free vertex relative to the rigid motion of its body [B, bodies] [m]."""
+        return self.displacements.longest[DISPLACEMENTS.index("apart")]
 
     @property
     def stretched(self) -> Tensor:
         """Distance by which the straight paths of a rotation, or of a fraction of it, take a vertex of each body from
         the rotated body [B, bodies] [m]."""
-        return self.ways.longest[WAYS.index("stretched")]
+        return self.displacements.longest[DISPLACEMENTS.index("stretched")]
 
 
-def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, fall: Tensor) -> Motion:
-    """Index data.
+def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, gravity_move: Tensor
+              ) -> Motion:  # fmt: skip
+    """Wanted displacements by kind.
 
     Args:
-        x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].  move, fall: [B, V, 3] [m].
+        x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].  move, gravity_move: [B, V, 3] [m].
     """
-    x, mass, move, fall = (t.detach().contiguous() for t in (x, mass, move, fall))
-    index = (surface.held, surface.held_bodies, surface.body_order, surface.body_ptr)
-    return Motion(move, fall, ops_contact.contact_motion(x, origin, mass, move, fall, *index))
+    x, mass, move, gravity_move = (t.detach().contiguous() for t in (x, mass, move, gravity_move))
+    index = (surface.pinned, surface.pinned_bodies, surface.body_order, surface.body_ptr)
+    return Motion(move, gravity_move, ops_contact.contact_motion(x, origin, mass, move, gravity_move, *index))

@@ -1,5 +1,5 @@
-"""The rigid corrections of a part of a step (docs/method.md, section 18): one before its sweeps, one after them, and
-after the last sweeps more of what did not get all the way."""
+"""The rigid corrections of a substep (docs/method.md, section 18): one before its sweeps, one after them, and more of
+blocked bodies after the last sweeps."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch.autograd import Function
 
 from .. import ops
 from .._common.context import is_captured, replaced
-from .._contact.start import PartStart
+from .._contact.start import SubstepStart
 from ..adjoint.contact import Pairs, at_corners, of_scene, pair_lag, some_of, sum_at_corners, sum_of_scenes
-from ..adjoint.potential import IncrementalPotential, RiseParts, of_vertices, rise_of_bodies
+from ..adjoint.potential import IncreaseInputs, IncrementalPotential, increase_of_bodies, of_vertices
 from ..model.system import System
 from ..ops import broadcast
 from ..ops import contact as ops_rigid
@@ -27,7 +27,7 @@ from ..ops.sums import Order, of_segments, one_thread, sum_by, sum_segments
 
 
 def barrier_values(s: Scenes, x: Tensor) -> Tensor:
-    """Of the barrier of each listed pair at x [B, V, 3], [pairs] [kg m^2]."""
+    """Barrier of each listed pair at x [B, V, 3], times h^2, [pairs] [kg m^2]."""
     f, listed = s.fields, s.listed
     state = pair_lag(x, f.collider, f.kappa, f.origin, listed)
     near = state[:, 1] > 0
@@ -53,7 +53,7 @@ def _barrier_values(s: Scenes, x: Tensor, listed: Pairs, state: Tensor, near: Te
 
 
 def lagged_values(s: Scenes, x: Tensor) -> Tensor:
-    """Of friction and damping of each pair that was close at the start of the step, likewise."""
+    """Friction and damping of each lagged pair, likewise."""
     f, h = s.fields, s.time_step
     load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
     scene, corners = corners_of(s.lagged)
@@ -65,7 +65,7 @@ def lagged_values(s: Scenes, x: Tensor) -> Tensor:
 
 
 def floor_friction_values(s: Scenes, x: Tensor) -> Tensor:
-    """Of friction of each vertex on a floor [B, V]."""
+    """Friction of each vertex on a floor, likewise [B, V]."""
     load, n = s.fields.floor_lag[..., 0], s.fields.floor_lag[..., 1:]
     travel = (x - s.fields.x_prev)[:, :, None]
     u = travel - n * (n * travel).sum(-1, keepdim=True)
@@ -73,7 +73,7 @@ def floor_friction_values(s: Scenes, x: Tensor) -> Tensor:
 
 
 def _slip_value(u: Tensor, eps: float) -> Tensor:
-    """Friction's potential f0 of slips u [..., 3]; twin of slip_value in csrc/contact/rigid.h."""
+    """Friction potential f0 of tangential motions u [..., 3]; twin of slip_value in csrc/subspace/contact_rigid.h."""
     length = u.square().sum(-1).sqrt()
     return torch.where(length < eps, length**2 * (1 / eps - length / (3 * eps**2)) + eps / 3, length)
 
@@ -84,12 +84,12 @@ EDGES = 1  # the kind of a pair of two edges
 
 
 class Sets(NamedTuple):
-    """The sets of bodies of all scenes, as the bodies of one large scene [1, B V, 3]; as MovingBodies."""
+    """Sets of bodies of all scenes, as the bodies of one large scene [1, B V, 3]; fields as of MovingBodies."""
 
     order: Tensor  # int32, rows of vertices that move, by set
-    ptr: Tensor  # int32 [sets + 1]; on CUDA, which must not look, many sets are empty
+    ptr: Tensor  # int32 [sets + 1]; on CUDA many sets are empty
     of: Tensor  # int64 [B V], the set of each row; `number` where it does not move
-    of_body: Tensor  # int64 [B, bodies + 1], and of each body that moves, and of what does not
+    of_body: Tensor  # int64 [B, bodies + 1], set of each body that moves, then that of the rest
 
     @property
     def number(self) -> int:
@@ -100,14 +100,14 @@ class Trials:
     """Common data of all trials in one substep.
 
     Args:
-        scenes: The part; its pairs are those that sweeps can reach, its rooms those of the sweeps.
-        parts: Of the bodies' own potentials.
+        scenes: Scenes of the substep, with the pairs that sweeps can reach and their trust regions.
+        inputs: Common data of the bodies' potentials.
     """
 
-    def __init__(self, scenes: Scenes, parts: RiseParts) -> None:
-        self.scenes, self.parts = scenes, parts
-        moving = parts.model._moving
-        self.count = moving.number + 1  # what does not move is a body too
+    def __init__(self, scenes: Scenes, inputs: IncreaseInputs) -> None:
+        self.scenes, self.inputs = scenes, inputs
+        moving = inputs.model._moving
+        self.count = moving.number + 1  # what does not move counts as a body
         self.each = torch.arange(scenes.fields.x_prev.shape[1], dtype=torch.int32, device=moving.of.device)
         self.of = moving.of
         self.of_corner = torch.cat([self.of, self.of.new_full((scenes.fields.collider.shape[1],), moving.number)])
@@ -124,8 +124,10 @@ class Trials:
         acts = (s.fields.lag[:, :2] != 0).any(-1) if s.fields.lag.numel() else s.lagged.pairs[:, 0] < 0
         one, two = torch.cat([near, self._sides(s.lagged, acts)]).unbind(1)
         least = connected_rows(one, two, scenes * self.count)
-        # where rounds have not been enough, all bodies of a scene are one set
-        apart = sum_by((least[one] != least[two]).to(s.fields.room.dtype)[:, None], one // self.count, scenes) > 0
+        # without convergence, all bodies of a scene are one set
+        apart = (
+            sum_by((least[one] != least[two]).to(s.fields.trust_radius.dtype)[:, None], one // self.count, scenes) > 0
+        )
         first = self.count * torch.arange(scenes, device=least.device)[:, None]
         least = torch.where(apart, first, least.reshape(scenes, self.count)[:, :moves])
         number, of_body = scenes * self.count, least
@@ -135,12 +137,12 @@ class Trials:
         of_body = torch.cat([of_body, of_body.new_full((scenes, 1), number)], 1)
         of = of_body[:, self.of].reshape(-1)
         ordered, order = torch.sort(of, stable=True)
-        active = scenes * len(self.parts.model._moving.order)
+        active = scenes * len(self.inputs.model._moving.order)
         ptr = torch.searchsorted(ordered, torch.arange(number + 1, device=of.device))
         return Sets(order[:active].int(), ptr.int(), of, of_body)
 
     def _sides(self, listed: Pairs, counts: Tensor) -> Tensor:
-        """Rows of the bodies of both sides of pairs [n, 2]; one twice where only one side moves or the pair does not
+        """Rows of the bodies of both sides of pairs [n, 2]; one row twice where one side moves or the pair does not
         count."""
         scene, corners = corners_of(listed)
         body, kind = self.of_corner[corners], listed.pairs[:, 4]
@@ -156,41 +158,42 @@ class Trials:
 
     @torch.no_grad()
     def admits(self, x: Tensor, to: Tensor) -> Tensor:
-        """Whether each set may go from x to ``to`` [1, B V, 3], bool [1, sets]. What does not move must stay."""
+        """Whether each set may move from x to ``to`` [1, B V, 3], bool [1, sets]; what does not move is at x in
+        both."""
         x, to = (t.reshape(self.scenes.fields.x_prev.shape) for t in (x, to))
         return self._admits(x, to, 0.0)[None, :-1]
 
     @torch.no_grad()
-    def lengths(self, x: Tensor, way: Tensor, slope: Tensor) -> Tensor:
-        """Fraction of a displacement [B, V, 3] that each set takes: the first of 1, 1/2, ..., 1/128 that lowers its
-        potential by enough of what the slope [sets] promises, else 0; [1, sets]."""
+    def lengths(self, x: Tensor, displacement: Tensor, slope: Tensor) -> Tensor:
+        """Step fraction of each set along a displacement [B, V, 3]: the first of 1, 1/2, ..., 1/128 with a sufficient
+        decrease of its potential, by the slope [sets]; else 0; [1, sets]."""
         found = torch.zeros_like(slope, dtype=x.dtype)
         for trial in range(FRACTIONS):
-            share = 0.5**trial
-            enough = torch.cat([DECREASE * share * slope, slope.new_zeros(1)])
-            good = self._admits(x, x + share * way, enough)[:-1] & (slope <= 0)
-            found = torch.where((found == 0) & good, share, found)
+            fraction = 0.5**trial
+            enough = torch.cat([DECREASE * fraction * slope, slope.new_zeros(1)])
+            good = self._admits(x, x + fraction * displacement, enough)[:-1] & (slope <= 0)
+            found = torch.where((found == 0) & good, fraction, found)
             if not x.is_cuda and bool((found > 0).all()):
                 break
         return found[None]
 
     def _admits(self, x: Tensor, to: Tensor, most: Tensor | float) -> Tensor:
-        """Whether the potential of each set rises at most so much, and nothing crosses, bool [sets + 1]."""
-        rise, size = self.rise(x, to).unbind(-1)
-        fits = torch.ones_like(rise, dtype=x.dtype)
+        """Whether the potential of each set increases at most by ``most``, without crossings, bool [sets + 1]."""
+        increase, size = self.increase(x, to).unbind(-1)
+        fits = torch.ones_like(increase, dtype=x.dtype)
         fits = fits.scatter_reduce(0, self.bodies.of, self._fits(x, to).reshape(-1), "amin")
-        # never of what is no number
-        return (rise <= most + ROUNDINGS * torch.finfo(x.dtype).eps * size) & (fits >= 1)
+        # False for NaN
+        return (increase <= most + ROUNDINGS * torch.finfo(x.dtype).eps * size) & (fits >= 1)
 
     def of_bodies(self, values: Tensor) -> Tensor:
         """Values of sets [1, sets] of each body that moves [B, bodies]."""
         return values[0][self.bodies.of_body[:, :-1]]
 
-    def rise(self, x: Tensor, to: Tensor) -> Tensor:
-        """Increase of the potential of each set from x to ``to`` [B, V, 3], and the sizes of its terms
-        [sets + 1, 2], last of what does not move."""
+    def increase(self, x: Tensor, to: Tensor) -> Tensor:
+        """Increase of the potential of each set from x to ``to`` [B, V, 3], and the sizes of its terms [sets + 1, 2];
+        the last row is of what does not move."""
         rows = self.bodies.number + 1
-        own = rise_of_bodies(self.parts, x, to)
+        own = increase_of_bodies(self.inputs, x, to)
         total = sum_by(own.flatten(0, 1), self.bodies.of_body[:, :-1].reshape(-1), rows)
         if self.scenes.fields.floor_lag.numel():
             total = total + _summed(floor_friction_values, self.scenes, x, to, self.bodies.of, rows)
@@ -199,16 +202,16 @@ class Trials:
         return total
 
     def _fits(self, x: Tensor, to: Tensor) -> Tensor:
-        """1 where a vertex may go there as all others go [B, V], less elsewhere; floors count in the potential."""
+        """Step fraction of each vertex when all move [B, V]: 1 where it fits; floors count in the potential."""
         f, surface = self.scenes.fields, self.scenes.model.surface_of_contact
         if surface is None:
             return torch.ones_like(x[..., 0])
         none, collider = x.new_zeros((x.shape[0], surface.bodies, 3)), f.collider.detach()
-        way = torch.nan_to_num(to - x, 0.0, 0.0, 0.0)  # what is no number is found by the potential
-        share, _ = ops_start.advance(x.contiguous(), way, none, f.center, f.origin, collider, collider, f.held, f.body,
-                                     self.each, self.scenes.listed, careful=False)  # fmt: skip
-        within = (to - f.center).square().sum(-1) <= f.room**2
-        return torch.where(within | f.held[: x.shape[1]], share, 0.0)
+        displacement = torch.nan_to_num(to - x, 0.0, 0.0, 0.0)  # the potential finds NaN
+        fraction, _ = ops_start.advance(x.contiguous(), displacement, none, f.center, f.origin, collider, collider,
+                                        f.pinned, f.body, self.each, self.scenes.listed, careful=False)  # fmt: skip
+        within = (to - f.center).square().sum(-1) <= f.trust_radius**2
+        return torch.where(within | f.pinned[: x.shape[1]], fraction, 0.0)
 
 
 def _summed(
@@ -220,13 +223,13 @@ def _summed(
 
 
 def connected_rows(one: Tensor, two: Tensor, count: int) -> Tensor:
-    """The least of the rows that pairs (one, two) [n] join, directly or by others, of each of so many [count]; on CUDA,
-    which must not look, after rounds that are enough for any but strange graphs."""
+    """Smallest row connected with each of ``count`` rows by pairs (one, two) [n]; on CUDA after a fixed number of
+    rounds, enough for all but unusual graphs."""
     least = torch.arange(count, device=one.device)
     for _ in range(2 * count.bit_length()):
         low = torch.minimum(least[one], least[two])
         after = least
-        for row in (one, two, least[one], least[two]):  # ends of pairs, and the least that they have known
+        for row in (one, two, least[one], least[two]):  # ends of pairs, and their smallest rows so far
             after = after.scatter_reduce(0, row, low, "amin")
         after = after[after]
         if not one.is_cuda and torch.equal(after, least):
@@ -273,7 +276,7 @@ def outer(n: Tensor) -> Tensor:
 
 
 def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
-    """f1(|u|) / |u| of friction, and that quotient's derivative over |u|, of slips u [..., 3]."""
+    """f1(|u|) / |u| of friction and the derivative of this quotient over |u|, of tangential motions u [..., 3]."""
     square = (u * u).sum(-1)
     moves = square > (RESTING_MOTION * eps) ** 2
     length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
@@ -284,7 +287,8 @@ def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
 
 
 def _slip_stiffness(rate: Tensor, bend: Tensor, n: Tensor, u: Tensor) -> Tensor:
-    """Friction's exact derivative by the motion across n [..., 3, 3], of load times what _slip returns."""
+    """Exact derivative of friction by the tangential motion [..., 3, 3]; rate, bend: results of _slip times the
+    load."""
     eye = torch.eye(3, dtype=n.dtype, device=n.device)
     return rate[..., None, None] * (eye - outer(n)) + bend[..., None, None] * outer(u)
 
@@ -297,7 +301,7 @@ def log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor | None]]]:
-    """The energies of single vertices, each with its data, the time step and the origin."""
+    """Vertex energies, each with its data, the time step and the origin."""
     f = s.fields
     out, first, origin = [], 0, f.origin if f.origin.numel() else None
     for energy in s.model.vertex_energies:
@@ -310,7 +314,7 @@ def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor |
 
 
 def _floor_slip(s: Scenes) -> tuple[Tensor, Tensor, Tensor]:
-    """Of friction on a floor: motion along each plane, and load [N] times what _slip returns."""
+    """Floor friction: tangential motion along each plane, and the results of _slip times the load [N]."""
     load, n = s.fields.floor_lag[..., 0], s.fields.floor_lag[..., 1:]
     travel = (s.fields.x - s.fields.x_prev)[:, :, None]
     u = travel - n * (n * travel).sum(-1, keepdim=True)
@@ -319,7 +323,7 @@ def _floor_slip(s: Scenes) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def vertex_gradient(s: Scenes) -> Tensor:
-    """Of inertia, energies of single vertices and friction on a floor [B, V, 3]; of inertia not at pinned vertices."""
+    """Gradient of inertia, vertex energies and floor friction [B, V, 3]; without inertia at pinned vertices."""
     f = s.fields
     off = torch.where(s.model._pinned[:, None], torch.zeros_like(f.x), f.x - f.y)
     force = broadcast(f.mass, f.x.shape[:2])[..., None] * off
@@ -332,7 +336,7 @@ def vertex_gradient(s: Scenes) -> Tensor:
 
 
 def vertex_blocks(s: Scenes) -> Tensor | None:
-    """Blocks [B, V, 3, 3] of its derivative, without those of inertia; None where there are none."""
+    """Blocks [B, V, 3, 3] of its derivative without inertia; None: there are none."""
     f = s.fields
     parts = [energy.blocks(f.x, f.x_prev, *rest) for energy, rest in _vertex_energies(s)]
     if f.floor_lag.numel():
@@ -345,13 +349,13 @@ def vertex_blocks(s: Scenes) -> Tensor | None:
 
 
 def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:
-    """Scene [n, 1] and corner points [n, 4] of pairs; of rows that no pair fills, the first."""
+    """Scene [n, 1] and corner points [n, 4] of pairs; empty rows get zeros."""
     rows = listed.pairs.long().clamp(min=0)
     return rows[:, 5:], rows[:, :4]
 
 
 def _listed(s: Scenes) -> Pairs:
-    """The pairs that push: few of those that are listed. All of them where values must not decide sizes."""
+    """Pairs that push, few of the listed ones; all where values must not decide sizes."""
     f, listed = s.fields, s.listed
     if f.x.is_cuda:
         return listed
@@ -361,7 +365,7 @@ def _listed(s: Scenes) -> Pairs:
 
 
 def pair_terms(s: Scenes) -> list[PairTerms]:
-    """Of barriers, and of lagged friction and damping."""
+    """Terms of barriers, and of lagged friction and damping."""
     f, h, h2 = s.fields, s.time_step, s.time_step**2
     points = torch.cat([f.x, f.collider], 1)
     out = []
@@ -417,45 +421,45 @@ class Corrected(NamedTuple):
     """State after corrections; all but x is index data."""
 
     x: Tensor  # [B, V, 3]
-    shares: list[Tensor]  # of its motion that each body took of each [B, bodies]
-    back: Tensor  # how much of its last shift each did not take [B, bodies] [m]
+    fractions: list[Tensor]  # step fractions of each correction [B, bodies]
+    back: Tensor  # translation that each did not take of its last motion [B, bodies] [m]
 
 
 class Which(NamedTuple):
-    """Bodies that a correction is to move, as of ops.contact.rigid_system."""
+    """Bodies that a correction moves; see ops.contact.rigid_system."""
 
     moving: Tensor | None = None  # bool [B, bodies]; None: all
     alone: bool = False
 
 
-# more(count, moved, groups): which bodies the next correction moves, after `count` of them, by what the last one
-# returned; None ends them.
+# more(count, moved, groups): bodies of the next correction, after `count` of them, from the results of the last one;
+# None ends them.
 More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
 
 
 def once(*_: Any) -> None:
-    """One correction, and no more."""
+    """Ends the corrections after the first."""
 
 
 def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float,
             more: More = once) -> Corrected:  # fmt: skip
-    """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as
-    ``more`` says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
+    """State after the rigid correction of every free body, by an admissible step fraction, and after those that
+    ``more`` adds. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
     kept = torch.is_grad_enabled() and any(t.requires_grad for t in fields)
     x, back, *rest = _correct(*fields, model, time_step, friction_eps, more, kept)
-    shares = _made(fields.x, rest).share if kept else rest
-    return Corrected(x, [share.to(x.dtype) for share in shares], back)
+    fractions = _made(fields.x, rest).fraction if kept else rest
+    return Corrected(x, [fraction.to(x.dtype) for fraction in fractions], back)
 
 
 def _made(x: Tensor, flat: Sequence[Tensor]) -> ops_rigid.Made:
-    """Takes apart what _Correct keeps: motion, share, factor and groups of each correction, and between two of them
-    where the second began. x: Where the first did."""
+    """Corrections from the saved list: motion, fraction, factor and groups of each, and between two of them the state
+    before the second. x: State before the first."""
     return ops_rigid.Made([x, *flat[4::5]], *(flat[k::5] for k in range(4)))
 
 
 def bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """order, ptr, free, held and body of ops.TouchingFields."""
+    """order, ptr, free, pinned and body of ops.TouchingFields."""
     return model.derived("touching_bodies", lambda: _bodies_of(model))
 
 
@@ -464,7 +468,7 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     pins = torch.zeros((count,), dtype=torch.int64, device=model.device).index_add(0, model.body, model._pinned.long())
     free = pins == 0
     if surface is not None:
-        return surface.body_order, surface.body_ptr, free, surface.held, surface.body
+        return surface.body_order, surface.body_ptr, free, surface.pinned, surface.body
     body, order = torch.sort(model.body, stable=True)
     ptr = torch.searchsorted(body, torch.arange(count + 1, device=body.device))
     return order.to(torch.int32), ptr.to(torch.int32), free, model._pinned, model.body.to(torch.int32)
@@ -479,8 +483,8 @@ def _run(*args: Any) -> tuple[Tensor, ...]:
             made.append(fields.x)
         centers, motion, factor, groups = ops_rigid.rigid_system(fields, *options, which.moving, which.alone)
         end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
-        made.extend([motion, end.share, factor, groups] if kept else [end.share])
-        back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
+        made.extend([motion, end.fraction, factor, groups] if kept else [end.fraction])
+        back = end.remaining if which.moving is None else torch.where(end.moved, end.remaining, back)
         count, fields = count + 1, replaced(fields, x=end.x)
         which = more(count, end, groups)
     return fields.x, back, *made
@@ -501,8 +505,8 @@ _correct = ops.Differentiable(
 
 
 def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> list[Tensor | None]:
-    """Of the fields. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
-    of d: a sum over vertices and pairs."""
+    """Adjoints of the fields. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint of d:
+    a sum over vertices and pairs."""
     f = s.fields
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
     own = ops_rigid.rigid_reverse(f, made, x_bar, s.model._data_count, s.time_step, s.friction_eps,
@@ -515,11 +519,11 @@ def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bo
 
 # --- the coarse correction of bodies that touch -----------------------------------------------------------------------
 
-REFUSALS = 2  # corrections of a set without an admissible length, after which a part makes no more of it
+REFUSALS = 2  # corrections of a set without an admissible length, after which a substep makes no more of them
 
 
 class Space(NamedTuple):
-    """The functions W [V, F] of a Model, row by row, and of which body they are; constants."""
+    """Functions W [V, F] of a Model by row, and their bodies; constants."""
 
     vertex: Tensor  # int64 [entries]
     function: Tensor  # int64 [entries]
@@ -568,7 +572,7 @@ def _order(index: Tensor, count: int) -> Order:
 
 
 class Corrections:
-    """The coarse corrections of one part of a step; ``packed``: the matrices of all bodies, differentiable."""
+    """Coarse corrections of a substep. packed: Matrices of all bodies, differentiable."""
 
     def __init__(self, trials: Trials, fields: ops.SweepFields, packed: Tensor, scenes: Scenes) -> None:
         self.trials, self.fields, self.packed, self.scenes = trials, fields, packed, scenes
@@ -588,20 +592,20 @@ class Corrections:
         r, presses = self._gradient(x)
         with torch.no_grad():
             a = self._solved(presses, r)
-            way = -self.space.prolonged(a)
+            displacement = -self.space.prolonged(a)
             slope = sum_by(-(r * a).sum(-1).reshape(-1, 1).double(), self.set_of.reshape(-1), over.shape[1] + 1)[:-1, 0]
-            length = torch.where(over | self._lost(), 0.0, self.trials.lengths(x, way, slope))
+            length = torch.where(over | self._lost(), 0.0, self.trials.lengths(x, displacement, slope))
             self.refused = self.refused + (length == 0)
         if torch.is_grad_enabled():
-            way = -self.space.prolonged(self._differentiable(a, r, presses))
+            displacement = -self.space.prolonged(self._differentiable(a, r, presses))
         of_vertex = torch.cat([length, length.new_zeros((1, 1))], 1)[0][self.trials.bodies.of].reshape(*x.shape[:2], 1)
-        return torch.where(of_vertex > 0, x + of_vertex * way, x), self._of_bodies(length)
+        return torch.where(of_vertex > 0, x + of_vertex * displacement, x), self._of_bodies(length)
 
     def _of_bodies(self, length: Tensor) -> Tensor:
         return length[0][self.trials.bodies.of_body[:, self.space.of_coarse]]
 
     def _gradient(self, x: Tensor) -> tuple[Tensor, list[_Press]]:
-        """P' dG [B, F, 3], and what presses back."""
+        """P' dG [B, F, 3], and stiffnesses."""
         s, f = replaced(self.scenes, fields=replaced(self.scenes.fields, x=x)), self.fields
         force = _Elastic.apply(x, f.mu, f.lam, f.rest, self.constants, s.model, s.time_step) + vertex_gradient(s)
         scenes, vertices = x.shape[:2]
@@ -612,7 +616,7 @@ class Corrections:
         for terms in pair_terms(s):
             scene, corners = corners_of(terms.listed)
             moves = corners < vertices
-            rows = vertices * scene + torch.where(moves, corners, 0)  # what does not move is of its scene, too
+            rows = vertices * scene + torch.where(moves, corners, 0)  # a corner that does not move keeps its scene
             weights = torch.where(moves, terms.weights, 0.0)
             pulled = terms.weights[..., None] * terms.force[:, None]
             if terms.at_corners is not None:
@@ -622,14 +626,14 @@ class Corrections:
         return self.space.restricted(force), presses
 
     def _solved(self, presses: list[_Press], r: Tensor) -> Tensor:
-        """a [B, F, 3]; keeps the factor, in double precision: single has no room for the range of stiffnesses."""
+        """a [B, F, 3]; keeps the factor, in double precision for the range of stiffnesses."""
         scenes, unknowns = r.shape[0], 3 * self.space.functions
         matrix = self.matrix.expand(scenes, unknowns, unknowns).double()
         for press in presses:
             matrix = matrix + press.assembled(self.space, scenes, self.scenes.fields.x_prev.shape[1])
         with one_thread(matrix):
             factor = torch.linalg.cholesky_ex(matrix)[0]
-        # of a matrix that is not positive definite no correction comes, and nothing goes back through it
+        # a matrix that is not positive definite gives no correction and no gradient
         self.solved = torch.isfinite(factor).flatten(1).all(1)[:, None, None]
         self.cholesky = torch.where(self.solved, factor, torch.eye(unknowns, dtype=factor.dtype, device=r.device))
         return self._back(r)
@@ -644,12 +648,12 @@ class Corrections:
         return _Back.apply(self.cholesky, right).reshape(r.shape).to(r.dtype)
 
     def _differentiable(self, a: Tensor, r: Tensor, presses: list[_Press]) -> Tensor:
-        """a with its derivatives: one more step, r - A a being zero, with the matrix as it was. It has no length, even
-        where it would have one, because the matrix is nearly singular: what was judged is what is done."""
+        """a with its derivatives: one more step with the same matrix. Its value, r - A a, is dropped, even where the
+        matrix is nearly singular: the correction that was tried is the one that is made."""
         pushed = _Product.apply(self.packed, a, self.space)
-        way = self.space.prolonged(a)
+        displacement = self.space.prolonged(a)
         for press in presses:
-            pushed = pushed + self.space.restricted(press.product(way))
+            pushed = pushed + self.space.restricted(press.product(displacement))
         step = self._back(r - pushed)
         return a + (step - step.detach())
 
@@ -661,13 +665,13 @@ class _Press(NamedTuple):
     weights: Tensor  # [n, k]
     stiffness: Tensor  # [n, 3, 3], times h^2
 
-    def product(self, way: Tensor) -> Tensor:
+    def product(self, displacement: Tensor) -> Tensor:
         """[B, V, 3] -> [B, V, 3]"""
-        flat = way.flatten(0, 1)
+        flat = displacement.flatten(0, 1)
         moved = (self.weights[..., None] * flat[self.rows]).sum(1)
         force = (self.stiffness * moved[:, None]).sum(-1)
         pulled = self.weights[..., None] * force[:, None]
-        return sum_by(pulled.reshape(-1, 3), self.rows.reshape(-1), len(flat)).reshape(way.shape)
+        return sum_by(pulled.reshape(-1, 3), self.rows.reshape(-1), len(flat)).reshape(displacement.shape)
 
     def assembled(self, space: Space, scenes: int, vertices: int) -> Tensor:
         """P' H P [B, 3F, 3F]."""
@@ -685,7 +689,7 @@ class _Press(NamedTuple):
 
 
 def _at_vertices(blocks: Tensor) -> _Press:
-    """Of blocks [B, V, 3, 3]; where values may decide sizes, of those that are not zero."""
+    """Stiffness of blocks [B, V, 3, 3]; only of nonzero ones where values may decide sizes."""
     flat = blocks.flatten(0, 1)
     rows = torch.arange(len(flat), device=flat.device)
     if not flat.is_cuda:
@@ -772,37 +776,36 @@ class _Elastic(Function):
 
 # --- rigid corrections of a substep -----------------------------------------------------------------------------------
 
-# Rigid corrections after the last sweeps, with the first, as long as bodies were held up on their way: they come close
-# to those that held them up, and then push them. Of a row of four cubes that meet at 3 m/s the motion lost 14 % of its
-# momentum with one correction and nothing with three; at 10 m/s that takes five.
-HELD_CORRECTIONS = 5
-# And where bodies are left alone, as those that touch are too many. In stacks of two that rub the upper one creeps at
-# 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.
+# Rigid corrections after the last sweeps while bodies are blocked: they first approach the blocking bodies, then push
+# them. A row of four cubes that meet at 3 m/s lost 14 % of its momentum with one correction and none with three; at
+# 10 m/s that takes five.
+BLOCKED_CORRECTIONS = 5
+# The same where touching bodies are too many to be corrected together. In stacks of two with friction the upper body
+# creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.
 LEFT_CORRECTIONS = 8
-HELD = 0.01  # of its way in the step and of dhat: by more than that a body has been held up
+BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
 
-def corrected(of: Any, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs,
-              more: More = once) -> Corrected:  # fmt: skip
-    """After the rigid correction of all free bodies, and after others, as ``more`` says."""
+def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, more: More = once) -> Corrected:
+    """State after the rigid correction of all free bodies, and after those that ``more`` adds."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
     return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, more)
 
 
-def touching(of: Any, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
-    """Parts of all potentials of whole bodies, at x [B, V, 3]."""
+def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs) -> ops.TouchingFields:
+    """Fields of the rigid correction, at x [B, V, 3]."""
     lagged = of.lagged
     return ops.TouchingFields(
         x, of.x_prev, of.begun.y, of.fields.mass, of.begun.data, of.origin, *bodies_of(of.model), collider, of.before,
-        of.kappa, *listed, of.lag, lagged.pairs, lagged.ptr, lagged.entry, of.floor_lag, start.center, start.room,
+        of.kappa, *listed, of.lag, lagged.pairs, lagged.ptr, lagged.entry, of.floor_lag, start.center,
+        start.trust_radius,
     )  # fmt: skip
 
 
-def corrected_after(of: Any, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, last: bool
-                    ) -> Corrected:  # fmt: skip
-    """After the corrections that follow the sweeps of a part. last: Whether these are the last sweeps."""
-    # coarse sweeps leave a stiff body turned, and one Newton step leaves so much of that that a free body gained spin
+def corrected_after(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, last: bool) -> Corrected:
+    """State after the corrections that follow the sweeps of a substep. last: Whether these are the last sweeps."""
+    # coarse sweeps leave a stiff body rotated; after one Newton step a free body still gained spin
     least = 1 if of.prepared.coarse is None else 2
     bodies = of.model.mesh.num_bodies
     grouped, captured = bodies <= most_grouped(bodies), is_captured(x)
@@ -810,23 +813,23 @@ def corrected_after(of: Any, x: Tensor, collider: Tensor, start: PartStart, list
     def more(count: int, end: Moved, groups: Tensor) -> Which | None:
         if count < least:
             return Which()
-        if not last or of.barrier is None or count >= (HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS):
+        if not last or of.barrier is None or count >= (BLOCKED_CORRECTIONS if grouped else LEFT_CORRECTIONS):
             return None
-        alone = count >= HELD_CORRECTIONS
+        alone = count >= BLOCKED_CORRECTIONS
         left = None if grouped else left_alone(groups)
         if not captured:
-            some_held = not alone and bool(end.held.any())
-            if not some_held and (left is None or not bool(left.any())):
+            some_blocked = not alone and bool(end.blocked.any())
+            if not some_blocked and (left is None or not bool(left.any())):
                 return None
-            alone = not some_held
-        return Which(end.held if left is None else left if alone else end.held | left, alone)
+            alone = not some_blocked
+        return Which(end.blocked if left is None else left if alone else end.blocked | left, alone)
 
     return corrected(of, x, collider, start, listed, more)
 
 
-def is_cut(of: Any, x: Tensor, back: Tensor) -> Tensor:
-    """The vertices [B, V] of bodies that were held up at the end, at x [B, V, 3]; back: of Corrected."""
+def is_blocked(of: Any, x: Tensor, back: Tensor) -> Tensor:
+    """Vertices [B, V] of bodies blocked at the end, at x [B, V, 3]; back: Of Corrected."""
     assert of.barrier is not None
-    way = (x.detach() - of.x_prev.detach()).norm(dim=-1)
+    displacement = (x.detach() - of.x_prev.detach()).norm(dim=-1)
     body = of.model.derived("labels", lambda: of.model.body)
-    return back[:, body] > HELD * (way + of.barrier.dhat)
+    return back[:, body] > BLOCKED * (displacement + of.barrier.dhat)

@@ -33,8 +33,8 @@ from .predict import Begun, begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
 # With these a turn leaves the shape of a body to third order in its angle. The first solve of SDIRK2() goes along
-# tangents, of chord 0, by which no turn could be measured.
-CHORD_OF_BDF2, CHORDS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
+# tangents, of lookback 0, by which no turn could be measured.
+LOOKBACK_OF_BDF2, LOOKBACKS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
 SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
 STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
 
@@ -172,27 +172,27 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
         x_end, v_end, last = solve(x, v, whole, end)
         return Taken(x_end, v_end, remembered(x_end), last)
 
-    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float, chord: float,
+    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, fraction: float, lookback: float,
                    end: dict[str, Any] = end, begun: Tensor | None = None) -> Taken:  # fmt: skip
         """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
-        start, weights = reference + carried, _over(whole, share, chord)
+        start, weights = reference + carried, _over(whole, fraction, lookback)
         if euler is not None:
             one = euler[..., None]
-            feasible, start = torch.where(one, x, feasible), torch.where(one, v / share, start)
-            weights, loads = _of_euler(model, weights, end, x, euler, share)
+            feasible, start = torch.where(one, x, feasible), torch.where(one, v / fraction, start)
+            weights, loads = _of_euler(model, weights, end, x, euler, fraction)
         else:
             loads = end
         x_end, v_end, last = solve(feasible, start, weights, loads, begun)
-        v_end = v_end - carried if euler is None else torch.where(euler[..., None], share * v_end, v_end - carried)
+        v_end = v_end - carried if euler is None else torch.where(euler[..., None], fraction * v_end, v_end - carried)
         return Taken(x_end, v_end, remembered(x_end), last)
 
     if isinstance(integrator, BDF2) and history is not None:
         carried = history.moved / (2 * time_step)
-        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3, CHORD_OF_BDF2)
-    first, second = CHORDS_OF_SDIRK2
-    on_the_way = _at_share(given, x, GAMMA)
-    x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), on_the_way)
-    feasible, carried, before = x1, math.sqrt(2) * v1, on_the_way["colliders"]
+        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3, LOOKBACK_OF_BDF2)
+    first, second = LOOKBACKS_OF_SDIRK2
+    midway = _at_fraction(given, x, GAMMA)
+    x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), midway)
+    feasible, carried, before = x1, math.sqrt(2) * v1, midway["colliders"]
     if euler is not None and model.contact is not None:
         # x1 keeps bodies apart that all are there; beside one that is still at x, which others may meet, all begin at x
         mixed = euler.any(-1)[..., None, None]
@@ -214,11 +214,11 @@ def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _over(whole: Prepared, share: float, chord: float) -> Prepared:
-    """The arguments of a solve over a share of the step, along ways of a chord."""
+def _over(whole: Prepared, fraction: float, lookback: float) -> Prepared:
+    """The arguments of a solve over a fraction of the step, with a lookback ratio."""
     numbers = whole.settings.numbers
-    numbers = replaced(numbers, time_step=share * numbers.time_step, friction_eps=share * numbers.friction_eps)
-    return replaced(whole, settings=replaced(whole.settings, numbers=numbers), chord=chord)
+    numbers = replaced(numbers, time_step=fraction * numbers.time_step, friction_eps=fraction * numbers.friction_eps)
+    return replaced(whole, settings=replaced(whole.settings, numbers=numbers), lookback=lookback)
 
 
 def _touching(model: System, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:
@@ -233,13 +233,14 @@ def _touching(model: System, x: Tensor, v: Tensor, prepared: Prepared, given: di
         return may_touch(model, begun, prepared, where).reshape(x.shape[:-1])
 
 
-def _of_euler(model: System, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, share: float
+def _of_euler(model: System, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, fraction: float
               ) -> tuple[Prepared, dict[str, Any]]:  # fmt: skip
-    """Arguments of a solve over a share of the step in which some bodies take all of it. ``euler``: bool [..., V]."""
-    factor = torch.ones_like(x[..., 0]).masked_fill(euler, share * share)
+    """Arguments of a solve over a fraction of the step in which some bodies take all of it. ``euler``: bool [...,
+    V]."""
+    factor = torch.ones_like(x[..., 0]).masked_fill(euler, fraction * fraction)
     mass = prepared.mass * factor.reshape(-1, factor.shape[-1])
     numbers = prepared.settings.numbers
-    settings = replaced(prepared.settings, numbers=replaced(numbers, friction_eps=numbers.friction_eps / share))
+    settings = replaced(prepared.settings, numbers=replaced(numbers, friction_eps=numbers.friction_eps / fraction))
     coarse = prepared.coarse
     if coarse is not None:
         coarse = replaced(coarse, mass=coarse_mass(model._coarse_plan, mass))
@@ -249,7 +250,7 @@ def _of_euler(model: System, prepared: Prepared, given: dict[str, Any], x: Tenso
             name = input_name(energy, "damping")
             value = parameters[name] if name in parameters else model.constants(energy)["damping"][None]
             if name in parameters or energy.damping > 0:
-                parameters[name] = share * value
+                parameters[name] = fraction * value
     gravity = acceleration_of(given["gravity"], x) / factor[..., None]
     own = replaced(prepared, mass=mass, settings=settings, coarse=coarse, parameters=parameters,
                    euler=euler.reshape(-1, euler.shape[-1]))  # fmt: skip
@@ -261,14 +262,14 @@ def _at_end(given: dict[str, Any]) -> dict[str, Any]:
     return {k: v[-1] if k in STAGED and isinstance(v, tuple) else v for k, v in given.items()}
 
 
-def _at_share(given: dict[str, Any], x: Tensor, share: float) -> dict[str, Any]:
-    """Of a solve up to a share of the step, to which what is prescribed moves evenly unless that is given."""
+def _at_fraction(given: dict[str, Any], x: Tensor, fraction: float) -> dict[str, Any]:
+    """Of a solve up to a fraction of the step, to which what is prescribed moves evenly unless that is given."""
     out = {k: v[0] if k in STAGED and isinstance(v, tuple) else v for k, v in given.items()}
     prescribed, colliders, before = (given[k] for k in ("prescribed", "colliders", "colliders_before"))
     if isinstance(prescribed, Tensor):
-        out["prescribed"] = x + share * (broadcastable("prescribed", prescribed, x) - x)
+        out["prescribed"] = x + fraction * (broadcastable("prescribed", prescribed, x) - x)
     if isinstance(colliders, Tensor) and before is not None:
-        out["colliders"] = before + share * (colliders - before)
+        out["colliders"] = before + fraction * (colliders - before)
     return out
 
 
@@ -290,14 +291,14 @@ def may_touch(model: System, begun: Begun, prepared: Prepared, where: tuple[Tens
         where: Colliders at the start and at the end of the step [B, Vc, 3] [m], of a Model with contact.
     """
     begun = begun.detached()
-    way = begun.y - begun.x_prev
-    near = torch.zeros_like(way[..., 0], dtype=torch.bool)
+    displacement = begun.y - begun.x_prev
+    near = torch.zeros_like(displacement[..., 0], dtype=torch.bool)
     if model.floor is not None:
-        near = _near_floor(model, begun, prepared, way)
+        near = _near_floor(model, begun, prepared, displacement)
     if model.contact is not None and where is not None:
-        near = near | _near_pairs(model, begun, prepared, way, *where)
+        near = near | _near_pairs(model, begun, prepared, displacement, *where)
     first = model._first_of_body.expand(near.shape)
-    of_body = torch.zeros_like(way[..., 0]).scatter_reduce(1, first, near.to(way.dtype), "amax")
+    of_body = torch.zeros_like(displacement[..., 0]).scatter_reduce(1, first, near.to(displacement.dtype), "amax")
     return of_body.gather(1, first) > 0
 
 
@@ -309,18 +310,18 @@ def _extrapolates(model: System, prepared: Prepared) -> bool:
     return model.friction is None and not any(damped)
 
 
-def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, way: Tensor, mass: Tensor, h: float) -> Tensor:
+def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, displacement: Tensor, mass: Tensor, h: float) -> Tensor:
     """Whether a step of h resolves a barrier, so that its force may be extrapolated: its sides move by less than the
     gap [m], and its curvature where they may end, over masses [kg], vibrates slowly."""
-    slow = way < SLOW * torch.minimum(gap, dhat)
-    return slow & (h * h * barrier_curvature(gap - way, kappa, dhat) < SOFT * mass)
+    slow = displacement < SLOW * torch.minimum(gap, dhat)
+    return slow & (h * h * barrier_curvature(gap - displacement, kappa, dhat) < SOFT * mass)
 
 
-def _near_floor(model: System, begun: Begun, prepared: Prepared, way: Tensor) -> Tensor:
+def _near_floor(model: System, begun: Begun, prepared: Prepared, displacement: Tensor) -> Tensor:
     assert model.floor is not None
     data = begun.data[:, : model.floor.count()]
     gap, normal, kappa, dhat = model.floor.gaps(begun.x_prev, data, begun.origin)
-    along = (normal * way[:, :, None]).sum(-1)
+    along = (normal * displacement[:, :, None]).sum(-1)
     near = gap - MARGIN * (-along).clamp(min=0) < (1 + LEAST) * dhat
     if _extrapolates(model, prepared):
         h = prepared.settings.numbers.time_step
@@ -328,47 +329,53 @@ def _near_floor(model: System, begun: Begun, prepared: Prepared, way: Tensor) ->
     return near.any(-1) & ~model._pinned
 
 
-def _near_pairs(model: System, begun: Begun, prepared: Prepared, way: Tensor, before: Tensor, after: Tensor) -> Tensor:
+def _near_pairs(model: System, begun: Begun, prepared: Prepared, displacement: Tensor, before: Tensor, after: Tensor
+                ) -> Tensor:  # fmt: skip
     step = ContactStep(model, begun, prepared, before, after)
     assert step.surface is not None
-    motion = motion_of(step.surface, step.x_prev, step.origin, step.fields.mass, way, torch.zeros_like(way))
+    motion = motion_of(step.surface, step.x_prev, step.origin, step.fields.mass, displacement,
+                       torch.zeros_like(displacement))  # fmt: skip
     found = step.detect(step.x_prev, step.before, step.colliders, motion)
-    ways = torch.cat([way, after - before], 1)
+    displacements = torch.cat([displacement, after - before], 1)
     *corner, kind, scene = found.listed.pairs.long().unbind(-1)
-    rows = torch.arange(len(kind), device=way.device)
+    rows = torch.arange(len(kind), device=displacement.device)
     at = torch.cat([step.x_prev if begun.origin is None else step.x_prev + step.origin, before], 1)
-    most = _way_between(kind, [ways[scene, c] for c in corner], [at[scene, c] for c in corner])
+    most = _displacement_between(kind, [displacements[scene, c] for c in corner], [at[scene, c] for c in corner])
     gap, dhat = step.gaps_before(found.listed), found.listed.constants[:, 0]
     near = gap - MARGIN * most < (1 + LEAST) * dhat
     near = near & (rows < found.listed.ptr[-1] // 4)  # that pairs fill
     if _extrapolates(model, prepared):
         # colliders do not give way: their masses count as infinite
-        mass = torch.cat([prepared.mass.expand(way.shape[:2]), torch.full_like(after[..., 0], torch.inf)], 1)
+        mass = torch.cat([prepared.mass.expand(displacement.shape[:2]), torch.full_like(after[..., 0], torch.inf)], 1)
         lightest = torch.stack([mass[scene, c] for c in corner]).amin(0)
-        kappa, h = step.kappa.expand(way.shape[0])[scene], prepared.settings.numbers.time_step
+        kappa, h = step.kappa.expand(displacement.shape[0])[scene], prepared.settings.numbers.time_step
         near = near & ~_resolved(gap, kappa, dhat, most, lightest, h)
-    total = ways.shape[0] * ways.shape[1]
+    total = displacements.shape[0] * displacements.shape[1]
     out = near.new_zeros(total + len(kind))
     for c in corner:  # a row that is not near has a place of its own
-        out[torch.where(near, scene * ways.shape[1] + c, total + rows)] = True
+        out[torch.where(near, scene * displacements.shape[1] + c, total + rows)] = True
     too_many = found.counts[0] > step.capacity  # of which some are not listed
-    return out[:total].reshape(ways.shape[:2])[:, : way.shape[1]] | too_many
+    return out[:total].reshape(displacements.shape[:2])[:, : displacement.shape[1]] | too_many
 
 
-def _way_between(kind: Tensor, way: list[Tensor], at: list[Tensor]) -> Tensor:
+def _displacement_between(kind: Tensor, displacement: list[Tensor], at: list[Tensor]) -> Tensor:
     """Relative displacement of the sides of pairs [m]: the longest of their corners' across them; for a
     plane, which may turn about points far away, the way of the vertex relative to the plane's point below it."""
     edges = kind == EDGE_EDGE
-    square = way[0].new_zeros(len(kind))
+    square = displacement[0].new_zeros(len(kind))
     for i, j, of in ((0, 1, ~edges), (0, 2, None), (0, 3, None), (1, 2, edges), (1, 3, edges)):
-        across = (way[i] - way[j]).square().sum(-1)
+        across = (displacement[i] - displacement[j]).square().sum(-1)
         square = torch.maximum(square, across if of is None else torch.where(of, across, 0))
     p, a, b, c = at
     first, second, own = b - a, c - a, p - a
     products = [(s * t).sum(-1) for s, t in ((first, first), (first, second), (second, second))]
     along = [(s * own).sum(-1) for s in (first, second)]
     inverse = 1 / (products[0] * products[2] - products[1].square())
-    share = [(products[2] * along[0] - products[1] * along[1]) * inverse,
-             (products[0] * along[1] - products[1] * along[0]) * inverse]  # fmt: skip
-    below = way[1] + share[0][:, None] * (way[2] - way[1]) + share[1][:, None] * (way[3] - way[1])
-    return torch.where(kind == POINT_PLANE, (way[0] - below).square().sum(-1), square).sqrt()
+    fraction = [(products[2] * along[0] - products[1] * along[1]) * inverse,
+                (products[0] * along[1] - products[1] * along[0]) * inverse]  # fmt: skip
+    below = (
+        displacement[1]
+        + fraction[0][:, None] * (displacement[2] - displacement[1])
+        + fraction[1][:, None] * (displacement[3] - displacement[1])
+    )
+    return torch.where(kind == POINT_PLANE, (displacement[0] - below).square().sum(-1), square).sqrt()

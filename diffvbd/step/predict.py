@@ -18,7 +18,7 @@ from ..model.bodies import Bodies, OtherBodies
 from ..model.system import System
 from ..ops import STARTS, distinct
 from ..ops.contact import join_data
-from .arguments import CHORD, Prepared, broadcastable
+from .arguments import LOOKBACK, Prepared, broadcastable
 
 
 def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -45,12 +45,12 @@ class Begun(NamedTuple):
     y: Tensor  # the predictor
     data: Tensor  # [1 | B, n], of the energies
     origin: Tensor | None
-    lift: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
+    h2a: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
-                     self.lift.detach())  # fmt: skip
+                     self.h2a.detach())  # fmt: skip
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
@@ -118,9 +118,9 @@ def begin(
         rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
         start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
-    x_start, y = begins(chord=prepared.chord)
+    x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
-        x_start = torch.where(prepared.euler[..., None], begins(chord=CHORD)[0], x_start)
+        x_start = torch.where(prepared.euler[..., None], begins(lookback=LOOKBACK)[0], x_start)
     return Begun(x_start, start, y, data, origin, (h * h) * acceleration)
 
 
@@ -141,11 +141,15 @@ def _run_start(*args: Any) -> tuple[Tensor, ...]:
 def _reverse_start(
     bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
 ) -> list[Any]:
-    fields, (falls, alone), (groups, options) = ops.BeginFields(*saved[:_START_FIELDS]), saved[_START_FIELDS:], rest
+    fields, (from_predictor, alone), (groups, options) = (
+        ops.BeginFields(*saved[:_START_FIELDS]),
+        saved[_START_FIELDS:],
+        rest,
+    )
     x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
     wants = (needs[2], needs[3], needs[5])
     *out, shared, own, planes = ops.direct.begin_backward(
-        *ops.as_list(fields, fields.x), x_start_bar, y_bar, falls, alone, groups, *options[:-1], wants
+        *ops.as_list(fields, fields.x), x_start_bar, y_bar, from_predictor, alone, groups, *options[:-1], wants
     )
     data_out = None
     if needs[5]:
@@ -170,7 +174,7 @@ def _saved(inputs: tuple, made: tuple) -> tuple:
     return *read, *made[2:]
 
 
-# Fields; groups, other_groups, (data_count, time_step, filter_eta, chord, start, filters, parts).
+# Fields; groups, other_groups, (data_count, time_step, filter_eta, lookback, start, filters, parts).
 _begin = ops.Differentiable(
     _run_start, _reverse_start, arguments=_START_FIELDS + 3, inputs=_START_TENSORS, outputs=2, saved=_saved,
     rest=lambda inputs: (inputs[_START_FIELDS], inputs[-1]), vmap=_vmap_start, batched=True,
@@ -180,7 +184,7 @@ _begin = ops.Differentiable(
 def start_of(
     x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
     origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
-    others: OtherBodies, data_count: tuple[int, ...], time_step: float, chord: float, *, start: str, filters: bool,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float, lookback: float, *, start: str, filters: bool,
     parts: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Start of the sweeps and predictor [m], both [B, V, 3]; differentiable in the first six tensors.
@@ -190,17 +194,17 @@ def start_of(
         prescribed: Where pinned vertices go [m], [1 | B, V, 3]; None: they stay.
         mass, energy_data, origin, mu, lam: As in ops.SweepFields.  pinned: bool [V].
         rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by choices alone.
-        chord: How far back along its way h v a vertex is taken to have been, over h: 1 where v = (x - x_prev) / h.
-        start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
-        filters: Whether the planes of a floor hold back a start.
-        parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
+        lookback: Distance back along h v at which a vertex counts as having been, over h v: 1 where v = (x - x_prev) /
+        h. start: "auto", "predictor" or "inertia", of the bodies that are not corrected. filters: Whether the planes of
+        a floor hold back a start. parts: Whether bodies that are held back may start vertex by vertex, for which there
+        must be filters.
     """
     # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
     looked_at = mu.detach(), lam.detach(), rest if rest is None else rest.detach()
     tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
     *listed, groups = bodies
     *listed_others, other_groups = others
-    options = (data_count, time_step, FILTER_ETA, chord, STARTS[start], filters)
+    options = (data_count, time_step, FILTER_ETA, lookback, STARTS[start], filters)
     x_start, y, *_ = _begin(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
     return x_start, y
 

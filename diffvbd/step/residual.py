@@ -263,8 +263,8 @@ def _of_body(model: System, at: IncrementalPotential, prepared: Prepared, scene:
         if acts.any():
             matrix += np.einsum("nf,ncd,ng->cfdg", q[acts], turn.T @ blocks[acts] @ turn, q[acts], optimize=True)
     force = (q.T @ (residual @ turn)).T.reshape(-1)
-    way = np.linalg.solve(matrix.reshape(3 * count, -1), force).reshape(3, count)
-    kept = np.linalg.solve(elastic, (way @ gram).reshape(-1)).reshape(3, count)
+    displacement = np.linalg.solve(matrix.reshape(3 * count, -1), force).reshape(3, count)
+    kept = np.linalg.solve(elastic, (displacement @ gram).reshape(-1)).reshape(3, count)
     error = (kept @ gram * kept).sum()
     return Unsolved(scene, body, float(max(error, 0.0) / total) ** 0.5,
                     float((mass * array(forced[None]) ** 2).sum() / total) ** 0.5)  # fmt: skip
@@ -273,13 +273,13 @@ def _of_body(model: System, at: IncrementalPotential, prepared: Prepared, scene:
 # --- motion that pairs have held up -----------------------------------------------------------------------------------
 
 
-def cut_share(model: System) -> Tensor:
+def truncated_fraction(model: System) -> Tensor:
     """Share of the vertices that pairs held up in the Model's latest step [-], of the worst scene; a number on the
     Model's device, which is not waited for."""
     outcome = outcomes.get(model.model)
-    if outcome is None or outcome.cut.numel() == 0 or model.num_active == 0:
+    if outcome is None or outcome.truncated.numel() == 0 or model.num_active == 0:
         return torch.zeros((), device=model.device)
-    return outcome.cut.sum(-1).amax() / model.num_active
+    return outcome.truncated.sum(-1).amax() / model.num_active
 
 
 def what_helps(model: System) -> str:
@@ -418,9 +418,9 @@ class _Bodies(NamedTuple):
     size: Tensor  # [bodies], how many
     corrected: Tensor  # int64 [bodies], which body of the coarse space each is
 
-    def rms(self, way: Tensor) -> Tensor:
+    def rms(self, displacement: Tensor) -> Tensor:
         """[B, V, 3] -> [B, bodies]"""
-        squares = way.square().sum(-1, keepdim=True)
+        squares = displacement.square().sum(-1, keepdim=True)
         return (segment_sum(squares, self.order, self.ptr)[..., 0] / self.size).sqrt()
 
 

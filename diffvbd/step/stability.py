@@ -164,10 +164,10 @@ def _part_of(model: System, crossed: Tensor) -> _Part:
         used, corners = np.unique(tets[rows], return_inverse=True)
         outside = np.ones(len(tets), dtype=bool)
         outside[rows] = False
-        held = model._pinned.cpu().numpy().copy()
-        held[tets[outside]] = True
+        pinned = model._pinned.cpu().numpy().copy()
+        pinned[tets[outside]] = True
         mesh = TetMesh(points[used], corners.reshape(-1, 4))
-        return _Part(_elastic(model, mesh, torch.from_numpy(held[used]), rows), rows)
+        return _Part(_elastic(model, mesh, torch.from_numpy(pinned[used]), rows), rows)
 
     return model.derived(f"elastic about {worst}", build)
 

@@ -140,8 +140,8 @@ def obstacles() -> Scene:
     scene.inputs["colliders_before"] = points + noise("obstacles", "before", shape=points.shape, size=2e-4)
     moved = noise("obstacles", "move", shape=points.shape, size=5e-4)
     scene.inputs["colliders"] = scene.inputs["colliders_before"] + moved
-    held = scene.x + noise("obstacles", "held", shape=scene.x.shape, size=5e-4)
-    scene.inputs["prescribed"] = torch.where(scene.model.pinned[:, None], held, torch.nan)
+    moved = scene.x + noise("obstacles", "held", shape=scene.x.shape, size=5e-4)
+    scene.inputs["prescribed"] = torch.where(scene.model.pinned[:, None], moved, torch.nan)
     return scene
 
 
@@ -166,8 +166,8 @@ def thrown() -> Scene:
     points = scene.model.collider_points
     scene.inputs["colliders_before"] = points + noise("thrown", "before", shape=points.shape, size=2e-4)
     scene.inputs["colliders"] = scene.inputs["colliders_before"] + torch.tensor([-0.001, 0.002, 0.0])
-    held = scene.x + torch.tensor([0.002, -0.001, 0.001])
-    scene.inputs["prescribed"] = torch.where(scene.model.pinned[:, None], held, torch.nan)
+    moved = scene.x + torch.tensor([0.002, -0.001, 0.001])
+    scene.inputs["prescribed"] = torch.where(scene.model.pinned[:, None], moved, torch.nan)
     return scene
 
 
@@ -195,10 +195,10 @@ SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (stacked, cross
                                                                  thrown, held_up, on_held)}  # fmt: skip
 
 
-def part_of(detection: Any) -> reference.Part:
+def substep_of(detection: Any) -> reference.Substep:
     """Index data of a detection as the reference takes it."""
     count = int(detection.counts[0])
-    lowest = detection.lowest.cpu().long() if detection.lowest.numel() else None
+    support_vertex = detection.support_vertex.cpu().long() if detection.support_vertex.numel() else None
     limits = None
     if detection.limits is not None:
         exponents = detection.limits.cpu().double().movedim(1, 0)
@@ -208,12 +208,13 @@ def part_of(detection: Any) -> reference.Part:
         rows = constants[:, -1] < constants[:, 0]
         rows[detection.kept] = True
         pairs, constants = pairs[rows], constants[rows]
-    return reference.Part(pairs, constants, detection.island.cpu().long(), torch.stack(detection.shares).cpu(),
-                          torch.stack(detection.corrections).cpu(), limits,
-                          None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
-                          lengths=None if detection.lengths is None else detection.lengths.cpu(),
-                          sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu(),
-                          resting=None if detection.resting is None else detection.resting.cpu())  # fmt: skip
+    return reference.Substep(pairs, constants, detection.island.cpu().long(), torch.stack(detection.fractions).cpu(),
+                             torch.stack(detection.corrections).cpu(), limits,
+                             None if detection.rigid_fraction is None else detection.rigid_fraction.cpu(),
+                             support_vertex=support_vertex,
+                             lengths=None if detection.lengths is None else detection.lengths.cpu(),
+                             sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu(),
+                             resting=None if detection.resting is None else detection.resting.cpu())  # fmt: skip
 
 
 def objective(x: Tensor, v: Tensor) -> Tensor:
@@ -223,33 +224,33 @@ def objective(x: Tensor, v: Tensor) -> Tensor:
 
 
 def compiled(scene: Scene, steps: int, solver: VBD, model: Model | None = None
-             ) -> tuple[dict[str, Tensor], list[list[reference.Part]]]:  # fmt: skip
+             ) -> tuple[dict[str, Tensor], list[list[reference.Substep]]]:  # fmt: skip
     """End state and gradients of the package's steps, and the detections of each of them."""
     model = scene.model if model is None else model
     leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
     inputs: dict[str, Any] = dict(leaves)
     x, v = inputs.pop("x"), inputs.pop("v")
-    parts = []
+    substeps = []
     for _ in range(steps):
         with record("contact") as found:
             x, v = step(model, x, v, solver, gravity=GRAVITY, **inputs)
-        parts.append([part_of(d) for d in found])
-    return _result(x, v, leaves), parts
+        substeps.append([substep_of(d) for d in found])
+    return _result(x, v, leaves), substeps
 
 
-def unrolled(scene: Scene, steps: int, solver: VBD, parts: list[list[reference.Part]], seed: int | None = None
+def unrolled(scene: Scene, steps: int, solver: VBD, substeps: list[list[reference.Substep]], seed: int | None = None
              ) -> dict[str, Tensor]:  # fmt: skip
     """The same by autograd through the reference; ``seed`` permutes pairs and tets, which changes rounding alone."""
     leaves = scene.leaves()
     inputs: dict[str, Any] = dict(leaves)
     x, v = inputs.pop("x"), inputs.pop("v")
-    for own in parts[:steps]:
+    for own in substeps[:steps]:
         order = tets = None
         if seed is not None:
             rng = generator("order", seed)
             order = [torch.from_numpy(rng.permutation(len(p.pairs))) for p in own]
             tets = torch.from_numpy(rng.permutation(scene.model.num_tets))
-        x, v = reference.contact_step(scene.model, x, v, solver, gravity=GRAVITY, parts=own, order=order,
+        x, v = reference.contact_step(scene.model, x, v, solver, gravity=GRAVITY, substeps=own, order=order,
                                       tet_order=tets, **inputs)  # fmt: skip
     return _result(x, v, leaves)
 

@@ -13,7 +13,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "headline_worst": (1e-12, "measured 4e-13; slivers and gaps amplify a rounding that permuted tets do not show"),
     "dual": (1e-14, "hand-written adjoint of one energy block against forward-mode scalars: no sweep amplifies it"),
     "dual_rounded": (1e-11, "the same adjoint in double: J - 1 and a gap lose what the state has lost"),
-    "damped_share": (
+    "damped_fraction": (
         1e-8,
         "the same where damping of a floor begins or is whole: differences of 1e-7, also in dual numbers",
     ),
@@ -115,7 +115,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "solves_of_a_part": (
         1e-12,
         "three steps with contact by implicit Euler, over all of a step and scaled to a share of it: measured 2e-14; "
-        "7e-3 with another chord, 1e-8 with a share in single precision",
+        "7e-3 with another lookback, 1e-8 with a fraction in single precision",
     ),
     "schedules": (1e-12, "gradients of a rollout: schedules of checkpoints add up the steps in another order"),
     "travel": (1e-10, "v h = x1 - x0, the way of a step, is a thousandth of the positions that it is a difference of"),

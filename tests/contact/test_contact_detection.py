@@ -152,7 +152,7 @@ def test_bodies_and_shells_of_meshes(device: str) -> None:
 def test_sides_in_one_place_at_rest_are_no_pair(device: str) -> None:
     body = soup(generator("twice"), 4)
     doubled = Surface.of(np.concatenate([body.points] * 2), np.concatenate([body.triangles, body.triangles + 12]))
-    s = Scene.of([doubled], room=0.18)
+    s = Scene.of([doubled], trust_radius=0.18)
     s.x[0, 12:] += 0.05
     expected, got = check(s, device)
     assert len(expected[0].gap) > 0 and int(got.counts[1]) == 0
@@ -163,7 +163,7 @@ def test_sides_in_one_place_at_rest_are_no_pair(device: str) -> None:
 
 def test_held_corners_and_colliders_alone_make_no_pair(device: str) -> None:
     s = mixed_scene()
-    s.held[:] = True
+    s.pinned[:] = True
     assert detect(s, device).counts.tolist() == [0, 0, -1, 0]
     nothing = Scene.of([], [sphere((0, 0, 0), 1), capsule((0, 0, 0), (1, 0, 0), 1)])
     assert detect(nothing, device).counts.tolist() == [0, 0, -1, 0]
@@ -193,7 +193,7 @@ def test_one_query_with_thousands_of_pairs(device: str) -> None:
     triangles = np.concatenate([np.stack([a, a + 1, a + 30], -1), np.stack([a + 1, a + 31, a + 30], -1)])
     colliders = [sphere((0.5, 20, 0.5), 19.9), capsule((-9, -0.15, 0.4), (9, -0.15, 0.5), 0.1),
                  plane((0, -0.06, 0), (0, -0.06, 1), (1, -0.06, 0))]  # fmt: skip
-    s = Scene.of([Surface.of(points, triangles)], colliders, self_contact=False, room=0.11, dhat=0.08)
+    s = Scene.of([Surface.of(points, triangles)], colliders, self_contact=False, trust_radius=0.11, dhat=0.08)
     expected, _ = check(s, device)
     assert np.bincount(expected[0].corners[expected[0].kind < 2].reshape(-1)).max() > 1500
 
@@ -202,7 +202,7 @@ def test_touching_pairs_are_counted(device: str) -> None:
     triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], dtype=float)
     upper = triangle + np.array([0.25, 0.0, 0.25])
     faces = np.array([[0, 1, 2]])
-    s = Scene.of([Surface.of(triangle, faces), Surface.of(upper, faces)], room=0.13)
+    s = Scene.of([Surface.of(triangle, faces), Surface.of(upper, faces)], trust_radius=0.13)
     got = detect(s, device)
     expected = all_pairs(s, 0)
     touching = expected.begins <= 0

@@ -10,7 +10,7 @@ from conftest import DEVICES
 
 import diffvbd as dv
 from diffvbd.mesh import box, join
-from diffvbd.step.contact import MOST_DETECTIONS, parts_of
+from diffvbd.step.contact import MOST_DETECTIONS, substeps_of
 from diffvbd.testing.tolerances import tolerance
 
 STEPS = 9
@@ -30,7 +30,7 @@ def meeting(speed: float, device: str, dtype: torch.dtype = torch.float64, **opt
 @pytest.mark.parametrize(("over", "parts"), ((0.0, 1), (1.0, 1), (1.5, 2), (2.0, 2), (2.1, 3), (4.0, 3), (5.0, 4),
                                              (1e9, 4), (math.nan, 1), (math.inf, 1)))  # fmt: skip
 def test_one_more_each_time_that_the_way_is_twice_as_long(over: float, parts: int) -> None:
-    assert parts_of(torch.tensor([[0.0, over]])) == parts <= MOST_DETECTIONS
+    assert substeps_of(torch.tensor([[0.0, over]])) == parts <= MOST_DETECTIONS
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -119,7 +119,7 @@ def test_a_step_goes_on_for_the_scenes_of_which_pairs_hold_something_up(device: 
     assert [part.sweeps for part in found] == [10] * len(found)
     for one, many in zip(scenes, together, strict=True):
         assert torch.equal(ends(one)[0], many)
-    assert sum(dv.contact.status(model).cut) == 0
+    assert sum(dv.contact.status(model).truncated) == 0
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -128,7 +128,7 @@ def test_no_body_passes_through_one_that_could_turn_inside_out(device: str) -> N
     model, x, v = meeting(40.0, device)
     v[:64, 1] = 40.0
     end, _ = dv.step(model, x, v, dv.VBD(1 / 60, 20), **MATERIAL)
-    assert dv.contact.status(model).cut[0] > 0
+    assert dv.contact.status(model).truncated[0] > 0
     assert float((end - (x + v / 60)).abs().max()) > 0.1
 
 

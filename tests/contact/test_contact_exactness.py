@@ -16,7 +16,7 @@ from helpers.spreads import assert_near_contact
 
 import diffvbd as dv
 from diffvbd.testing import relative_error
-from diffvbd.testing.contact_scenes import GRAVITY, SCENES, compiled, noise, part_of, unrolled
+from diffvbd.testing.contact_scenes import GRAVITY, SCENES, compiled, noise, substep_of, unrolled
 from diffvbd.testing.tolerances import tolerance
 
 # (steps, sweeps)
@@ -95,10 +95,10 @@ def test_the_scenes_meet_every_kind_of_contact() -> None:
         scene = scene_of(name)
         with dv.record("contact") as found:
             dv.step(scene.model, scene.x, scene.v, scene.solver(2), gravity=GRAVITY, **scene.inputs)
-        held = dv.contact.status(scene.model).cut
+        held = dv.contact.status(scene.model).truncated
         cut, free = cut + sum(held), free + scene.x[..., 0].numel() - sum(held)
         for detection in found:
-            part = part_of(detection)
+            part = substep_of(detection)
             kinds |= set(part.pairs[:, 4].tolist())
             near, values = detection.near_corners, detection.near_values
             touching = (values[..., 7] < scene.model.contact.dhat) & (near[..., 4] >= 0)

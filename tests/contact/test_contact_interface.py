@@ -86,7 +86,10 @@ def test_scenes_do_not_mix(one_regime: None, device: str) -> None:
             # what kappa gets is a sum over pairs, and processors differ in its order
             assert relative_error(together[-1][i, j], alone[-1]) <= tolerance("contact_adjoint")
             own = dv.contact.status(model)
-            assert own.cut[0] == status.cut[3 * i + j] and own.smallest_gap[0] == status.smallest_gap[3 * i + j]
+            assert (
+                own.truncated[0] == status.truncated[3 * i + j]
+                and own.smallest_gap[0] == status.smallest_gap[3 * i + j]
+            )
     assert len(set(status.smallest_gap)) > 1
 
 
@@ -95,7 +98,7 @@ def test_no_scenes_no_pairs_no_sweeps() -> None:
     x = model.rest_points
     none = x.new_zeros(0, 16, 3)
     assert dv.step(model, none, none, **STEP)[0].shape == (0, 16, 3)
-    assert dv.contact.status(model).cut == []
+    assert dv.contact.status(model).truncated == []
     for integrator in (dv.SDIRK2(), dv.BDF2()):
         ran = dv.rollout(model, none, none, dv.VBD(0.01, 3, integrator=integrator), steps=1, mu=2e4, lam=4e4)
         assert ran.x.shape == (2, 0, 16, 3)
@@ -246,4 +249,4 @@ def test_contact_that_meets_nothing_changes_nothing(detections: int) -> None:
         solver = dv.VBD(0.01, sweeps)
         for a, b in zip(*(dv.step(m, x, v, solver, mu=2e4, lam=4e4) for m in (model, plain)), strict=True):
             assert relative_error(a, b) <= tolerance("forward" if a.abs().max() < 1 else "invariance")
-    assert dv.contact.status(model).cut == [0] and dv.contact.status(model).pairs == 0
+    assert dv.contact.status(model).truncated == [0] and dv.contact.status(model).pairs == 0

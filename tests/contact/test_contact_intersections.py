@@ -42,7 +42,7 @@ def expected(s: Scene, dtype: torch.dtype = torch.float64) -> list[list[int]]:
             mesh = max(one, other) < s.mesh_bodies
             ignored = one == s.mesh_bodies if one == other and not mesh else False
             ignored |= mesh and not (s.self_contact if one == other else s.between_bodies)
-            held = s.held[[*edges[edge], *triangles[triangle]]].all()
+            held = s.pinned[[*edges[edge], *triangles[triangle]]].all()
             if not ignored and not held:
                 rows.append([scene, edge, triangle])
     return rows
@@ -54,7 +54,7 @@ def tangled(scenes: int = 3, **options: Any) -> Scene:
     bodies = [solid(dv.mesh.cube(4, 0.4)), soup(rng, 30), solid(dv.mesh.cube(3, 0.4).translate((0.31, 0.13, 0.07)))]
     s = Scene.of(bodies, [soup(rng, 10), capsule((0, 0.1, 0.2), (0.9, 0.3, 0.1), 0.1), soup(rng, 5)], scenes, **options)
     s.x += 0.03 * rng.standard_normal(s.x.shape)
-    s.held[: s.x.shape[1]] |= rng.random(s.x.shape[1]) < 0.3
+    s.pinned[: s.x.shape[1]] |= rng.random(s.x.shape[1]) < 0.3
     return s
 
 
@@ -98,7 +98,7 @@ def test_places_that_coincide_at_rest_do_not_cross(device: str) -> None:
 def test_points_behind_planes(device: str, dtype: torch.dtype) -> None:
     s = mixed_scene(2)
     found = find(s, device, dtype)
-    movable = ~s.held[s.points]
+    movable = ~s.pinned[s.points]
     for b in range(2):
         at = np.concatenate([s.x[b], s.collider[b]]).astype(np.float32 if dtype == torch.float32 else np.float64)
         behind = []

@@ -47,7 +47,7 @@ def test_a_body_that_flies_and_spins_beside_others_lists_no_pairs_of_its_own() -
             for detection in found:
                 bodies = model.body[detection.listed.pairs[:, :4].long()]
                 assert len(bodies) > 0 and (bodies[:, 0] != bodies[:, 3]).all()
-                assert dv.contact.status(model).cut == [0] and detection.frames.tolist() == [[1.0, 1.0]]
+                assert dv.contact.status(model).truncated == [0] and detection.rigid_fraction.tolist() == [[1.0, 1.0]]
         ends.append(x)
     assert relative_error(ends[0] - model.rest_points, ends[1] - model.rest_points) <= tolerance("contact_motion")
 
@@ -88,7 +88,7 @@ def test_an_impact_of_more_than_an_edge_a_step_keeps_its_momentum(speed: float, 
     start, cut = (model.mass[:, None] * v).sum(0), 0
     for _ in range(8):
         x, v = dv.step(model, x, v, dv.VBD(time_step, 10), mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0))
-        cut += sum(dv.contact.status(model).cut)
+        cut += sum(dv.contact.status(model).truncated)
     end = (model.mass[:, None] * v).sum(0)
     assert float((end - start).norm()) <= tolerance("closed_form") * float(start.norm())
     assert cut > 0 and v[:64].abs().max() > 0.1  # they have met, and pairs held some vertices up

@@ -81,7 +81,7 @@ def test_stacked_blocks_carry_each_other(support: str) -> None:
         x, _ = dv.step(model, x, torch.zeros_like(x), **step)
     with dv.record("contact") as found:
         x, v = dv.step(model, x, torch.zeros_like(x), **step)
-    assert dv.contact.status(model).cut == [0]
+    assert dv.contact.status(model).truncated == [0]
     forces, slopes = pair_forces(model, x, found[0])
     assert int((slopes < 0).sum()) >= 4
     weights = per_body(model, model.mass[:, None])[:, 0] * GRAVITY
@@ -142,7 +142,7 @@ def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
         first, linear, angular = per_body(model, mass * v), 0.0, 0.0
         for _ in range(40):
             x1, v1 = dv.step(model, x, v, dv.VBD(h, sweeps), mu=1e4, lam=1e4, gravity=(0.0, 0.0, 0.0))
-            assert dv.contact.status(model).cut == [0]
+            assert dv.contact.status(model).truncated == [0]
             linear = max(linear, float((mass * (v1 - v)).sum(0).norm()))
             gained = torch.linalg.cross(x1, mass * v1) - torch.linalg.cross(x, mass * v)
             angular = max(angular, float((gained - h * torch.linalg.cross(mass * v1, v)).sum(0).norm()))
@@ -172,7 +172,7 @@ def test_collision_in_one_dimension() -> None:
         v[model.body == 0, 0] = speed
         for _ in range(round(duration / h)):
             x, v = dv.step(model, x, v, dv.VBD(h, 20), mu=2e5, lam=0.0, gravity=(0.0, 0.0, 0.0))
-            assert dv.contact.status(model).cut == [0]
+            assert dv.contact.status(model).truncated == [0]
         assert dv.contact.status(model).smallest_gap[0] > 0.05  # they have parted
         ends = per_body(model, model.mass[:, None] * v)[:, 0] / masses
         assert float((masses * ends).sum()) == pytest.approx(float(masses[0]) * speed, rel=tolerance("closed_form"))

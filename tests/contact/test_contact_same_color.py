@@ -19,7 +19,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.mesh import TetMesh, join
-from diffvbd.reference.contact import Part
+from diffvbd.reference.contact import Substep
 from diffvbd.reference.distance import distance
 from diffvbd.testing import contact_scenes, relative_error, tolerance
 from diffvbd.testing.contact_scenes import Scene, boxes, build, compiled, unrolled
@@ -65,7 +65,7 @@ def folded() -> Scene:
 SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (two_tets, two_on_one, twins, batch_of_stacks, folded)}
 
 
-def met(model: dv.Model, part: Part, x: Tensor) -> tuple[int, int]:
+def met(model: dv.Model, part: Substep, x: Tensor) -> tuple[int, int]:
     """How often listed pairs hold two vertices of one color, and how many third vertices see two vertices of one color
     through different pairs; pairs farther apart than dhat do nothing and do not count."""
     color, inside, third = colors(model, model.num_vertices + len(model.collider_points)), 0, 0

@@ -18,7 +18,7 @@ from diffvbd import reference
 from diffvbd.energies import _barrier_slope
 from diffvbd.mesh import box, join
 from diffvbd.testing import relative_error, tolerance
-from diffvbd.testing.contact_scenes import noise, part_of
+from diffvbd.testing.contact_scenes import noise, substep_of
 
 GRAVITY = 9.81  # [m/s^2]
 KAPPA, DHAT, GAP = 2e3, 0.05, 0.025  # [N/m], [m], gap of the undeformed block [m]
@@ -93,7 +93,7 @@ def slide(block: Block, angle: float, h: float, duration: float, speed: float = 
     parameters = {} if coefficient is None else {"friction": coefficient}
     for _ in range(round(duration / h)):
         x, v = dv.step(model, x, v, dv.VBD(h, SWEEPS), mu=LAME, lam=LAME, gravity=gravity, **parameters)  # fmt: skip
-        assert model.contact is None or dv.contact.status(model).cut == [0]
+        assert model.contact is None or dv.contact.status(model).truncated == [0]
     return x, v
 
 
@@ -211,7 +211,7 @@ def test_gradient_without_slip_is_that_of_the_reference() -> None:
     with dv.record("contact") as found:
         for run in (dv.step, reference.contact_step):
             v = torch.full_like(model.rest_points, 0.01).requires_grad_()
-            more = {} if run is dv.step else {"parts": [part_of(found[0])]}
+            more = {} if run is dv.step else {"substeps": [substep_of(found[0])]}
             x, _ = run(model, model.rest_points, v, **more, **step)
             gradients.append(torch.autograd.grad((noise("slip", shape=x.shape, size=1.0) * x).sum(), v)[0])
     assert relative_error(*gradients) <= tolerance("contact_adjoint")
@@ -357,7 +357,7 @@ def test_what_does_not_hold_slides() -> None:
 
 @pytest.mark.parametrize("support", ["floor", "plane"])
 def test_the_derivative_of_rest_is_that_of_rest(support: str) -> None:
-    """Some fifty times less than that of the coasting which one Newton step with a bound for friction left."""
+    """Some fifty times less than that of the sliding which one Newton step with a bound for friction left."""
     share = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     speed = pushed(block(support), share, 5, 1e6).v[-1, :, 0].mean()
     (slope,) = torch.autograd.grad(speed, share)

@@ -146,7 +146,7 @@ def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypa
 
     def correct(*arguments: Any) -> Any:
         out = original(*arguments)
-        shares.extend(share[0] for share in out.shares)
+        shares.extend(share[0] for share in out.fractions)
         return out
 
     original = corrections.correct

@@ -206,7 +206,7 @@ def test_floor_block_vjp(headers: Any, case: str) -> None:
     rng = generator("floor", case)
     # where the share of damping is near 0 or 1, its derivative is what cancelling leaves, also in dual numbers
     faint = case in ("nearly touching", "just inside")
-    bar, rounded = (tolerance("damped_share" if faint else name) for name in ("dual", "dual_rounded"))
+    bar, rounded = (tolerance("damped_fraction" if faint else name) for name in ("dual", "dual_rounded"))
     for _ in range(50):
         values = floor_input(rng, *FLOORS[case])
         expected = np.asarray(headers.floor_dual(values))

@@ -73,13 +73,13 @@ class Scene:
     points: np.ndarray
     planes: np.ndarray
     body: np.ndarray
-    held: np.ndarray
+    pinned: np.ndarray
     mesh_bodies: int
     self_contact: bool = True
     between_bodies: bool = True
     dhat: float = 0.03
-    room: float = 0.05  # how far vertices of the first body may go; of the last half as far
-    own_share: float = 0.79  # of that, that they may go beside the rigid motion of their body
+    trust_radius: float = 0.05  # how far vertices of the first body may go; of the last half as far
+    own_fraction: float = 0.79  # of that, that they may go beside the rigid motion of their body
     origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @staticmethod
@@ -107,20 +107,20 @@ class Scene:
             points=stack("lone", 1).reshape(-1),
             planes=np.array(planes, np.int32).reshape(-1, 3),
             body=np.repeat(np.arange(len(parts)), sizes).astype(np.int32),
-            held=np.arange(len(rest)) >= v,
+            pinned=np.arange(len(rest)) >= v,
             mesh_bodies=len(bodies),
             **options,
         )
 
     @property
-    def rooms(self) -> np.ndarray:
+    def trust_radii(self) -> np.ndarray:
         """Of each body [mesh_bodies]."""
-        return self.room * np.linspace(1, 0.5, self.mesh_bodies)
+        return self.trust_radius * np.linspace(1, 0.5, self.mesh_bodies)
 
     @property
     def reach(self) -> float:
         """Largest gap that may be found."""
-        return self.dhat + 2 * max(1.0, self.own_share) * self.room
+        return self.dhat + 2 * max(1.0, self.own_fraction) * self.trust_radius
 
     def alone(self, b: int) -> Scene:
         """Scene b of the batch."""
@@ -135,11 +135,11 @@ class Scene:
             return torch.as_tensor(a, device=device)
 
         x = self.x - self.origin if self.origin.size else self.x
-        room = np.tile([*self.rooms, self.room], (len(x), 1))
+        trust_radius = np.tile([*self.trust_radii, self.trust_radius], (len(x), 1))
         return (
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
-            index(self.body), index(self.held), real(room), real(self.own_share * room),
+            index(self.body), index(self.pinned), real(trust_radius), real(self.own_fraction * trust_radius),
             self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
         )  # fmt: skip
 
@@ -160,7 +160,7 @@ def mixed_scene(scenes: int = 1, **options: Any) -> Scene:
     s.x += 0.02 * rng.standard_normal(s.x.shape)
     s.collider += 0.01 * rng.standard_normal(s.collider.shape)
     s.collider_next += 0.01 * rng.standard_normal(s.collider.shape)
-    s.held[: s.x.shape[1]] = rng.uniform(size=s.x.shape[1]) < 0.3
+    s.pinned[: s.x.shape[1]] = rng.uniform(size=s.x.shape[1]) < 0.3
     return s
 
 
@@ -248,8 +248,8 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         collider = np.maximum(one, other) >= s.mesh_bodies
         both = np.minimum(one, other) >= s.mesh_bodies
         admitted = np.where(collider, ~both, s.self_contact & (one == other) | s.between_bodies & (one != other))
-        held = s.held[corners]
-        admitted &= ~(held[:, 0] if kind == POINT_PLANE else held.all(1))
+        pinned = s.pinned[corners]
+        admitted &= ~(pinned[:, 0] if kind == POINT_PLANE else pinned.all(1))
         for m, n in itertools.product(range(second), range(second, 4)):
             admitted &= corners[:, m] != corners[:, n]
         i, j, corners, one, other = (a[admitted] for a in (i, j, corners, one, other))
@@ -266,9 +266,9 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         edges = [np.linalg.norm(rest[:, n] - rest[:, m], axis=-1) for m, n in ((0, 1), (1, 2), (2, 3), (3, 1))]
         threshold = 1e-3 * (edges[0] * edges[2]) ** 2 if kind == EDGE_EDGE else np.zeros(len(d))
         dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, s.dhat)
-        rooms = np.append(s.rooms, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
-        rooms = np.where(one == other, s.own_share * rooms, rooms)
-        keep = (least - offset < s.dhat + rooms) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
+        trust_radii = np.append(s.trust_radii, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
+        trust_radii = np.where(one == other, s.own_fraction * trust_radii, trust_radii)
+        keep = (least - offset < s.dhat + trust_radii) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
         columns = (np.full(len(d), kind), corners, d - offset, least - offset, weights,
                    np.stack([dhat, offset, threshold], -1), ((b * 3 + kind) * base + i) * base + j, takes,
                    begins - offset)  # fmt: skip
@@ -278,8 +278,8 @@ def all_pairs(s: Scene, b: int) -> Pairs:
     )
     near = np.full(len(s.body), s.reach)
     np.minimum.at(near, corners, gap[:, None])
-    room = np.where(s.body < s.mesh_bodies, np.append(s.rooms, 0)[np.minimum(s.body, s.mesh_bodies)], 0.0)
+    trust_radius = np.where(s.body < s.mesh_bodies, np.append(s.trust_radii, 0)[np.minimum(s.body, s.mesh_bodies)], 0.0)
     second = corners[np.arange(len(kind)), np.where(kind == EDGE_EDGE, 2, 1)]
-    own = np.where(s.body[corners[:, 0]] == s.body[second], s.own_share, 1.0)
-    margin = constants[:, 0] - (least - own * (room[corners[:, 0]] + room[second]))
+    own = np.where(s.body[corners[:, 0]] == s.body[second], s.own_fraction, 1.0)
+    margin = constants[:, 0] - (least - own * (trust_radius[corners[:, 0]] + trust_radius[second]))
     return Pairs(kind, corners, gap, weights, constants, key, margin, near, ends, begins)

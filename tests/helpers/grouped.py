@@ -10,5 +10,5 @@ def grouped(sizes: list[int], rng: np.random.Generator, held: float, device: str
     n = sum(sizes)
     order, ptr = rng.permutation(n).astype(np.int32), np.cumsum([0, *sizes]).astype(np.int32)
     holds = rng.random(n) < held
-    held_bodies = np.array([holds[order[a:b]].any() for a, b in zip(ptr[:-1], ptr[1:], strict=True)], dtype=bool)
-    return tuple(torch.as_tensor(a, device=device) for a in (holds, held_bodies, order, ptr))
+    pinned_bodies = np.array([holds[order[a:b]].any() for a, b in zip(ptr[:-1], ptr[1:], strict=True)], dtype=bool)
+    return tuple(torch.as_tensor(a, device=device) for a in (holds, pinned_bodies, order, ptr))

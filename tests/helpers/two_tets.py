@@ -71,7 +71,7 @@ def considered() -> list[tuple[list[int], int]]:
     return pairs
 
 
-def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list[int]]) -> reference.Part:
+def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list[int]]) -> reference.Substep:
     """Brute force over `considered`, x [B, V, 3], colliders [B, Vc, 3]; lists what may come closer than dhat, too."""
     pairs = considered()
     corners, kind = torch.tensor(np.array([c for c, _ in pairs])), torch.tensor([k for _, k in pairs])
@@ -90,7 +90,7 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list
         rows.append(torch.cat((corners, tail), 1)[listed])
         constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, threshold), 1)[listed])
     shares, corrections = torch.ones((2, *x.shape[:2])), torch.ones((2, len(x), 2))
-    return reference.Part(torch.cat(rows), torch.cat(constants), torch.tensor(island), shares, corrections)
+    return reference.Substep(torch.cat(rows), torch.cat(constants), torch.tensor(island), shares, corrections)
 
 
 def scene_of(model: Any, x: Tensor, parameters: dict[str, Any] | None = None) -> Any:

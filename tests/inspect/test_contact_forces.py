@@ -124,7 +124,7 @@ def test_a_converged_step_is_newtons_second_law(device: str, scene: str) -> None
     v[:8, 0], v[8:, 2] = 0.2, 0.1
     solver = dv.VBD(0.005, 1)
     done = dv.solve(model, x, v, solver, tolerance=1e-12, pair_damping=5.0, **SOFT)
-    assert dv.contact.status(model).cut == [0]
+    assert dv.contact.status(model).truncated == [0]
     found = dv.contact.forces(model, done.x, solver, previous=(x, v), pair_damping=5.0)
     mass = model.mass[:, None]
     gained = per_body(model, mass * (done.v - v)) / solver.time_step + per_body(model, mass) * mass.new_tensor(

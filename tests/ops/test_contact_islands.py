@@ -13,8 +13,8 @@ import diffvbd as dv
 from diffvbd.ops import contact as ops_contact
 from diffvbd.testing import generator, tolerance
 
-ROOM, DHAT = 0.01, 0.02
-MARGIN = ROOM + DHAT / 2
+RADIUS_FACTOR, DHAT = 0.01, 0.02
+MARGIN = RADIUS_FACTOR + DHAT / 2
 CUBE = dv.mesh.cube(2, 1.0)
 
 
@@ -22,14 +22,15 @@ def arguments(
     s: Scene, move: np.ndarray, mass: np.ndarray, device: str = "cpu", dtype: torch.dtype = torch.float64
 ) -> tuple:
     """Of contact_islands; move [B, V, 3], mass [1 | B, V]."""
-    x, origin, collider, following, _, radius, *_, planes, body, held = s.arguments(device, dtype)[:12]
+    x, origin, collider, following, _, radius, *_, planes, body, pinned = s.arguments(device, dtype)[:12]
     v = s.x.shape[1]
     order = np.argsort(s.body[:v], kind="stable").astype(np.int32)
     ptr = np.searchsorted(s.body[order], np.arange(s.mesh_bodies + 1)).astype(np.int32)
     real = [torch.as_tensor(np.array(a), dtype=dtype, device=device) for a in (move, mass)]
     index = [torch.as_tensor(a, device=device) for a in (order, ptr)]
-    room = torch.full((len(x), s.mesh_bodies + 1), ROOM, dtype=dtype, device=device)
-    return (x, origin, *real, collider, following, planes, body, *index, held, radius, room, s.mesh_bodies, DHAT)
+    trust_radius = torch.full((len(x), s.mesh_bodies + 1), RADIUS_FACTOR, dtype=dtype, device=device)
+    return (x, origin, *real, collider, following, planes, body, *index, pinned, radius, trust_radius, s.mesh_bodies,
+            DHAT)  # fmt: skip
 
 
 def islands(s: Scene, move: Any, device: str = "cpu", dtype: torch.dtype = torch.float64) -> list[list[int]]:
@@ -39,11 +40,11 @@ def islands(s: Scene, move: Any, device: str = "cpu", dtype: torch.dtype = torch
     return ops_contact.contact_islands(*arguments(s, moves, np.ones((1, v)), device, dtype)).tolist()
 
 
-def cubes(*places: Any, colliders: tuple[Surface, ...] = (), held: int | None = None, scenes: int = 1) -> Scene:
+def cubes(*places: Any, colliders: tuple[Surface, ...] = (), pinned: int | None = None, scenes: int = 1) -> Scene:
     """Unit cubes with these lower corners."""
     s = Scene.of([solid(CUBE.translate(p)) for p in places], colliders, scenes)
-    if held is not None:
-        s.held[held] = True
+    if pinned is not None:
+        s.pinned[pinned] = True
     return s
 
 
@@ -74,8 +75,8 @@ def test_what_reaches_a_collider_stays(device: str, height: float, expected: int
 def definition(s: Scene, b: int, move: np.ndarray, mass: np.ndarray) -> list[int]:
     """As written down, with loops."""
     v, bodies = s.x.shape[1], range(s.mesh_bodies)
-    body, held = s.body[:v], s.held[:v]
-    label, blocked = np.arange(s.mesh_bodies), np.array([held[body == k].any() for k in bodies])
+    body, pinned = s.body[:v], s.pinned[:v]
+    label, blocked = np.arange(s.mesh_bodies), np.array([pinned[body == k].any() for k in bodies])
     boxes = np.stack([[s.x[b][body == k].min(0), s.x[b][body == k].max(0)] for k in bodies])
     solids = []
     for k in set(s.body[v:].tolist()) - set(s.body[s.planes].reshape(-1).tolist()):
@@ -87,7 +88,7 @@ def definition(s: Scene, b: int, move: np.ndarray, mass: np.ndarray) -> list[int
         out = np.empty_like(boxes)
         for k in bodies:
             own = np.isin(body, np.flatnonzero(label == label[k]))
-            free = own & ~held
+            free = own & ~pinned
             stays = blocked[label == label[k]].any() or not free.any()
             u = np.zeros(3) if stays else (mass[free, None] * move[free]).sum(0) / mass[free].sum()
             ends = np.stack([boxes[k], boxes[k] + u])
@@ -121,7 +122,7 @@ def test_random_scenes(device: str, seed: int) -> None:
     rng = generator("islands", seed)
     places = rng.uniform(0, (12, 12, 30)[seed % 3], (25, 3))
     colliders = (sphere((6, 6, 6), 0.5), plane((0, 0.5, 0), (0, 0.5, 1), (1, 0.4, 0)))[: seed % 3]
-    s = cubes(*places, colliders=colliders, held=40 if seed % 2 else None, scenes=3)
+    s = cubes(*places, colliders=colliders, pinned=40 if seed % 2 else None, scenes=3)
     move = rng.normal(0, 1, (3, s.mesh_bodies, 3))[:, s.body[: s.x.shape[1]]] + 0.1 * rng.standard_normal(s.x.shape)
     s.x += rng.uniform(-0.2, 0.2, (3, s.mesh_bodies, 3))[:, s.body[: s.x.shape[1]]]
     for mass in (rng.uniform(0.5, 2, (1, s.x.shape[1])), rng.uniform(0.5, 2, s.x.shape[:2])):

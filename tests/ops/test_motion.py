@@ -11,8 +11,8 @@ from helpers.grouped import grouped
 from torch import Tensor
 
 from diffvbd.ops import contact as ops_motion
-from diffvbd.ops.contact import Ways
-from diffvbd.ops.fields import WAYS
+from diffvbd.ops.contact import Displacements
+from diffvbd.ops.fields import DISPLACEMENTS
 from diffvbd.testing import generator, tolerance
 
 SIZES = [[0, 3, 0, 1], [1] * 40, [300, 20, 0], [8] * 7, [6000, 5], [0], []]
@@ -23,16 +23,16 @@ class Case(NamedTuple):
     origin: Tensor
     mass: Tensor
     move: Tensor
-    fall: Tensor
-    held: Tensor
-    held_bodies: Tensor
+    gravity_move: Tensor
+    pinned: Tensor
+    pinned_bodies: Tensor
     order: Tensor
     ptr: Tensor
 
     def changed(self, **values: Tensor) -> Case:
         return Case(**(self._asdict() | values))
 
-    def found(self) -> Ways:
+    def found(self) -> Displacements:
         return ops_motion.contact_motion(*self)
 
     def body(self) -> Tensor:
@@ -43,11 +43,11 @@ class Case(NamedTuple):
 
     def backward(self, bar: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of x, mass and move."""
-        given = (self.x, self.origin, self.mass, self.move, self.held, self.held_bodies, self.order, self.ptr)
+        given = (self.x, self.origin, self.mass, self.move, self.pinned, self.pinned_bodies, self.order, self.ptr)
         return ops_motion.contact_motion_backward(bar, *given)
 
 
-def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, held: float = 0.0,
+def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, pinned: float = 0.0,
          origin: bool = True) -> Case:  # fmt: skip
     """Bodies of these sizes whose vertices have any numbers, and a share of which is held."""
     rng, n = generator("motion", *sizes), sum(sizes)
@@ -55,19 +55,19 @@ def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scen
     def reals(*shape: int) -> Tensor:
         return torch.as_tensor(rng.standard_normal(shape), dtype=dtype, device=device)
 
-    index = grouped(sizes, rng, held, device)
-    x, far, move, fall = (reals(scenes, n, 3) for _ in range(4))
-    return Case(x, far if origin else x.new_empty((0,)), 0.5 + reals(1, n).abs(), move, fall, *index)
+    index = grouped(sizes, rng, pinned, device)
+    x, far, move, gravity_move = (reals(scenes, n, 3) for _ in range(4))
+    return Case(x, far if origin else x.new_empty((0,)), 0.5 + reals(1, n).abs(), move, gravity_move, *index)
 
 
-def by_torch(c: Case) -> Ways:
+def by_torch(c: Case) -> Displacements:
     """As written down."""
     scenes, bodies, body = c.x.shape[0], len(c.ptr) - 1, c.body()
 
     def total(values: Tensor) -> Tensor:
         return values.new_zeros((scenes, bodies, *values.shape[2:])).index_add(1, body, values)
 
-    weight = torch.where(c.held, 0.0, c.mass).expand(c.x.shape[:2])[..., None]
+    weight = torch.where(c.pinned, 0.0, c.mass).expand(c.x.shape[:2])[..., None]
     at, tiny, eps = c.x + c.origin if c.origin.numel() else c.x, torch.finfo(c.x.dtype).tiny, 1e-9
     eps = max(eps, torch.finfo(c.x.dtype).eps)
     mass = total(weight).clamp(min=tiny)
@@ -76,7 +76,7 @@ def by_torch(c: Case) -> Ways:
     square = arm.square().sum(-1)[..., None, None] * torch.eye(3, dtype=c.x.dtype, device=c.x.device)
     inertia = total(weight[..., None] * ((1 + eps) * square - arm[..., None] * arm[..., None, :]))
     spin = total(weight * torch.linalg.cross(arm, c.move))
-    keeps = (~c.held_bodies).expand(scenes, -1)
+    keeps = (~c.pinned_bodies).expand(scenes, -1)
     turns = keeps & (inertia.diagonal(dim1=-2, dim2=-1).sum(-1) > tolerance("sums_of_bodies") ** 2)
     safe = torch.where(turns[..., None, None], inertia, torch.eye(3, dtype=c.x.dtype, device=c.x.device))
     turn = torch.where(turns[..., None], torch.linalg.solve(safe, spin), 0.0)[:, body]
@@ -87,22 +87,25 @@ def by_torch(c: Case) -> Ways:
         zeros = lengths.new_zeros((scenes, bodies))
         return zeros.scatter_reduce(1, body.expand(lengths.shape), torch.where(counts, lengths, 0.0), "amax")
 
-    free, turned = ~c.held, turned.norm(dim=-1)
+    free, turned = ~c.pinned, turned.norm(dim=-1)
     angle = longest(turned / arm.norm(dim=-1).clamp(min=tiny), free)
-    ways = {
+    displacements = {
         "bends": longest((c.move - mean[:, body]).norm(dim=-1), free),
-        "driven": longest(c.move.norm(dim=-1), c.held),
+        "driven": longest(c.move.norm(dim=-1), c.pinned),
         "apart": longest((c.move - rigid).norm(dim=-1), free),
         "stretched": longest(turned, free) * angle / (1 + (1 + angle * angle).sqrt()),
-        "falls": longest(c.fall.norm(dim=-1), free) if c.fall.numel() else mean.new_zeros((scenes, bodies)),
+        "gravity": longest(c.gravity_move.norm(dim=-1), free)
+        if c.gravity_move.numel()
+        else mean.new_zeros((scenes, bodies)),
     }
-    return Ways(rigid, torch.stack([ways[name] for name in WAYS]), torch.cat([total(weight * c.move), mass], -1))
+    return Displacements(rigid, torch.stack([displacements[name] for name in DISPLACEMENTS]),
+                         torch.cat([total(weight * c.move), mass], -1))  # fmt: skip
 
 
 def check(c: Case) -> None:
     got, again = c.found(), c.found()
     scale = torch.finfo(c.x.dtype).eps / torch.finfo(torch.float64).eps
-    for name, one, expected, same in zip(Ways._fields, got, by_torch(c), again, strict=True):
+    for name, one, expected, same in zip(Displacements._fields, got, by_torch(c), again, strict=True):
         rtol = scale * tolerance("sums_of_bodies")
         torch.testing.assert_close(one, expected, rtol=rtol, atol=rtol, msg=lambda text, name=name: f"{name}: {text}")
         assert torch.equal(one, same)
@@ -113,13 +116,13 @@ def check(c: Case) -> None:
 def test_as_plain_torch_says(device: str, sizes: list[int], dtype: torch.dtype) -> None:
     if dtype == torch.float32:
         sizes = [n if n > 3 else 4 * n for n in sizes]  # of a point the inertia is rounding
-    for scenes, held, origin in ((0, 0.0, True), (1, 0.3, False), (3, 0.0, True)):
-        check(case(sizes, device, dtype, scenes, held, origin))
+    for scenes, pinned, origin in ((0, 0.0, True), (1, 0.3, False), (3, 0.0, True)):
+        check(case(sizes, device, dtype, scenes, pinned, origin))
 
 
-@pytest.mark.parametrize("held", [0.0, 0.02])
-def test_adjoint_is_that_of_autograd(device: str, held: float) -> None:
-    c = case([5, 40, 12, 1, 0], device, scenes=3, held=held)
+@pytest.mark.parametrize("pinned", [0.0, 0.02])
+def test_adjoint_is_that_of_autograd(device: str, pinned: float) -> None:
+    c = case([5, 40, 12, 1, 0], device, scenes=3, pinned=pinned)
     bar = torch.randn(c.x.shape, dtype=c.x.dtype, generator=torch.Generator().manual_seed(0)).to(device)
     x, mass, move = (t.clone().requires_grad_() for t in (c.x, c.mass.expand(3, -1).contiguous(), c.move))
     given = c.changed(x=x, mass=mass, move=move)

@@ -71,7 +71,7 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
         def potential(p: Tensor, barrier: PairBarrier = barrier) -> Tensor:
             return barrier.energy(torch.cat((x[:vertex], p[None], x[vertex + 1 :])).T, x.T)
 
-        def gap(p: Tensor, one: reference.Part = one) -> Tensor:
+        def gap(p: Tensor, one: reference.Substep = one) -> Tensor:
             points = torch.cat((x[:vertex], p[None], x[vertex + 1 :], COLLIDERS))
             return (distance.distance(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
 

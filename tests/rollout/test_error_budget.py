@@ -31,7 +31,7 @@ def test_few_sweeps_are_the_cause() -> None:
     own = dv.rollout(model, x, v, dv.VBD(1 / 200, 3), steps=40, mu=2e5, lam=2e5, save=10)
     expected = (own.x - true.x).square().sum(-1)[1:].mean().sqrt() / (true.x - x).square().sum(-1)[1:].mean().sqrt()
     assert budget.largest.motion == pytest.approx(float(expected), rel=tolerance("cause_of_error"))
-    assert budget.cut is None and budget.friction is None and budget.duration == pytest.approx(0.2)
+    assert budget.truncated is None and budget.friction is None and budget.duration == pytest.approx(0.2)
 
 
 def test_converged_steps_on_a_floor_are_held_against_converged_ones(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +80,7 @@ def test_contact_and_friction() -> None:
     v[8:, 0] = 0.5
     budget = dv.error_budget(model, model.rest_points, v, dv.VBD(1 / 100, 5), duration=0.08, mu=1e5, lam=1e5)
     assert {"sweeps", "time step", "contact", "all but mesh"} == set(shares(budget))
-    assert budget.cut is not None and 0 <= budget.cut <= 1
+    assert budget.truncated is not None and 0 <= budget.truncated <= 1
     assert budget.friction is not None and budget.friction >= 0
     assert "of the friction" in str(budget) and "truncated" in str(budget)
     assert 0 < budget.total < 1

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from diffvbd._common.constants import FILTER_ETA
 from diffvbd.model.bodies import Bodies, OtherBodies
-from diffvbd.ops.contact import Decided, PartBodies, part_start
+from diffvbd.ops.contact import Decided, SubstepBodies, substep_start
 from diffvbd.reference.energies import FloorBarrier
-from diffvbd.step.arguments import CHORD
+from diffvbd.step.arguments import LOOKBACK
 from diffvbd.step.predict import start_of as begin
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -70,7 +70,7 @@ def by_begin(a: dict[str, Tensor]) -> Tensor:
     others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one, tets, one, (0, 0, 0, 0))
     step = a["step"].expand_as(x).contiguous()
     start, _ = begin(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none, none,
-                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0, CHORD,
+                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0, LOOKBACK,
                      start="inertia", filters=True, parts=False)  # fmt: skip
     return start - x
 
@@ -87,11 +87,11 @@ def by_contact(a: dict[str, Tensor]) -> Tensor:
     x, (scenes, vertices) = a["x"].contiguous(), a["x"].shape[:2]
     free, body = torch.zeros(vertices, dtype=torch.bool), torch.zeros(vertices, dtype=torch.int32)
     ends = torch.tensor([0, vertices], dtype=torch.int32)
-    bodies = PartBodies(free, free[:1], body, torch.arange(vertices, dtype=torch.int32), ends)
+    bodies = SubstepBodies(free, free[:1], body, torch.arange(vertices, dtype=torch.int32), ends)
     none, still, all_of_it = x.new_zeros((0,)), torch.zeros_like(x), torch.ones_like(x[..., 0])
     decided = Decided(x.new_zeros((scenes, 1)), (all_of_it, all_of_it), torch.zeros((scenes, 1)) > 0, none, bodies)
     u = x.new_zeros((scenes, 1, 3))
-    target, short = part_start(x, a["step"].contiguous(), still, u, still, packed(a), decided)
+    target, short = substep_start(x, a["step"].contiguous(), still, u, still, packed(a), decided)
     assert not short.any()
     return target - x
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd.ops import contact as sweep_rooms
+from diffvbd.ops import contact as sweep_radii
 from diffvbd.testing import generator, tolerance
 
 MORE, LEAST = 1.5, 0.02
@@ -21,19 +21,19 @@ class Case(NamedTuple):
     start: Tensor
     begin: Tensor
     move: Tensor
-    fall: Tensor
+    gravity_move: Tensor
     apart: Tensor
     stretched: Tensor
     center: Tensor
-    room: Tensor
-    own_center: Tensor
-    own_room: Tensor
-    held: Tensor
+    trust_radius: Tensor
+    deformation_center: Tensor
+    deformation_radius: Tensor
+    pinned: Tensor
     order: Tensor
     ptr: Tensor
 
-    def rooms(self) -> Tensor:
-        return sweep_rooms.sweep_rooms(*self, MORE, LEAST)
+    def trust_radii(self) -> Tensor:
+        return sweep_radii.sweep_radii(*self, MORE, LEAST)
 
 
 def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, own: bool = True) -> Case:
@@ -41,14 +41,25 @@ def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scen
     rng, n = generator("rooms", *sizes), sum(sizes)
     points = [0.02 * rng.standard_normal((scenes, n, 3)) for _ in range(7)]
     of_bodies = [0.02 * rng.random((scenes, len(sizes))) for _ in range(2)]
-    rooms = [scale * rng.random((scenes, n)) for scale in (1.0, 0.5)]
-    x, start, begin, move, fall, center, own_center, apart, stretched, room, own_room = (
-        torch.as_tensor(a, dtype=dtype, device=device) for a in (*points, *of_bodies, *rooms)
-    )
+    trust_radii = [scale * rng.random((scenes, n)) for scale in (1.0, 0.5)]
+    (
+        x,
+        start,
+        begin,
+        move,
+        gravity_move,
+        center,
+        deformation_center,
+        apart,
+        stretched,
+        trust_radius,
+        deformation_radius,
+    ) = (torch.as_tensor(a, dtype=dtype, device=device) for a in (*points, *of_bodies, *trust_radii))
     if not own:
-        own_center = own_room = x.new_empty((0,))
+        deformation_center = deformation_radius = x.new_empty((0,))
     index = [rng.permutation(n).astype(np.int32), np.cumsum([0, *sizes]).astype(np.int32)]
-    return Case(x, start, begin, move, fall, apart, stretched, center, room, own_center, own_room,
+    return Case(x, start, begin, move, gravity_move, apart, stretched, center, trust_radius,
+                deformation_center, deformation_radius,
                 torch.as_tensor(rng.random(n + 4) < 1 / 3, device=device),  # and of colliders
                 *(torch.as_tensor(a, device=device) for a in index))  # fmt: skip
 
@@ -58,29 +69,29 @@ def by_torch(c: Case) -> Tensor:
     scenes, vertices, bodies = *c.x.shape[:2], len(c.ptr) - 1
     body = torch.empty_like(c.order, dtype=torch.int64)
     body[c.order.long()] = torch.repeat_interleave(torch.arange(bodies, device=c.ptr.device), c.ptr.diff())
-    free = ~c.held[:vertices]
+    free = ~c.pinned[:vertices]
 
-    def length(way: Tensor) -> Tensor:
-        return way.square().sum(-1).sqrt()
+    def length(displacement: Tensor) -> Tensor:
+        return displacement.square().sum(-1).sqrt()
 
-    def largest(way: Tensor) -> Tensor:
-        of_vertices, index = torch.where(free, length(way), 0.0), body.expand(scenes, vertices)
-        return way.new_zeros((scenes, bodies)).scatter_reduce(1, index, of_vertices, "amax")
+    def largest(displacement: Tensor) -> Tensor:
+        of_vertices, index = torch.where(free, length(displacement), 0.0), body.expand(scenes, vertices)
+        return displacement.new_zeros((scenes, bodies)).scatter_reduce(1, index, of_vertices, "amax")
 
-    held_up = largest(c.begin + c.move + c.fall - c.start)
-    wish = largest(c.fall) + c.apart + MORE * held_up + largest(c.x - c.start) + MORE * c.stretched
+    held_up = largest(c.begin + c.move + c.gravity_move - c.start)
+    wish = largest(c.gravity_move) + c.apart + MORE * held_up + largest(c.x - c.start) + MORE * c.stretched
     wish = LEAST + (wish.amax(1, keepdim=True).expand_as(wish) if bodies else wish)
-    left = c.room - length(c.x - c.center)
-    if c.own_room.numel():
-        left = torch.minimum(left, c.own_room - length(c.x - c.own_center))
+    left = c.trust_radius - length(c.x - c.center)
+    if c.deformation_radius.numel():
+        left = torch.minimum(left, c.deformation_radius - length(c.x - c.deformation_center))
     return torch.where(free, torch.minimum(left, wish[:, body]).clamp(min=0), 0.0)
 
 
 def check(c: Case) -> Tensor:
     """The rooms: but for roundings, on the scale of the rooms, those of torch."""
-    got, scale = c.rooms(), torch.finfo(c.x.dtype).eps / torch.finfo(torch.float64).eps
+    got, scale = c.trust_radii(), torch.finfo(c.x.dtype).eps / torch.finfo(torch.float64).eps
     torch.testing.assert_close(got, by_torch(c), rtol=0.0, atol=tolerance("ulps") * scale, equal_nan=True)
-    assert got.is_contiguous() and torch.equal(got.nan_to_num(), c.rooms().nan_to_num())
+    assert got.is_contiguous() and torch.equal(got.nan_to_num(), c.trust_radii().nan_to_num())
     return got
 
 
@@ -96,13 +107,14 @@ def test_all_that_bounds_a_room_does(device: str) -> None:
     """What is left of either room, what bodies want, and nothing where more than a room is taken or one is held."""
     c = case([300, 20, 400], device)
     got, vertices = check(c), c.x.shape[1]
-    left = (c.room - (c.x - c.center).norm(dim=-1), c.own_room - (c.x - c.own_center).norm(dim=-1))
-    free = ~c.held[:vertices].expand_as(got)
+    left = (c.trust_radius - (c.x - c.center).norm(dim=-1),
+            c.deformation_radius - (c.x - c.deformation_center).norm(dim=-1))  # fmt: skip
+    free = ~c.pinned[:vertices].expand_as(got)
     most = got[0].max()
     assert bool(((left[0] < 0) & free).any()) and bool((got[free & (left[0] < 0)] == 0).all())
     assert bool((got[~free] == 0).all()) and bool((got[free] > 0).any())
     for bound in left:
         assert bool(((got - bound).abs() < tolerance("ulps")).any())
     assert int((got[0] == most).sum()) > 1  # those that have room for all that bodies want
-    check(c._replace(held=torch.ones_like(c.held)))
-    check(c._replace(held=torch.zeros_like(c.held)))
+    check(c._replace(pinned=torch.ones_like(c.pinned)))
+    check(c._replace(pinned=torch.zeros_like(c.pinned)))

@@ -9,8 +9,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd._contact import detection
-from diffvbd.adjoint.contact import Pairs, of_scene, pair_lag, rubbing, sum_at_corners
-from diffvbd.energies import damped_share
+from diffvbd.adjoint.contact import Pairs, friction_lag, of_scene, pair_lag, sum_at_corners
+from diffvbd.energies import damped_fraction
 from diffvbd.testing import relative_error, tolerance
 
 SCENES, DHAT = 3, 0.02
@@ -49,10 +49,10 @@ def plain(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping:
     def of_pair(value: Tensor) -> Tensor:
         return of_scene(value.expand(SCENES), listed)[:, None] if len(value) else torch.zeros_like(force)
 
-    share = damped_share(force, of_pair(kappa), listed.constants[:, :1])
+    fraction = damped_fraction(force, of_pair(kappa), listed.constants[:, :1])
     push = (force * rest[:, 3:])[..., None] * rest[:, None, :3]
     points = x.shape[1] + collider.shape[1]
-    lag = torch.cat([of_pair(friction) * force, of_pair(damping) * share, rest], -1)
+    lag = torch.cat([of_pair(friction) * force, of_pair(damping) * fraction, rest], -1)
     return lag, sum_at_corners(push, listed, SCENES, points)
 
 
@@ -64,7 +64,7 @@ def test_rubbing_and_its_adjoint(coefficients: int, absent: tuple[str, ...], par
     values, listed, origin = case(device, coefficients)
     values |= {name: values[name][:0] for name in absent}
     found = {}
-    for name, function in (("op", rubbing), ("plain", plain)):
+    for name, function in (("op", friction_lag), ("plain", plain)):
         leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
         out = function(*leaves.values(), origin, listed)
         loss = sum((out[i] * torch.linspace(-1, 2, out[i].numel()).to(out[i]).view_as(out[i])).sum() for i in parts)

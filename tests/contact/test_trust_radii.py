@@ -11,9 +11,9 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd._contact.surface import ContactSurface
 from diffvbd.ops import contact as ops_detect
-from diffvbd.ops.contact import RoomsOfBodies
-from diffvbd.ops.fields import WAYS
-from diffvbd.step.contact import LEAST_ROOM, ROOM, Motion, motion_of, rooms
+from diffvbd.ops.contact import TrustRadii
+from diffvbd.ops.fields import DISPLACEMENTS
+from diffvbd.step.contact import LEAST_RADIUS, RADIUS_FACTOR, Motion, motion_of, trust_radii
 from diffvbd.testing import generator, tolerance
 
 DHAT = 0.02
@@ -27,18 +27,18 @@ class Given(NamedTuple):
     origin: Tensor
     mass: Tensor
     move: Tensor
-    fall: Tensor
+    gravity_move: Tensor
     was: Tensor
     now: Tensor
     floor: Tensor | None
 
     def motion(self) -> Motion:
-        return motion_of(self.surface, self.x, self.origin, self.mass, self.move, self.fall)
+        return motion_of(self.surface, self.x, self.origin, self.mass, self.move, self.gravity_move)
 
-    def found(self) -> RoomsOfBodies:
+    def found(self) -> TrustRadii:
         s, barrier, *rest, floor = self
         x, origin, mass, _, _, was, now = rest
-        return rooms(self.motion(), s, barrier, x, origin, mass, was, now, floor, False)
+        return trust_radii(self.motion(), s, barrier, x, origin, mass, was, now, floor, False)
 
 
 def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact: bool, floor: bool = True,
@@ -61,9 +61,9 @@ def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact:
     turn = torch.as_tensor(rng.standard_normal((2, bodies, 3)), dtype=x.dtype, device=device)
     move = speed * (of_body[:, body] + torch.linalg.cross(turn[:, body], x) + 0.1 * own)
     was = surface.collider_points.expand(2, -1, -1).contiguous()
-    fall = torch.zeros_like(x) - 0.1 * speed * x.new_tensor([0.0, 1.0, 0.0])
+    gravity_move = torch.zeros_like(x) - 0.1 * speed * x.new_tensor([0.0, 1.0, 0.0])
     data = x.new_tensor([[0.0, 1.0, 0.0, 0.05, 1e3, DHAT, 0.0]]) if floor else None
-    return Given(surface, barrier, x, x.new_empty((0,)), model.mass[None].contiguous(), move, fall, was,
+    return Given(surface, barrier, x, x.new_empty((0,)), model.mass[None].contiguous(), move, gravity_move, was,
                  was + 0.2 * speed, data)  # fmt: skip
 
 
@@ -73,41 +73,44 @@ def of_bodies(g: Given, lengths: Tensor, start: float, reduction: str) -> Tensor
     return out.scatter_reduce(1, body.expand(lengths.shape), lengths, reduction)
 
 
-def longest(g: Given, way: Tensor) -> Tensor:
-    free = ~g.surface.held[: g.x.shape[1]]
-    return of_bodies(g, torch.where(free, way.norm(dim=-1), 0.0), 0.0, "amax")
+def longest(g: Given, displacement: Tensor) -> Tensor:
+    free = ~g.surface.pinned[: g.x.shape[1]]
+    return of_bodies(g, torch.where(free, displacement.norm(dim=-1), 0.0), 0.0, "amax")
 
 
-def left_by(g: Given, planes: Tensor, way: Tensor) -> Tensor:
+def left_by(g: Given, planes: Tensor, displacement: Tensor) -> Tensor:
     """What planes [B, P, 7] leave of the ways of bodies that go as wholes."""
-    body, held = g.surface.body[: g.x.shape[1]].long(), g.surface.held[: g.x.shape[1]]
-    shift, least = torch.zeros((2, g.surface.bodies, 3)).to(way), torch.ones((2, g.surface.bodies)).to(way)
+    body, pinned = g.surface.body[: g.x.shape[1]].long(), g.surface.pinned[: g.x.shape[1]]
+    shift, least = (
+        torch.zeros((2, g.surface.bodies, 3)).to(displacement),
+        torch.ones((2, g.surface.bodies)).to(displacement),
+    )
     for normal, height, dhat in zip(planes[..., :3].unbind(1), planes[..., 3].T, planes[..., 5].T, strict=True):
         gap = ((g.x * normal[:, None]).sum(-1) - height[:, None]).clamp(min=0)
-        deep, toward = DEEP * dhat[:, None], -(way * normal[:, None]).sum(-1)
-        room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-        closes = (toward > room) & ~held
-        excess = of_bodies(g, torch.where(closes, toward - room, 0.0), 0.0, "amax")
+        deep, toward = DEEP * dhat[:, None], -(displacement * normal[:, None]).sum(-1)
+        trust_radius = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
+        closes = (toward > trust_radius) & ~pinned
+        excess = of_bodies(g, torch.where(closes, toward - trust_radius, 0.0), 0.0, "amax")
         shift = shift + excess[..., None] * normal[:, None]
-        share = torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0)
-        least = torch.minimum(least, of_bodies(g, share, 1.0, "amin"))
+        fraction = torch.where(closes, trust_radius / torch.where(closes, toward, 1.0), 1.0)
+        least = torch.minimum(least, of_bodies(g, fraction, 1.0, "amin"))
     good = torch.ones_like(least, dtype=torch.bool)
     for normal, height, dhat in zip(planes[..., :3].unbind(1), planes[..., 3].T, planes[..., 5].T, strict=True):
         gap = ((g.x * normal[:, None]).sum(-1) - height[:, None]).clamp(min=0)
-        deep, toward = DEEP * dhat[:, None], -(way * normal[:, None]).sum(-1)
-        room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-        over = toward - (shift[:, body] * normal[:, None]).sum(-1) - room
-        good &= of_bodies(g, torch.where(held, -1.0, over), -1.0, "amax") <= tolerance("sums_of_bodies")
+        deep, toward = DEEP * dhat[:, None], -(displacement * normal[:, None]).sum(-1)
+        trust_radius = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
+        over = toward - (shift[:, body] * normal[:, None]).sum(-1) - trust_radius
+        good &= of_bodies(g, torch.where(pinned, -1.0, over), -1.0, "amax") <= tolerance("sums_of_bodies")
     good = good[:, body, None]
-    return torch.where(good, 1.0, least[:, body, None]) * way + torch.where(good, shift[:, body], 0.0)
+    return torch.where(good, 1.0, least[:, body, None]) * displacement + torch.where(good, shift[:, body], 0.0)
 
 
-def by_torch(g: Given) -> RoomsOfBodies:
+def by_torch(g: Given) -> TrustRadii:
     """As written down."""
     s, motion = g.surface, g.motion()
     body = s.body[: g.x.shape[1]].long()
-    way = dict(zip(WAYS, motion.ways.longest, strict=True))
-    falls = 2 * way["falls"] + LEAST_ROOM * DHAT
+    displacement = dict(zip(DISPLACEMENTS, motion.displacements.longest, strict=True))
+    gravity_moves = 2 * displacement["gravity"] + LEAST_RADIUS * DHAT
     pushed = (g.now - g.was).norm(dim=-1).amax(1, keepdim=True)
     first = s.planes.long() - g.x.shape[1]
     planes = []
@@ -118,41 +121,44 @@ def by_torch(g: Given) -> RoomsOfBodies:
         planes.append(torch.cat([n, height, rest, rest + DHAT, rest], -1))
     floors = [] if g.floor is None else [g.floor.reshape(1, -1, 7).expand(2, -1, -1)]
     every = torch.cat([*(p[:, None] for p in planes), *floors], 1) if planes or floors else g.x.new_zeros((2, 0, 7))
-    stopped = torch.minimum(longest(g, g.move - left_by(g, every, g.move)), s.most_own_room)
+    stopped = torch.minimum(longest(g, g.move - left_by(g, every, g.move)), s.max_deformation_radius)
     bent = longest(g, g.move - left_by(g, every, motion.rigid))
 
-    def room_of(beside: Tensor, most: Tensor) -> Tensor:
-        asked = ROOM * beside + way["bends"] + falls + stopped + 2 * DHAT
-        return torch.maximum(torch.minimum(asked, most), way["driven"]) + pushed
+    def radius_of(beside: Tensor, most: Tensor) -> Tensor:
+        asked = RADIUS_FACTOR * beside + displacement["bends"] + gravity_moves + stopped + 2 * DHAT
+        return torch.maximum(torch.minimum(asked, most), displacement["driven"]) + pushed
 
-    def last(room: Tensor) -> Tensor:
-        return torch.cat([room, room.amax(1, keepdim=True)], 1)
+    def last(trust_radius: Tensor) -> Tensor:
+        return torch.cat([trust_radius, trust_radius.amax(1, keepdim=True)], 1)
 
-    def islands(room: Tensor) -> Tensor:
+    def islands(trust_radius: Tensor) -> Tensor:
         return ops_detect.contact_islands(g.x, g.origin, g.move, g.mass, g.was, g.now, s.planes, s.body, s.body_order,
-                                          s.body_ptr, s.held, s.radius, last(room), s.bodies, DHAT)  # fmt: skip
+                                          s.body_ptr, s.pinned, s.radius, last(trust_radius), s.bodies,
+                                          DHAT)  # fmt: skip
 
-    island = islands(room_of(way["bends"], s.most_room_alone)).long()
+    island = islands(radius_of(displacement["bends"], s.max_trust_radius_alone)).long()
     alone = (island >= 0) & ((island[:, :, None] == island[:, None]).sum(-1) == 1)
-    most = torch.where(alone, s.most_room_alone, s.most_room.expand(2, -1))
-    room = room_of(way["bends"], most)
+    most = torch.where(alone, s.max_trust_radius_alone, s.max_trust_radius.expand(2, -1))
+    trust_radius = radius_of(displacement["bends"], most)
     for _ in range(3):  # whom a body meets gets room as well
-        island = islands(room).long()
+        island = islands(trust_radius).long()
         same = ((island[:, :, None] == island[:, None]) & (island >= 0)[:, None]).to(g.x)
-        joined = same @ motion.ways.sums
+        joined = same @ motion.displacements.sums
         u = torch.where((island >= 0)[..., None], joined[..., :3] / joined[..., 3:].clamp(min=1e-300), 0.0)
         beside = longest(g, g.move - u[:, body])
-        room = torch.maximum(room, room_of(beside, most))
-    wanted = beside + ROOM * way["stretched"]
-    asks = wanted + (ROOM - 1) * beside + way["bends"] + falls + stopped
-    over = torch.maximum(wanted / most, (asks / most).clamp(max=2))
-    own = torch.zeros_like(room)
+        trust_radius = torch.maximum(trust_radius, radius_of(beside, most))
+    wanted = beside + RADIUS_FACTOR * displacement["stretched"]
+    pending = wanted + (RADIUS_FACTOR - 1) * beside + displacement["bends"] + gravity_moves + stopped
+    over = torch.maximum(wanted / most, (pending / most).clamp(max=2))
+    own = torch.zeros_like(trust_radius)
     if g.barrier.self_contact:
-        own = torch.minimum((ROOM + 1) * (bent + way["stretched"]) + falls, s.most_own_room)
-        own = torch.maximum(torch.maximum(own, torch.minimum(room, s.least_own_room)), way["driven"])
-    island = islands(room)
-    room = torch.where(island >= 0, room - pushed, room)  # which no collider comes near
-    return RoomsOfBodies(island, last(room), last(own), over)
+        own = torch.minimum((RADIUS_FACTOR + 1) * (bent + displacement["stretched"]) + gravity_moves,
+                            s.max_deformation_radius)  # fmt: skip
+        own = torch.maximum(torch.maximum(own, torch.minimum(trust_radius, s.min_deformation_radius)),
+                            displacement["driven"])  # fmt: skip
+    island = islands(trust_radius)
+    trust_radius = torch.where(island >= 0, trust_radius - pushed, trust_radius)  # which no collider comes near
+    return TrustRadii(island, last(trust_radius), last(own), over)
 
 
 def check(g: Given) -> None:
@@ -163,7 +169,7 @@ def check(g: Given) -> None:
         torch.testing.assert_close(one, expected, rtol=tolerance("sums_of_bodies"), atol=0.0,
                                    msg=lambda text, name=name: f"{name}: {text}")  # fmt: skip
         assert torch.equal(one, same)
-    assert (got.room > 0).all() and bool((got.own_room > 0).all()) == g.barrier.self_contact
+    assert (got.trust_radius > 0).all() and bool((got.deformation_radius > 0).all()) == g.barrier.self_contact
 
 
 @pytest.mark.parametrize("speed", [1e-4, 0.03, 0.5, 3.0])
@@ -186,5 +192,5 @@ def test_what_is_not_finite_does_not_pass_for_a_room(device: str) -> None:
     move = g.move.clone()
     move[1, -1, 0] = torch.nan
     found = g._replace(move=move).found()
-    assert found.room[0].isfinite().all() and found.island[1, 3] == -1
-    assert found.room[1, 3:].isnan().all() and found.over[1, 3].isnan()
+    assert found.trust_radius[0].isfinite().all() and found.island[1, 3] == -1
+    assert found.trust_radius[1, 3:].isnan().all() and found.over[1, 3].isnan()
