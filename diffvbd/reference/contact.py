@@ -15,11 +15,10 @@ from torch import Tensor
 
 from .coarse import Coarse
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import FADE, FloorBarrier, build_energies, floor_friction, smoothed, tangential6
-from .rigid import turned
+from .energies import FADE, build_energies, floor_friction, smoothed, tangential6
 from .rigid_contact import Correction
-from .scene import Scene, build_layout, build_scene, dot, outer6
-from .sweep import check_start, color_masses, executed, predictor, run_sweeps, started
+from .scene import Scene, build_layout, build_scene, outer6
+from .sweep import check_start, color_masses, executed, predictor, run_sweeps
 
 
 class Substep(NamedTuple):
@@ -28,16 +27,13 @@ class Substep(NamedTuple):
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
     constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
-    island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
-    fractions: Tensor  # [2, B, V]: step fractions of the two displacements of the start
+    u: Tensor  # [B, bodies, 3]: translation of each body's island
+    fractions: Tensor  # [B, V]: step fraction of each vertex at the start
+    truncated: Tensor  # bool [B, V]: vertices whose displacement goes on in the next substep
     # [1 to 3, B, bodies]: step fractions of the rigid motions before and after the sweeps
     corrections: Tensor
     limits: Tensor | None = None  # [K, B, V]: step fraction of each update
-    rigid_fraction: Tensor | None = None  # [B, bodies]: step fractions of the rigid motions of the start; None: none
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
-    support_vertex: Tensor | None = (
-        None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
-    )
     sweeps: int | None = None  # None: an even part of those of the step
     going: Tensor | None = None  # bool [B, 1, 1]: scenes that it is for; None: all
     resting: Tensor | None = None  # bool [B, V]: vertices that begin without their gravity move; None: none
@@ -233,7 +229,6 @@ def contact_step(
     colliders_before: Tensor | None = None,
     order: Sequence[Tensor] | None = None,
     tet_order: Tensor | None = None,
-    lookback: float = 1.0,
     **parameters: Any,
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
@@ -241,8 +236,7 @@ def contact_step(
     Arguments of `step`, and: substeps, one for each detection, scenes counted in
     row-major order of x's leading dimensions; colliders and colliders_before: positions [..., Vc, 3] [m] of collider
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
-    permutation of the pairs for each substep, tet_order one of the tets: they change only the order of summation;
-    lookback: distance back along h v at which a vertex counts as having been, over h v, 1 where v = (x - x_prev) / h.
+    permutation of the pairs for each substep, tet_order one of the tets: they change only the order of summation.
     parameters may hold "pair_kappa" [N/m], "pair_damping" [N s/m] and "friction". Raises ValueError when an unpinned
     vertex starts below a floor plane, or when substeps or order have another length. Returns (x', v')."""
     model, time_step, sweeps = executed(model, solver), solver.time_step, solver.sweeps
@@ -264,11 +258,14 @@ def contact_step(
     )
     energies = build_energies(scene, elsewhere=("pair", "friction"))
     energies += floor_friction(scene, energies)
-    floor = next((energy for energy in energies if isinstance(energy, FloorBarrier)), None)
     masses = color_masses(scene)
     end = _collider_rows(scene, model.collider_points if colliders is None else colliders)
     begin = end if colliders_before is None else _collider_rows(scene, colliders_before)
     listed = [Pairs(scene, substep, None if order is None else order[r]) for r, substep in enumerate(substeps)]
+
+    def rows(values: Tensor) -> Tensor:
+        """[B, V, c] -> [..., c, V]"""
+        return values.to(x).transpose(-1, -2).reshape(*x.shape[:-2], values.shape[-1], x.shape[-2])
 
     y = predictor(scene, x, v, force, gravity, prescribed).transpose(-1, -2)
     x_prev, pinned = x.transpose(-1, -2), model.pinned
@@ -276,35 +273,16 @@ def contact_step(
     start = corner_points(x_prev, begin)
     inertial = torch.where(pinned, y, x_prev + time_step * v.transpose(-1, -2))
     displacement, h2a, state = inertial - x_prev, y - inertial, x_prev
-    free = torch.zeros(int(model.body.max()) + 1).to(x).index_add(0, model.body, pinned.to(x))[model.body] == 0
-    displacement = remaining = extrapolation(scene, x_prev, displacement, free, lookback)
+    if substeps and substeps[0].resting is not None:
+        resting = substeps[0].resting.reshape(*x.shape[:-2], 1, -1)
+        displacement = displacement + torch.where(resting, 0.0, h2a)
+    remaining = displacement
     for r, substep in enumerate(substeps):
-        before, now = (begin + min(1.0, n / prescribed_substeps) * (end - begin) for n in (r, r + 1))
+        now = begin + min(1.0, (r + 1) / prescribed_substeps) * (end - begin)
         move = remaining if prescribed_substeps == 1 else torch.where(pinned, displacement / prescribed_substeps,
                                                                       remaining)  # fmt: skip
-        gravity_move = h2a if r == 0 else torch.zeros_like(h2a)
-        if r == 0:
-            gravity_move = h2a = residual_acceleration(scene, listed[0], floor, x_prev, before, h2a)
-            if substep.resting is not None:
-                gravity_move = h2a = torch.where(substep.resting.reshape(*x.shape[:-2], 1, -1), 0.0, h2a)
-        if model.starts_from == "inertia":
-            gravity_move = torch.zeros_like(gravity_move)
-        begun = at = state
-        u = Translation(scene, substep, state, move, floor).u
-        stopped = torch.zeros_like(x[..., 0], dtype=torch.bool)
-        for wanted, by, fraction in ((move, u, substep.fractions[0]),
-                                     (gravity_move, torch.zeros_like(u), substep.fractions[1])):  # fmt: skip
-            base, fraction = at + by, fraction.reshape(*x.shape[:-2], 1, -1).to(at)
-            target = at + wanted
-            if floor is not None:
-                target = base + started(energies, base, target - base)
-            if by is u and substep.rigid_fraction is not None:
-                rigid_fraction = substep.rigid_fraction.to(at)[:, model.body].reshape(*x.shape[:-2], 1, -1)
-                relative = rigid_displacement(scene, state, move) - u
-                if floor is not None:
-                    relative, stopped = above_floor(floor, model, base, relative)
-                base = base + rigid_fraction * relative
-            at = torch.where(pinned, at + wanted, base + fraction * (target - base))
+        u, fraction = rows(substep.u[:, model.body]), rows(substep.fractions[..., None])
+        begun, at = state, torch.where(pinned, state + move, state + u + fraction * (move - u))
         forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
         correct = Correction(scene, energies, forces, y, x_prev)
         state = correct(at, substep.corrections[0])
@@ -316,12 +294,7 @@ def contact_step(
                 state = correct(state, fractions)
         if substep.going is not None:
             state = torch.where(substep.going.reshape(*x.shape[:-2], 1, 1), state, begun)
-        truncated = (
-            (substep.fractions.amin(0) < TRUNCATED).reshape(*x.shape[:-2], 1, -1)
-            & ~pinned
-            & ~(stopped & free).unsqueeze(-2)
-        )
-        remaining = torch.where(truncated, x_prev + displacement + h2a - state, 0.0)
+        remaining = torch.where(rows(substep.truncated[..., None]) > 0, y - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()
     return x_new, (x_new - x) / time_step
 
@@ -335,135 +308,6 @@ def _collider_rows(scene: Scene, points: Any) -> Tensor:
 def corner_points(x: Tensor, colliders: Tensor) -> Tensor:
     """Positions [B, N, 3] of all corner points from a state [..., 3, V] and colliders [B, Vc, 3]."""
     return torch.cat((x.transpose(-1, -2).reshape(len(colliders), -1, 3), colliders), 1)
-
-
-class Translation:
-    """Translation of the island of each vertex [..., 3, V]: the mean wanted displacement, above the floor."""
-
-    def __init__(self, scene: Scene, substep: Any, x: Tensor, wanted: Tensor, floor: FloorBarrier | None) -> None:
-        rows = wanted.transpose(-1, -2).reshape(len(substep.island), x.shape[-1], 3)
-        u = self._mean(scene, substep, rows).transpose(-1, -2).reshape(x.shape)
-        if floor is not None and substep.support_vertex is not None:
-            support = substep.support_vertex[:, scene.model.body].reshape(*x.shape[:-2], x.shape[-1], -1)
-            u = self._above(floor, u, x, support)
-        self.u = u
-
-    @staticmethod
-    def _mean(scene: Scene, substep: Any, wanted: Tensor) -> Tensor:
-        """u [B, V, 3]: mean of `wanted` [B, V, 3], weighted by mass, over the vertices of a vertex's island."""
-        model = scene.model
-        label = substep.island[:, model.body]
-        moves = label >= 0
-        label = label.clamp(min=0)
-        mass = scene.mass.expand(scene.like.shape[:-1]).reshape(label.shape)
-        mass = torch.where(model.pinned, 0.0, mass)
-        columns = torch.cat((mass[..., None] * wanted, mass[..., None]), -1)
-        index = label[..., None].expand_as(columns)
-        sums = columns.new_zeros(len(label), substep.island.shape[1], 4).scatter_add(1, index, columns).gather(1, index)
-        total = torch.where(moves, sums[..., 3], 1.0)
-        return torch.where(moves[..., None], sums[..., :3] / total[..., None], 0.0)
-
-    @staticmethod
-    def _above(floor: FloorBarrier, u: Tensor, x: Tensor, support_vertex: Tensor) -> Tensor:
-        """u [..., 3, V], limited so that the support vertex [..., V, planes] stays dhat above each plane."""
-        lead, count = x.shape[:-2], x.shape[-1]
-        gap = floor.gap(x)  # [..., planes, V]
-        allowance = (gap.gather(-1, support_vertex.transpose(-1, -2)) - floor.dhat).clamp(min=0)
-        normal = floor.normal.expand(*lead, *floor.normal.shape[-3:]).expand(*lead, -1, 3, count)
-        slack = 8 * torch.finfo(x.dtype).eps * dot(u, u).detach().sqrt().unsqueeze(-2)
-        for plane in range(allowance.shape[-2]):
-            n = normal[..., plane, :, :]
-            u = u + (-dot(n, u) - allowance[..., plane, :]).clamp(min=0).unsqueeze(-2) * n
-        down = -dot(normal, u.unsqueeze(-3))
-        safe = (down <= allowance * (1 + 1e-6) + slack).all(-2)
-        return torch.where(safe.unsqueeze(-2), u, 0.0)
-
-
-def residual_acceleration(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor, colliders: Tensor,
-                          h2a: Tensor) -> Tensor:  # fmt: skip
-    """Residual acceleration times h^2 [..., 3, V] of bodies after the barriers at the start of the step."""
-    model, scenes, count = scene.model, len(colliders), int(scene.model.body.max()) + 1
-    points = corner_points(x, colliders)
-    gap, slope, e, _ = pairs.measures(points, torch.arange(len(pairs.kind), device=x.device))
-    kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
-    _, first, _ = log_barrier(gap, kappa, pairs.dhat)
-    push = -(e * first)[:, None, None] * slope
-    force = torch.zeros_like(points).index_put((pairs.batch[:, None], pairs.corners), push, accumulate=True)
-    force = force[:, : x.shape[-1]]
-    if floor is not None:
-        _, slope, _ = log_barrier(floor.gap(x), floor.kappa, floor.dhat)
-        floor_force = -(slope.unsqueeze(-2) * floor.normal).sum(-3)
-        force = force + floor_force.transpose(-1, -2).reshape(force.shape)
-    mass = scene.mass.expand(*x.shape[:-2], x.shape[-1]).reshape(scenes, -1, 1)
-    displacement = h2a.transpose(-1, -2).reshape(force.shape)
-    free = ~model.pinned
-    columns = torch.where(free[:, None], torch.cat([mass * displacement, scene.time_step**2 * force, mass], -1), 0.0)
-    sums = columns.new_zeros(scenes, count, 7).index_add(1, model.body, columns)
-    own, borne = (sums[..., i : i + 3] / sums[..., 6:].clamp(min=1e-300) for i in (0, 3))
-    square = (borne**2).sum(-1, keepdim=True)
-    fraction = (-(own * borne).sum(-1, keepdim=True) / square.clamp(min=1e-300)).clamp(0, 1)
-    pinned = torch.zeros(count, device=x.device).index_add(0, model.body, model.pinned.float()) > 0
-    taken = torch.where(pinned[:, None], 0.0, fraction * borne)[:, model.body]
-    displacement = torch.where(free[:, None], displacement + taken, displacement)
-    return displacement.transpose(-1, -2).reshape(x.shape)
-
-
-def rigid_displacement(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
-    """Translation and linearised rotation of each body with the momenta of the displacements [..., 3, V]."""
-    model, displacement, at = scene.model, move.transpose(-1, -2), x.transpose(-1, -2)
-    mass = scene.mass.expand(at.shape[:-1])[..., None]
-    eye, out = torch.eye(3).to(x), torch.zeros_like(at)
-    for body in range(int(model.body.max()) + 1):
-        own = model.body == body
-        if bool(model.pinned[own].any()):
-            continue
-        m, d, p = mass[..., own, :], displacement[..., own, :], at[..., own, :]
-        whole = m.sum(-2, keepdim=True)
-        arm, shift = p - (m * p).sum(-2, keepdim=True) / whole, (m * d).sum(-2, keepdim=True) / whole
-        spread = (m[..., None] * arm[..., None] * arm[..., None, :]).sum(-3)
-        size = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        momentum = (m * torch.linalg.cross(arm, d)).sum(-2)
-        turn = torch.linalg.solve((1 + 1e-9) * size * eye - spread, momentum)
-        out = out.index_add(-2, own.nonzero()[:, 0], shift + torch.linalg.cross(turn[..., None, :].expand_as(arm), arm))
-    return out.transpose(-1, -2)
-
-
-def extrapolation(scene: Scene, x: Tensor, displacement: Tensor, free: Tensor, lookback: float) -> Tensor:
-    """Displacements [..., 3, V] without the stretch of free bodies. free: bool [V]."""
-    model = scene.model
-    mass = scene.mass.expand(x[..., 0, :].shape).unsqueeze(-2)
-    for number in model.body[free].unique().tolist():
-        own = (model.body == number).nonzero()[:, 0]
-        mine = turned(mass[..., own], x[..., own], displacement[..., own], lookback)
-        displacement = displacement.index_copy(-1, own, mine)
-    return displacement
-
-
-TRUNCATED = 0.99  # step fraction below which a displacement counts as truncated
-KEPT, DEEP, KEPT_DEEP = 0.9, 0.1, 0.1  # of a gap; of dhat, and of a gap below that
-
-
-def above_floor(floor: FloorBarrier, model: Any, x: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-    """Displacements [..., 3, V] of whole bodies limited by the floor, and vertices of stopped bodies [..., V]."""
-    lead, out, stopped = x.shape[:-2], displacement, torch.zeros_like(x[..., 0, :], dtype=torch.bool)
-    deep, gap = DEEP * floor.dhat, floor.gap(x)  # [..., planes, V]
-    allowance = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-    normal = floor.normal.expand(*lead, *floor.normal.shape[-3:])  # [..., planes, 3, 1]
-    toward = -(normal * displacement.unsqueeze(-3)).sum(-2)
-    for number in range(int(model.body.max()) + 1):
-        own = (model.body == number) & ~model.pinned
-        if not bool(own.any()):
-            continue
-        off, left = toward[..., own] - allowance[..., own], allowance[..., own] / toward[..., own].clamp(min=1e-300)
-        shift = (off.amax(-1).clamp(min=0)[..., None, None] * normal).sum(-3)  # [..., 3, 1]
-        fraction = torch.where(off > 0, left, 1.0).amin((-2, -1))
-        past = off - (normal * shift.unsqueeze(-3)).sum(-2)
-        rounding = 1e-12 * (toward[..., own].abs() + shift.abs().sum(-2).unsqueeze(-2))
-        good = (past <= rounding).all(-1).all(-1)[..., None, None]
-        mine = torch.where(good, displacement + shift, fraction[..., None, None] * displacement)
-        out = torch.where(model.body == number, mine, out)
-        stopped = stopped | ((model.body == number) & (fraction < TRUNCATED)[..., None])
-    return out, stopped
 
 
 def in_cycles(

@@ -217,15 +217,6 @@ def _turn_or_none(b: Tensor, lookback: float) -> tuple[Tensor, Tensor]:
     return turn, turns & (square < 2 * (MOST_TURN * lookback) ** 2)[..., None, None]
 
 
-def turned(mass: Tensor, x: Tensor, displacement: Tensor, lookback: float) -> Tensor:
-    """The same, rotated as a whole toward the ends of the displacements."""
-    total = mass.sum(-1, keepdim=True)
-    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, displacement))
-    _, shape, end = bent(mass, x, displacement, lookback)
-    turn, turns = _turn_or_none((mass * end) @ shape.transpose(-1, -2), 1.0)
-    return torch.where(turns, mean + turn @ shape - (x - center), displacement)
-
-
 def clear(energy: Any, x: Tensor) -> Tensor:
     """Mask [..., planes, n] of gaps above rounding."""
     size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()

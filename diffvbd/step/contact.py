@@ -214,7 +214,8 @@ class ContactStep:
                 x, truncated = torch.where(going, x, begin), torch.where(going[..., 0], truncated, records.truncated)
                 blocked = blocked & going[..., 0]
             records.truncated = truncated
-            records.found[r] = replaced(detection, fractions=start.fractions, corrections=tuple(taken), limits=limits,
+            records.found[r] = replaced(detection, fractions=start.fractions, truncated=start.truncated,
+                                        corrections=tuple(taken), limits=limits,
                                         kept=kept, lengths=lengths, sweeps=sweeps, going=going,
                                         resting=resting)  # fmt: skip
             r += 1
@@ -519,6 +520,7 @@ class Detection(NamedTuple):
         trust_radius: Trust-region radius of each body relative to its island, and the largest [m], [B, bodies + 1].
         deformation_radius: The same relative to the body's rigid motion [m].
         fractions: Step fraction of each vertex at the start [B, V].
+        truncated: Vertices that pairs or radii have truncated at the start, bool [B, V].
         corrections: Step fractions of the rigid corrections before and after the sweeps, [B, bodies] each.
         limits: Number of halvings of each update, uint8 [B, K, V]; 8: it was not made.
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
@@ -538,6 +540,7 @@ class Detection(NamedTuple):
     deformation_radius: Tensor
     # decisions of the substep
     fractions: Tensor | None = None
+    truncated: Tensor | None = None
     corrections: tuple[Tensor, ...] | None = None
     limits: Tensor | None = None
     lengths: Tensor | None = None

@@ -198,7 +198,6 @@ SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (stacked, cross
 def substep_of(detection: Any) -> reference.Substep:
     """Index data of a detection as the reference takes it."""
     count = int(detection.counts[0])
-    support_vertex = detection.support_vertex.cpu().long() if detection.support_vertex.numel() else None
     limits = None
     if detection.limits is not None:
         exponents = detection.limits.cpu().double().movedim(1, 0)
@@ -208,10 +207,8 @@ def substep_of(detection: Any) -> reference.Substep:
         rows = constants[:, -1] < constants[:, 0]
         rows[detection.kept] = True
         pairs, constants = pairs[rows], constants[rows]
-    return reference.Substep(pairs, constants, detection.island.cpu().long(), torch.stack(detection.fractions).cpu(),
+    return reference.Substep(pairs, constants, detection.u.cpu(), detection.fractions.cpu(), detection.truncated.cpu(),
                              torch.stack(detection.corrections).cpu(), limits,
-                             None if detection.rigid_fraction is None else detection.rigid_fraction.cpu(),
-                             support_vertex=support_vertex,
                              lengths=None if detection.lengths is None else detection.lengths.cpu(),
                              sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu(),
                              resting=None if detection.resting is None else detection.resting.cpu())  # fmt: skip
