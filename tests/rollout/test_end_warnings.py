@@ -15,7 +15,7 @@ from diffvbd.mesh import box
 from diffvbd.model.system import system_of
 from diffvbd.rollout import checks
 from diffvbd.step.arguments import material_of, prepare
-from diffvbd.step.contact import CUT
+from diffvbd.step.contact import TRUNCATED
 from diffvbd.step.residual import truncated_fraction
 from diffvbd.step.stability import FAR
 from diffvbd.testing import tolerance
@@ -292,7 +292,7 @@ def test_motion_that_pairs_held_up_is_warned_of() -> None:
         dv.rollout(model, x, v, steps=1, **FAST, checks=dv.Checks(contact=True))
     assert found[0].filename == __file__
     assert sum("pairs truncated" in str(w.message) for w in found) == 1
-    assert truncated_fraction(system_of(model, FAST["solver"])) > CUT
+    assert truncated_fraction(system_of(model, FAST["solver"])) > TRUNCATED
 
 
 def test_friction_that_has_not_converged_is_warned_of() -> None:
