@@ -3,8 +3,7 @@
 A benchmark is a module with run(quick) that returns its results, or with GROUPS, functions of a Card by name. Its
 docstring and its TABLES say how the site shows them (`bench.tables`). DEVICE is where it measures without `--device`,
 THREADS how many torch uses. Results go to NAME.json, those on CUDA to NAME-cuda.json. Other names: list; all; `tasks`,
-inverse problems and their logs; `report`, what pages in the repository show of results; `gallery` and `screenshots`,
-which make pictures.
+inverse problems and their logs; `report`, what pages in the repository show of results.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from typing import Any
 import torch
 
 import bench
-from bench import common, tables
+from bench import common, report, tables, tasks
 from bench.measure import Card
 
 ASKED = ("bits",)  # only when asked for by name: what it writes is no result
-OTHERS = ("report", "tasks", "gallery", "screenshots")
+OTHERS = ("report", "tasks")
 PAPER = ("exactness", "ablation", "cost", "fd")  # the paper's own measurements, in its order
 
 
@@ -36,20 +35,9 @@ def benchmarks() -> dict[str, ModuleType]:
     return {name: module for name, module in modules.items() if hasattr(module, "run") or hasattr(module, "GROUPS")}
 
 
-def other(options: argparse.Namespace) -> int:
-    """What is no benchmark."""
-    module = importlib.import_module(f"bench.{options.name}")
-    if options.name == "tasks":
-        return module.main(options.only, options.device or "cpu", options.seeds, options.options, options.out,
-                           options.quick)  # fmt: skip
-    given = {"report": (), "gallery": (options.only, options.out), "screenshots": (options.out,)}
-    return module.main(*given[options.name])
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description="Runs a benchmark and writes its results.")
-    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; list, tasks, report, gallery, "
-                                     "screenshots")  # fmt: skip
+    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; list, tasks, report")
     parser.add_argument("--quick", action="store_true", help="a few small cases; written only where --out says")
     parser.add_argument("--out", type=Path, help="folder of the results (default: bench/results)")
     parser.add_argument("--device", help="where to measure, if the benchmark lets one choose: cuda, cuda:1, cpu")
@@ -59,8 +47,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.device and torch.device(options.device).type == "cuda" and not torch.cuda.is_available():
         parser.error(f"--device: expected a device of this machine, got {options.device}, and torch sees no CUDA here")
-    if options.name in OTHERS:
-        return other(options)
+    if options.name == "report":
+        return report.main()
+    if options.name == "tasks":
+        return tasks.main(options.only, options.device or "cpu", options.seeds, options.options, options.out,
+                          options.quick)  # fmt: skip
     if (Path(__file__).parent / f"{options.name}.py").exists():
         known = {options.name: importlib.import_module(f"bench.{options.name}")}
     else:
