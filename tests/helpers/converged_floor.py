@@ -1,4 +1,4 @@
-"""Converged steps of a body that meets a floor, by Newton's method with a line search, in NumPy, apart from the package.
+"""Converged steps of a body that meets a floor, by Newton's method with a line search: NumPy, apart from the package.
 
 Stable Neo-Hookean tets, the log barrier and lagged friction are as docs/method.md states them, with dense matrices.
 """
