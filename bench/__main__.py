@@ -25,7 +25,6 @@ from bench import common, report, tables, tasks
 from bench.measure import Card
 
 ASKED = ("bits",)  # only when asked for by name: what it writes is no result
-OTHERS = ("report", "tasks")
 PAPER = ("exactness", "ablation", "cost", "fd")  # the paper's own measurements, in its order
 
 
@@ -66,22 +65,23 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--out: {options.name} is compared between two folders, and needs one")
     module = known.get(options.name)
     if module is None or not (hasattr(module, "run") or hasattr(module, "GROUPS")):
-        parser.error(
-            f"name: expected one of {', '.join(benchmarks())}, all, list, {', '.join(OTHERS)}, got {options.name}"
-        )
-    takes = {"device", "only"} if hasattr(module, "GROUPS") else set(inspect.signature(module.run).parameters)
-    if options.only is not None and "only" not in takes or options.device and not on_device(module, options.device):
+        parser.error(f"name: expected one of {', '.join(benchmarks())}, all, list, report, tasks, got {options.name}")
+    if options.only is not None and "only" not in takes(module) or not on_device(module, options.device):
         parser.error(f"--only, --device: {options.name} has no such option")
     run_one(options.name, module, options, options.only)
     return 0
 
 
-def on_device(module: ModuleType, device: str) -> bool:
+def takes(module: ModuleType) -> set[str]:
+    """The options that a benchmark has."""
+    if hasattr(module, "GROUPS"):
+        return {"only", "device"} if getattr(module, "ANYWHERE", False) else {"only"}
+    return set(inspect.signature(module.run).parameters)
+
+
+def on_device(module: ModuleType, device: str | None) -> bool:
     """Whether a benchmark can measure there."""
-    home = getattr(module, "DEVICE", "cpu")
-    takes = getattr(module, "ANYWHERE", False) if hasattr(module, "GROUPS") else "device" in inspect.signature(
-        module.run).parameters  # fmt: skip
-    return torch.device(device).type == home or takes
+    return not device or torch.device(device).type == getattr(module, "DEVICE", "cpu") or "device" in takes(module)
 
 
 def run_one(name: str, module: ModuleType, options: argparse.Namespace, only: str | None = None) -> None:
@@ -96,8 +96,8 @@ def run_one(name: str, module: ModuleType, options: argparse.Namespace, only: st
                                            out=out)  # fmt: skip
         else:
             given = {"device": options.device, "only": only, "out": out}
-            takes = inspect.signature(module.run).parameters
-            results = module.run(options.quick, **{k: v for k, v in given.items() if v is not None and k in takes})
+            known = takes(module)
+            results = module.run(options.quick, **{k: v for k, v in given.items() if v is not None and k in known})
     print(tables.text_of(name, results))
     if out is not None:
         suffix = common.device_suffix(device, home)

@@ -28,11 +28,16 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import common
-from bench.advice import DHAT, FRAMES, Run, Runs, Scene, advised
+from bench.advice import DHAT, ERRORS, FRAMES, Row, Run, Runs, Scene, advised
 from bench.tables import Table
 from diffvbd import mesh
 
 ELASTIC = dv.StableNeoHookean()
+
+
+def beam() -> dv.TetMesh:
+    """0.6 m long."""
+    return mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
 
 
 def still(model: dv.Model) -> Tensor:
@@ -42,7 +47,7 @@ def still(model: dv.Model) -> Tensor:
 def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, speed: float = 0.0, name: str = "") -> Scene:
     """A beam of 0.6 m held at one end, some swings of it. contrast: of its two halves' stiffness, in layers; speed:
     of its free end at first [m/s], where it would hardly sag."""
-    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    body = beam()
     model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
     lam = 2 * mu * poisson / (1 - 2 * poisson)
     share = np.where(body.points[body.tets].mean(1)[:, 1] > 0.075, 1.0, 1 / contrast)
@@ -65,7 +70,7 @@ def cloth() -> Scene:
 
 def twist() -> Scene:
     """A bar whose ends are turned against each other by half a turn in 0.3 s."""
-    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    body = beam()
     rest = torch.tensor(body.points)
     left, right = rest[:, 0] < 1e-9, rest[:, 0] > 0.6 - 1e-9
     model = dv.Model(body, pinned=left | right)
@@ -146,8 +151,6 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 LONGEST = 1 / 30  # [s], the first step
-ERRORS = (0.1, 0.01, 0.001)
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -382,7 +385,7 @@ def newton_model(engine: Any, scene: Scene) -> Any:
 
 
 def numbers(rows: list[Row]) -> list[Row]:
-    """Rows of which both error and time are numbers."""
+    """Rows of which error and time are numbers."""
     return [r for r in rows if isinstance(r.get("error"), float) and isinstance(r["ms"], float)]
 
 
