@@ -31,7 +31,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import exactness, paper
-from bench.exactness import GLOBAL, PRESET, UNROLLED, Case, Row, Scene, Solves, build, expected_of
+from bench.exactness import GLOBAL, PRESET, UNROLLED, Case, Row, Scene, build, expected_of
 from bench.measure import Card, kept_bytes, peak_memory, reset_peak_memory
 from bench.tables import Table, times
 from diffvbd import testing
@@ -141,10 +141,10 @@ def interleaved(card: Card, tasks: dict[Any, Task], rounds: dict[Any, int]) -> d
 
 def accuracy(scene: Scene, name: str, expected: dict[str, Tensor]) -> Row:
     """Gradient error of a route, its forward verified first, and what its linear solves took."""
-    solves = Solves()
-    got = exactness.result_of(scene, SWEEPS, exactness.adjoint_of(name, TOLERANCE, solves))
+    solves: list[Any] = []
+    got = exactness.result_of(scene, SWEEPS, exactness.adjoint_of(name, TOLERANCE, solves.append))
     forward = exactness.verified_forward(got, expected, scene.case.time_step, name)
-    return {"error": exactness.gradient_error(got, expected), "forward": forward, **solves.summary()}
+    return {"error": exactness.gradient_error(got, expected), "forward": forward, **exactness.summary(solves)}
 
 
 def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:

@@ -122,31 +122,23 @@ def build(case: Case, device: str = "cpu") -> Scene:
 # --- routes -----------------------------------------------------------------------------------------------------------
 
 
-class Solves:
-    """Collects the reports of a GlobalAdjoint: one linear solve for each step of a backward."""
-
-    def __init__(self) -> None:
-        self.reports: list[Any] = []
-
-    def __call__(self, report: Any) -> None:
-        self.reports.append(report)
-
-    def summary(self) -> Row:
-        """Iterations of the longest solve and of all, and whether every one converged; nothing where none was made."""
-        if not self.reports:
-            return {}
-        counts = [int(torch.as_tensor(report.iterations).max()) for report in self.reports]
-        return {"iterations": max(counts), "total_iterations": sum(counts),
-                "converged": all(bool(report.converged) for report in self.reports)}  # fmt: skip
+def summary(solves: list[Any]) -> Row:
+    """Of the linear solves of a backward: iterations of the longest and of all, and whether every one converged; nothing
+    where none was made."""
+    if not solves:
+        return {}
+    counts = [int(torch.as_tensor(solve.iterations).max()) for solve in solves]
+    return {"iterations": max(counts), "total_iterations": sum(counts),
+            "converged": all(bool(solve.converged) for solve in solves)}  # fmt: skip
 
 
 ROUTES = (OURS, UNROLLED, *GLOBAL)
 
 
-def adjoint_of(route: str, tolerance: float = TIGHT, solves: Solves | None = None) -> Any:
-    """The adjoint of a route; tolerance: of its linear solves, which `solves` collects."""
+def adjoint_of(route: str, tolerance: float = TIGHT, report: Callable[[Any], None] | None = None) -> Any:
+    """The adjoint of a route; tolerance: of its linear solves, of which each is reported."""
     if route in GLOBAL:
-        return dv.GlobalAdjoint(assembled=route == GLOBAL[0], tolerance=tolerance, on_failure="warn", report=solves)
+        return dv.GlobalAdjoint(assembled=route == GLOBAL[0], tolerance=tolerance, on_failure="warn", report=report)
     return dv.Unrolled() if route == UNROLLED else dv.ReverseSweep()
 
 
@@ -224,11 +216,11 @@ def measure(scene: Scene, sweeps: int) -> Row:
     row: Row = {"mesh": scene.name, "mu": c.mu, "lam": c.lam, "time_step": c.time_step, "steps": c.steps,
                 "sweeps": sweeps, "forward": 0.0, **residuals(scene, sweeps), "routes": {}}  # fmt: skip
     for route in ROUTES:
-        solves = Solves()
-        gradients[route] = got = result_of(scene, sweeps, adjoint_of(route, TIGHT, solves))
+        solves: list[Any] = []
+        gradients[route] = got = result_of(scene, sweeps, adjoint_of(route, TIGHT, solves.append))
         forward = verified_forward(got, expected, c.time_step, route)
         row["forward"] = max(row["forward"], forward)
-        row["routes"][route] = {"error": gradient_error(got, expected), "forward": forward, **solves.summary()}
+        row["routes"][route] = {"error": gradient_error(got, expected), "forward": forward, **summary(solves)}
     row["global_difference"] = gradient_error(*(gradients[route] for route in GLOBAL))
     return row
 

@@ -43,6 +43,11 @@ from diffvbd.testing import regime
 GRADIENTS = ("x", "v", "material")
 
 
+def steps_of(card: Card) -> int:
+    """Steps of one graph."""
+    return 2 if card.quick else 10
+
+
 def label(model: dv.Model, sweeps: int) -> str:
     return f"{model.num_vertices} v / {model.num_tets} t, K = {sweeps}, {str(model.dtype)[6:]}"
 
@@ -91,10 +96,9 @@ def steps(card: Card) -> list[Row]:
         model = model_of(dv.mesh.cube(n, split="five"), card)
         for material in ("scalar", "per tet"):
             scene = scene_of(model, material=material)
-            timed_parts(card, rows, {"material": material}, scene, 20, 2 if card.quick else 10, ("full", "compact"),
-                        targets)  # fmt: skip
+            timed_parts(card, rows, {"material": material}, scene, 20, steps_of(card), ("full", "compact"), targets)
     single = scene_of(model_of(dv.mesh.cube(4 if card.quick else 58, split="five"), card, torch.float32))
-    timed_parts(card, rows, {"material": "scalar"}, single, 20, 2 if card.quick else 10, (), (1.8, None))
+    timed_parts(card, rows, {"material": "scalar"}, single, 20, steps_of(card), (), (1.8, None))
     return rows
 
 
@@ -113,14 +117,14 @@ def cubes(card: Card) -> list[Row]:
     scene = scene_of(model, scenes, "per scene", noise=1e-5)
     for note, plain in (("", False), (", sweeps alone", True)):
         about = {"name": f"{scenes} scenes of {label(model, 5)}{note}", "material": "per scene"}
-        timed_parts(card, rows, about, replace(scene, plain=plain), 5, 2 if card.quick else 10, ("recompute",),
-                    (1.2, None), ("x", "v", "mu"))  # fmt: skip
+        timed_parts(card, rows, about, replace(scene, plain=plain), 5, steps_of(card), ("recompute",), (1.2, None),
+                    ("x", "v", "mu"))  # fmt: skip
     return rows
 
 
 def batches(card: Card, sweeps: int = 10) -> list[Row]:
     """Scenes of 1,331 vertices in one call; throughput and its share of the best of the series."""
-    model, count = model_of(dv.mesh.cube(3 if card.quick else 11, split="five"), card), 2 if card.quick else 10
+    model, count = model_of(dv.mesh.cube(3 if card.quick else 11, split="five"), card), steps_of(card)
     rows: list[Row] = []
     for scenes in (2, 4) if card.quick else (128, 256, 512, 1024, 2048, 4096, 8192):
 
@@ -153,11 +157,6 @@ def rollout_reverse(scene: Scene, sweeps: int, steps: int, tape: Any, every: Any
         return torch.autograd.grad((end.x[-1], end.v[-1]), wanted, (ones, ones))
 
     return work
-
-
-def room(card: Card) -> int:
-    """Bytes that a measurement may take."""
-    return int(0.5 * torch.cuda.get_device_properties(card.device).total_memory) if card.cuda else 2**30
 
 
 # --- sweeps x vertices ------------------------------------------------------------------------------------------------
@@ -193,12 +192,10 @@ def _grid_row(card: Card, mesh: dv.TetMesh, sweeps: int) -> Row:
         return {**row, "note": f"peak of {GRID_STEPS} steps not measured"}
     row["rollout_peak"] = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "auto", "auto"))
     predicted = dv.memory(model, dv.VBD(0.01, sweeps, tape="full"), steps=GRID_STEPS, checkpoint_every=None)
-    if predicted["total"] < room(card):
+    if predicted["total"] < int(0.5 * torch.cuda.get_device_properties(card.device).total_memory):
         own = card.allocated() - before - scene.bytes
-        peak = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None))
-        if peak is not None:
-            row["full_peak"] = peak + own
-            row["full_peak_bytes_per_vertex_sweep_step"] = (peak + own) / (size * GRID_STEPS)
+        row["full_peak"] = own + (card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None)) or 0)
+        row["full_peak_bytes_per_vertex_sweep_step"] = row["full_peak"] / (size * GRID_STEPS)
     return row
 
 
@@ -286,15 +283,8 @@ def _cover(card: Card) -> list[Row]:
     fall = cover_the_spot.Fall(settings, cover_the_spot.RADIUS,
                                cover_the_spot.QUICK if card.quick else cover_the_spot.FULL)  # fmt: skip
 
-    def forward() -> Tensor:
-        with torch.no_grad():
-            return fall.simulate()
-
-    def both() -> tuple[Tensor, ...]:
-        return torch.autograd.grad(fall.simulate().sum(), (fall.velocity, fall.offset))
-
     about = {"vertices": fall.model.num_vertices, "scenes": 1, "sweeps": fall.version.sweeps}
-    return _timed(card, about, fall.version.steps, forward, both, (0.25, 0.6))
+    return _timed(card, about, fall.version.steps, fall.simulate, (fall.velocity, fall.offset), (0.25, 0.6))
 
 
 def _grippers(card: Card, scenes: int) -> list[Row]:
@@ -315,32 +305,32 @@ def _grippers(card: Card, scenes: int) -> list[Row]:
 
     with torch.no_grad():
         x, v = moved(x, v, ends[:CLOSING])
+        moved(x, v, ends[CLOSING:])
     leaves = tuple(t.requires_grad_() for t in (x, v))
-
-    def forward() -> Tensor:
-        with torch.no_grad():
-            return moved(x, v, ends[CLOSING:])[0]
-
-    def both() -> tuple[Tensor, ...]:
-        return torch.autograd.grad(moved(x, v, ends[CLOSING:])[0].sum(), leaves)
-
-    forward()
     status = dv.contact.status(model)
     pairs = status.pairs / scenes
     dv.contact.reserve(model, math.ceil(SPARE * pairs))
     held_up = sum(status.cut) / (scenes * model.num_active)
     about = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": CLAMPED_SWEEPS, "pairs_per_scene": pairs,
              "held_up": held_up}  # fmt: skip
-    rows = _timed(card, about, CLAMPED_STEPS, forward, both, (None, None))
+    rows = _timed(card, about, CLAMPED_STEPS, lambda: moved(*leaves, ends[CLOSING:])[0], leaves, (None, None))
     for row, target in zip(rows, (1e5, 3.5e4), strict=True):
         row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
         row["target_rate"] = target if scenes >= 1024 else None
     return rows
 
 
-def _timed(card: Card, about: dict[str, Any], steps: int, forward: Any, both: Any,
+def _timed(card: Card, about: Row, steps: int, end: Callable[[], Tensor], leaves: tuple[Tensor, ...],
            targets: tuple[float | None, float | None]) -> list[Row]:  # fmt: skip
     """A row of the forward and one of forward and reverse, in milliseconds a step."""
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return end()
+
+    def both() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(end().sum(), leaves)
+
     rows: list[Row] = []
     for part, work, target in zip(PARTS, (forward, both), targets, strict=True):
         rows.append(about | {"part": part, **spans(card, work, steps, 3.0, 3, 5), "target_ms": target})

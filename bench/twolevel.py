@@ -21,7 +21,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.measure import Card, timed
-from bench.sweeps import MATERIAL, bar
+from bench.sweeps import MATERIAL, STEP, bar
 from bench.tables import Table
 from diffvbd.model.system import system_of
 
@@ -30,18 +30,17 @@ RELAXATION = 1.5  # with corrections
 
 @dataclass(frozen=True)
 class Scene:
+    """A body at rest."""
+
     name: str
     mesh: dv.TetMesh
     pinned: np.ndarray
     material: dict[str, Any]  # mu, lam [Pa]
-    time_step: float = 1 / 60
-    x: Tensor | None = None  # None: at rest
-    v: Tensor | None = None
     device: str = "cpu"
 
     def state(self) -> tuple[Tensor, Tensor]:
-        x = torch.from_numpy(self.mesh.points.copy()) if self.x is None else self.x
-        return x.to(self.device), (torch.zeros_like(x) if self.v is None else self.v).to(self.device)
+        x = torch.from_numpy(self.mesh.points.copy()).to(self.device)
+        return x, torch.zeros_like(x)
 
     @cached_property
     def model(self) -> dv.Model:
@@ -49,7 +48,7 @@ class Scene:
 
     def solver(self, sweeps: int = 1, subspace: Any = "coarse", relaxation: float = RELAXATION, start: Any = "auto"
                ) -> dv.VBD:  # fmt: skip
-        return dv.VBD(self.time_step, sweeps, subspace=subspace, relaxation=relaxation, start=start)
+        return dv.VBD(STEP, sweeps, subspace=subspace, relaxation=relaxation, start=start)
 
     def rolled(self, solver: dv.VBD, steps: int, save: Any = "all") -> dv.results.Trajectory:
         with torch.no_grad():
