@@ -306,14 +306,14 @@ def _grippers(card: Card, scenes: int) -> list[Row]:
     with torch.no_grad():
         x, v = moved(x, v, ends[:CLOSING])
         moved(x, v, ends[CLOSING:])
-    leaves = tuple(t.requires_grad_() for t in (x, v))
+    leaves = x.requires_grad_(), v.requires_grad_()
     status = dv.contact.status(model)
     pairs = status.pairs / scenes
     dv.contact.reserve(model, math.ceil(SPARE * pairs))
     held_up = sum(status.cut) / (scenes * model.num_active)
     about = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": CLAMPED_SWEEPS, "pairs_per_scene": pairs,
              "held_up": held_up}  # fmt: skip
-    rows = _timed(card, about, CLAMPED_STEPS, lambda: moved(*leaves, ends[CLOSING:])[0], leaves, (None, None))
+    rows = _timed(card, about, CLAMPED_STEPS, lambda: moved(x, v, ends[CLOSING:])[0], leaves, (None, None))
     for row, target in zip(rows, (1e5, 3.5e4), strict=True):
         row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
         row["target_rate"] = target if scenes >= 1024 else None

@@ -115,7 +115,7 @@ TASKS = {
 OURS, GLOBAL = "reverse sweep", ("global, assembled", "global, matrix-free")
 FULL, UNROLLED = "reverse sweep, full tape", "unrolled autograd"
 Results = dict[str, Any]
-Figure = Callable[[Results], Any]
+Figure = Callable[[Any], Any]  # of results or of a task's history
 Line = tuple[Any, ...]  # figure, paper, ours on the CPU and on a GPU
 
 

@@ -6,6 +6,7 @@ Stable Neo-Hookean tets, the log barrier and lagged friction are as docs/method.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +121,7 @@ class Body:
             whole = (vector * np.maximum(value, 0)[:, None]) @ vector.swapaxes(1, 2)
             block = whole.reshape(-1, 4, 3, 4, 3).swapaxes(2, 3)
         h2 = self.time_step**2
-        out = h2 * np.bincount(self.where, block.ravel(), self.size**2).reshape(self.size, self.size)
+        out: Any = h2 * np.bincount(self.where, block.ravel(), self.size**2).reshape(self.size, self.size)
         own = np.zeros((len(x), 3, 3))
         own[:, [0, 1, 2], [0, 1, 2]] = self.mass[:, None]
         own[:, 1, 1] += h2 * self.barrier(x)[2]
