@@ -123,7 +123,7 @@ def build(case: Case, device: str = "cpu") -> Scene:
 
 
 def summary(solves: list[Any]) -> Row:
-    """Of the linear solves of a backward: iterations of the longest and of all, and whether every one converged; nothing
+    """Of the linear solves of a backward: iterations of the longest and of all, and whether every one converged. Empty
     where none was made."""
     if not solves:
         return {}
