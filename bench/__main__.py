@@ -3,8 +3,7 @@
 A benchmark is a module with run(quick) that returns its results, or with GROUPS, functions of a Card by name. Its
 docstring and its TABLES say how the site shows them (`bench.tables`). DEVICE is where it measures without `--device`,
 THREADS how many torch uses. Results go to NAME.json, those on CUDA to NAME-cuda.json. Other names: list; all; `tasks`,
-inverse problems and their logs; `report`, what pages in the repository show of results; `gallery` and `screenshots`,
-which make pictures.
+inverse problems and their logs; `report`, what pages in the repository show of results.
 """
 
 from __future__ import annotations
@@ -22,11 +21,10 @@ from typing import Any
 import torch
 
 import bench
-from bench import common, tables
+from bench import common, report, tables, tasks
 from bench.measure import Card
 
 ASKED = ("bits",)  # only when asked for by name: what it writes is no result
-OTHERS = ("report", "tasks", "gallery", "screenshots")
 PAPER = ("exactness", "ablation", "cost", "fd")  # the paper's own measurements, in its order
 
 
@@ -36,20 +34,9 @@ def benchmarks() -> dict[str, ModuleType]:
     return {name: module for name, module in modules.items() if hasattr(module, "run") or hasattr(module, "GROUPS")}
 
 
-def other(options: argparse.Namespace) -> int:
-    """What is no benchmark."""
-    module = importlib.import_module(f"bench.{options.name}")
-    if options.name == "tasks":
-        return module.main(options.only, options.device or "cpu", options.seeds, options.options, options.out,
-                           options.quick)  # fmt: skip
-    given = {"report": (), "gallery": (options.only, options.out), "screenshots": (options.out,)}
-    return module.main(*given[options.name])
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description="Runs a benchmark and writes its results.")
-    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; list, tasks, report, gallery, "
-                                     "screenshots")  # fmt: skip
+    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; list, tasks, report")
     parser.add_argument("--quick", action="store_true", help="a few small cases; written only where --out says")
     parser.add_argument("--out", type=Path, help="folder of the results (default: bench/results)")
     parser.add_argument("--device", help="where to measure, if the benchmark lets one choose: cuda, cuda:1, cpu")
@@ -59,8 +46,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.device and torch.device(options.device).type == "cuda" and not torch.cuda.is_available():
         parser.error(f"--device: expected a device of this machine, got {options.device}, and torch sees no CUDA here")
-    if options.name in OTHERS:
-        return other(options)
+    if options.name == "report":
+        return report.main()
+    if options.name == "tasks":
+        return tasks.main(options.only, options.device or "cpu", options.seeds, options.options, options.out,
+                          options.quick)  # fmt: skip
     if (Path(__file__).parent / f"{options.name}.py").exists():
         known = {options.name: importlib.import_module(f"bench.{options.name}")}
     else:
@@ -75,22 +65,23 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--out: {options.name} is compared between two folders, and needs one")
     module = known.get(options.name)
     if module is None or not (hasattr(module, "run") or hasattr(module, "GROUPS")):
-        parser.error(
-            f"name: expected one of {', '.join(benchmarks())}, all, list, {', '.join(OTHERS)}, got {options.name}"
-        )
-    takes = {"device", "only"} if hasattr(module, "GROUPS") else set(inspect.signature(module.run).parameters)
-    if options.only is not None and "only" not in takes or options.device and not on_device(module, options.device):
+        parser.error(f"name: expected one of {', '.join(benchmarks())}, all, list, report, tasks, got {options.name}")
+    if options.only is not None and "only" not in takes(module) or not on_device(module, options.device):
         parser.error(f"--only, --device: {options.name} has no such option")
     run_one(options.name, module, options, options.only)
     return 0
 
 
-def on_device(module: ModuleType, device: str) -> bool:
+def takes(module: ModuleType) -> set[str]:
+    """The options that a benchmark has."""
+    if hasattr(module, "GROUPS"):
+        return {"only", "device"} if getattr(module, "ANYWHERE", False) else {"only"}
+    return set(inspect.signature(module.run).parameters)
+
+
+def on_device(module: ModuleType, device: str | None) -> bool:
     """Whether a benchmark can measure there."""
-    home = getattr(module, "DEVICE", "cpu")
-    takes = getattr(module, "ANYWHERE", False) if hasattr(module, "GROUPS") else "device" in inspect.signature(
-        module.run).parameters  # fmt: skip
-    return torch.device(device).type == home or takes
+    return not device or torch.device(device).type == getattr(module, "DEVICE", "cpu") or "device" in takes(module)
 
 
 def run_one(name: str, module: ModuleType, options: argparse.Namespace, only: str | None = None) -> None:
@@ -105,8 +96,8 @@ def run_one(name: str, module: ModuleType, options: argparse.Namespace, only: st
                                            out=out)  # fmt: skip
         else:
             given = {"device": options.device, "only": only, "out": out}
-            takes = inspect.signature(module.run).parameters
-            results = module.run(options.quick, **{k: v for k, v in given.items() if v is not None and k in takes})
+            known = takes(module)
+            results = module.run(options.quick, **{k: v for k, v in given.items() if v is not None and k in known})
     print(tables.text_of(name, results))
     if out is not None:
         suffix = common.device_suffix(device, home)

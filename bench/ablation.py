@@ -22,6 +22,8 @@ that they make (Hessian tangent).
 from __future__ import annotations
 
 import statistics
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import paper
+from bench.exactness import gradient_error, mesh_of, verified_forward
 from bench.tables import Table
 from diffvbd import testing
 from diffvbd.solvers import VertexBlock, vertex_block_descent
@@ -41,7 +44,6 @@ TWIST = 4.0  # [rad/s per m]
 NOISE = 1.0  # [m/s]
 GATE = 0.5  # least det F at which the gated adjoint keeps the tangent
 DRAWS = 5  # of the noise, the first of which is the scene of the main table
-GRADIENTS = ("grad_x", "grad_v")
 
 
 class NoSaturationJacobian(VertexBlock):
@@ -73,28 +75,25 @@ def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
     for size in testing.SIZES[:2] if quick else testing.SIZES:
         model, inputs = scene(size)
         for sweeps in SWEEPS[:1] if quick else SWEEPS:
-            expected = testing.reference_result(model, inputs, solver_of(sweeps))
-            found = {name: composed(model.to(device), inputs, sweeps, kind) for name, kind in VARIANTS.items()}
-            found[STEP] = package_step(model.to(device), inputs, sweeps)
-            rows += [{"variant": name, "vertices": model.num_vertices, "sweeps": sweeps, **errors(name, one, expected)}
-                     for name, one in found.items()]  # fmt: skip
+            steps = {name: composed(model.to(device), sweeps, kind) for name, kind in VARIANTS.items()}
+            steps[STEP] = partial(dv.step, model.to(device), solver=solver_of(sweeps))
+            found = errors(model, inputs, sweeps, steps, device)
+            rows += [{"variant": name, "vertices": model.num_vertices, "sweeps": sweeps, **row}
+                     for name, row in found.items()]  # fmt: skip
         meshes.append(described(model, inputs))
     return {"rows": rows, "meshes": meshes, "draws": [] if quick else draws(device)}
 
 
-def errors(name: str, found: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float]:
-    """Errors of the gradients and of the forward; another forward would make a comparison of gradients worthless."""
-    forward = forward_error(found, expected, TIME_STEP)
-    if forward > testing.tolerance("forward"):
-        raise RuntimeError(f"{name}: forward differs from the reference by {forward:.1e}")
-    return {"error": max(testing.relative_error(found[g], expected[g]) for g in GRADIENTS), "forward": forward}
-
-
-def forward_error(found: dict[str, Tensor], expected: dict[str, Tensor], time_step: float) -> float:
-    """Error of x and v at the end of a step, relative to the largest x and to that over h: v is a difference of
-    positions over h, and so is its error."""
-    apart = (found["v"] - expected["v"]).abs().max() * time_step / expected["x"].abs().max()
-    return max(testing.relative_error(found["x"], expected["x"]), float(apart))
+def errors(model: dv.Model, inputs: dict[str, Any], sweeps: int, steps: dict[str, Any], device: str
+           ) -> dict[str, dict[str, float]]:  # fmt: skip
+    """Errors of the gradients and of the forward of each kind of step; another forward would make a comparison of
+    gradients worthless."""
+    expected, rows = testing.reference_result(model, inputs, solver_of(sweeps)), {}
+    for name, step in steps.items():
+        found = testing.evaluate(step, testing.on_device(inputs, device), TIME_STEP)
+        forward = verified_forward(found, expected, TIME_STEP, name)
+        rows[name] = {"error": gradient_error(found, expected), "forward": forward}
+    return rows
 
 
 def draws(device: str) -> list[dict[str, Any]]:
@@ -104,10 +103,9 @@ def draws(device: str) -> list[dict[str, Any]]:
         found: dict[str, list[float]] = {name: [] for name in VARIANTS}
         for draw in range(DRAWS):
             model, inputs = scene(size, draw)
-            expected = testing.reference_result(model, inputs, solver_of(1))
-            for name, kind in VARIANTS.items():
-                one = composed(model.to(device), inputs, 1, kind)
-                found[name].append(errors(name, one, expected)["error"])
+            steps = {name: composed(model.to(device), 1, kind) for name, kind in VARIANTS.items()}
+            for name, row in errors(model, inputs, 1, steps, device).items():
+                found[name].append(row["error"])
         rows += [{"variant": name, "vertices": model.num_vertices, "median": statistics.median(values),
                   "least": min(values), "largest": max(values)} for name, values in found.items()]  # fmt: skip
     return rows
@@ -115,7 +113,7 @@ def draws(device: str) -> list[dict[str, Any]]:
 
 def scene(size: str, draw: int = 0) -> tuple[dv.Model, dict[str, Any]]:
     """Model and inputs of a step, on the CPU."""
-    model = dv.Model(mesh_of(size))
+    model = dv.Model(mesh_of("delaunay", size)[1])
     points = model.mesh.points
     x, height, z = (points - 0.5).T
     twist = TWIST * height * np.stack((z, 0 * z, -x))
@@ -128,14 +126,6 @@ def scene(size: str, draw: int = 0) -> tuple[dv.Model, dict[str, Any]]:
 def solver_of(sweeps: int) -> dv.VBD:
     """The paper's preset by the sweeps alone, as the composed variants have them."""
     return dv.VBD.paper(TIME_STEP, sweeps, subspace=None)
-
-
-def mesh_of(size: str) -> dv.TetMesh:
-    """The Delaunay mesh of a size or, without scipy, which makes it, a structured one of nearly as many vertices."""
-    try:
-        return dv.TetMesh(*testing.build_mesh("delaunay", size))
-    except ImportError:
-        return dv.TetMesh(*testing.build_mesh("structured", size))
 
 
 def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
@@ -155,8 +145,8 @@ def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def composed(model: dv.Model, inputs: dict[str, Any], sweeps: int, kind: type[VertexBlock]) -> dict[str, Tensor]:
-    """`testing.evaluate` of a step whose sweep is composed of one kind of update."""
+def composed(model: dv.Model, sweeps: int, kind: type[VertexBlock]) -> Callable[..., Any]:
+    """A step whose sweep is composed of one kind of update."""
     solver = vertex_block_descent(model, solver_of(sweeps), kind)
 
     def step(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor) -> Any:
@@ -164,16 +154,7 @@ def composed(model: dv.Model, inputs: dict[str, Any], sweeps: int, kind: type[Ve
         (end,) = solver((y,), (y, mu, lam, model.mass), sweeps=sweeps)
         return end, (end - x) / TIME_STEP
 
-    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device), TIME_STEP), "cpu")
-
-
-def package_step(model: dv.Model, inputs: dict[str, Any], sweeps: int) -> dict[str, Tensor]:
-    """`testing.evaluate` of the package's own step."""
-
-    def step(**given: Any) -> tuple[Tensor, Tensor]:
-        return dv.step(model, solver=solver_of(sweeps), **given)
-
-    return testing.on_device(testing.evaluate(step, testing.on_device(inputs, model.device), TIME_STEP), "cpu")
+    return step
 
 
 TABLES = (

@@ -126,9 +126,8 @@ def _body(rng: np.random.Generator) -> tuple[str, dv.TetMesh]:
     kind = ("beam", "sheet", "blob", "box")[rng.integers(4)]
     if kind == "beam":
         n = int(rng.integers(2, 4))
-        return kind, mesh.beam(
-            int(rng.integers(5, 12)), n, n, size=(float(rng.uniform(0.2, 0.8)), 0.1, 0.1), split="kuhn"
-        )
+        counts = int(rng.integers(5, 12)), n, n
+        return kind, mesh.beam(*counts, size=(float(rng.uniform(0.2, 0.8)), 0.1, 0.1), split="kuhn")
     if kind == "sheet":
         return kind, mesh.sheet(8, 8, (0.3, 0.3), float(rng.uniform(0.01, 0.04)))
     if kind == "blob":
@@ -191,12 +190,8 @@ SWEEPS: list[tuple[dict[str, Any], tuple[int, ...]]] = [
     ({"relaxation": 1.6}, (10, 20, 40)),
     ({"relaxation": 1.5, "subspace": "coarse"}, (2, 5, 8)),
 ]
-GRID = [
-    dv.VBD(1.0, k, integrator=scheme, **options)
-    for scheme in (dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2())
-    for options, counts in SWEEPS
-    for k in counts
-]
+GRID = [dv.VBD(1.0, k, integrator=scheme, **options) for scheme in (dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2())
+        for options, counts in SWEEPS for k in counts]  # fmt: skip
 
 
 # --- the promise ------------------------------------------------------------------------------------------------------

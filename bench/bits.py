@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from bench.measure import capture
 from diffvbd import testing
 from diffvbd._common.checks import input_name
 from diffvbd.solvers import XPBD, ProjectiveDynamics
@@ -149,12 +150,13 @@ def rollouts(device: str) -> dict[str, Callable[[], Values]]:
         out[f"contact: {name}, float32"] = partial(of_contact, name, device, torch.float32)
     for name in ("stacked", "obstacles", "thrown", "batched"):
         out[f"contact: {name}, coarse"] = partial(of_contact, name, device, torch.float64, SPACE)
-    if torch.device(device).type == "cuda":
-        out["captured"] = lambda: captured(bar())
-        out["captured, coarse"] = lambda: captured(bar(), **corrected)
-        out["captured, pairs"] = lambda: captured(three(energies=TOUCHING))
-        out["captured, pairs, coarse"] = lambda: captured(three(energies=TOUCHING), subspace=SPACE)
-    return out
+    on_cuda: dict[str, Callable[[], Values]] = {
+        "captured": lambda: captured(bar()),
+        "captured, coarse": lambda: captured(bar(), **corrected),
+        "captured, pairs": lambda: captured(three(energies=TOUCHING)),
+        "captured, pairs, coarse": lambda: captured(three(energies=TOUCHING), subspace=SPACE),
+    }
+    return out | on_cuda if torch.device(device).type == "cuda" else out
 
 
 def beam(device: str, **options: Any) -> dv.Model:
@@ -260,31 +262,18 @@ def of_contact(name: str, device: str, dtype: torch.dtype, subspace: Any = "rigi
 
 def captured(model: dv.Model, **options: Any) -> Values:
     """Of two steps whose forward and backward are one CUDA graph, replayed twice."""
-    inputs = inputs_of(model)
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-
-    def rolled(**given: Any) -> tuple[Tensor, Tensor]:
-        x, v = given.pop("x"), given.pop("v")
-        for _ in range(2):
-            x, v = dv.step(model, x, v, dv.VBD(STEP, 5, **options), **given)
-        return x, v
-
-    leaves = {name: t.clone().requires_grad_() for name, t in inputs.items()}
+    leaves = {name: t.clone().requires_grad_() for name, t in inputs_of(model).items()}
     weights = torch.cos(torch.arange(leaves["x"].numel(), device=model.device, dtype=model.dtype))
     weights = weights.reshape(leaves["x"].shape)
 
     def run() -> tuple[Tensor, ...]:
-        x, v = rolled(**leaves)
+        given = dict(leaves)
+        x, v = given.pop("x"), given.pop("v")
+        for _ in range(2):
+            x, v = dv.step(model, x, v, dv.VBD(STEP, 5, **options), **given)  # type: ignore[arg-type]
         return x, v, *torch.autograd.grad((weights * (x + 0.01 * v)).sum(), list(leaves.values()))
 
-    with torch.cuda.stream(side):
-        for _ in range(2):
-            run()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        found = run()
+    graph, found = capture(run)
     for _ in range(2):
         graph.replay()
     return dict(zip(("x", "v", *(f"grad_{name}" for name in leaves)), found, strict=True))

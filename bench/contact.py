@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from bench import measure
 from bench.measure import Card, kept_bytes, least
 from bench.tables import Table, times
 from diffvbd import mesh
@@ -52,13 +53,8 @@ def piles(count: int, n: int, close: int) -> dv.TetMesh:
     return mesh.replicate(box, np.array(offsets))
 
 
-def piled(tets: dv.TetMesh, card: Card, contact: bool, reach: float | None = None) -> dv.Model:
-    barrier = (dv.PairBarrier(kappa=100.0, dhat=DHAT, detections=DETECTIONS, reach=reach),) if contact else ()
-    return dv.Model(tets, energies=(dv.StableNeoHookean(), *barrier), device=card.device)
-
-
 def stepping(model: dv.Model, reverse: bool) -> Callable[[], Any]:
-    """A step from rest, or one and the gradient toward its state; as gpu_measure times it."""
+    """A step from rest, or one and the gradient toward its state."""
     x = model.rest_points.clone().requires_grad_(reverse)
     v = torch.zeros_like(x).requires_grad_(reverse)
     modulus = torch.full((), MODULUS, dtype=x.dtype, device=x.device)
@@ -78,24 +74,20 @@ def milliseconds(card: Card, work: Callable[[], Any]) -> float:
     if replayed is not None:
         return 1e3 * replayed
 
-    def span() -> float:
-        start = time.process_time()
-        work()
-        return time.process_time() - start
-
-    return 1e3 * least(span, 3 if card.quick else 7)
+    return 1e3 * least(lambda: measure.timed(work, time.process_time), 3 if card.quick else 7)
 
 
 def measured(card: Card, count: int, n: int, close: int, reach: float | None = None) -> dict[str, Any]:
     """Times of piles with contact and without."""
     tets = piles(count, n, close)
     row: dict[str, Any] = {"bodies": 2 * count, "vertices": tets.num_vertices, "reach": reach}
-    for key, contact in (("without", False), ("with", True)):
-        model = piled(tets, card, contact, reach)
+    barrier = dv.PairBarrier(kappa=100.0, dhat=DHAT, detections=DETECTIONS, reach=reach)
+    for key, pairs in (("without", ()), ("with", (barrier,))):
+        model = dv.Model(tets, energies=(dv.StableNeoHookean(), *pairs), device=card.device)
         row[f"{key}_ms"] = milliseconds(card, stepping(model, False))
         row[f"{key}_reverse_ms"] = milliseconds(card, stepping(model, True))
         row[f"{key}_kept"] = kept_bytes(stepping(model.to("cpu"), True))
-        if contact:
+        if pairs:
             stepping(model, False)()  # raises where a captured one would have returned NaN
             row["pairs"] = dv.contact.status(model).pairs
         card.tidy()
@@ -114,11 +106,9 @@ def _bodies(rng: np.random.Generator) -> list[dv.TetMesh]:
         lambda: mesh.sheet(5, 5, (0.14, 0.14), float(rng.uniform(0.01, 0.03))),
         lambda: mesh.blob(4, int(rng.integers(100)), 0.06),
     )
-    places = [np.array([i, j, 0.0]) for j in range(2) for i in range(2)]
     chosen = [kinds[rng.integers(3)]() for _ in range(int(rng.integers(2, 5)))]
-    return [
-        turned(body, rng).translate(0.24 * place + [0, 0.15, 0]) for body, place in zip(chosen, places, strict=False)
-    ]
+    places = [0.24 * np.array([k % 2, k // 2, 0.0]) + [0, 0.15, 0] for k in range(len(chosen))]
+    return [turned(body, rng).translate(place) for body, place in zip(chosen, places, strict=True)]
 
 
 def _drawn(seed: int, device: str, batch: int) -> dict[str, Any]:
@@ -180,19 +170,16 @@ def cost(card: Card) -> list[dict[str, Any]]:
 
 
 def fuzz(card: Card) -> list[dict[str, Any]]:
-    batch, out = 10 if card.quick else BATCH, []
+    batch = 10 if card.quick else BATCH
     keys = ("scenes", "crossings", "nonfinite", "scene_steps", "cut")
-    rows: dict[float, list[float]] = {speed: [0, 0, 0, 0, 0.0] for speed in SPEEDS}
+    rows = {speed: {"speed": speed, **dict.fromkeys(keys, 0)} for speed in SPEEDS}
     for seed in range(3 if card.quick else SCENES // BATCH):
         crossings, lost, steps, cut = _crossings(seed, str(card.device), batch)
         row = rows[SPEEDS[seed % len(SPEEDS)]]
-        for k, more in enumerate((batch, crossings, lost, batch * steps, batch * cut)):
-            row[k] += more
+        for key, more in zip(keys, (batch, crossings, lost, batch * steps, batch * cut), strict=True):
+            row[key] += more
         print(f"{seed}: {crossings}, {lost}", file=sys.stderr, flush=True)
-    for speed, row in rows.items():
-        row[-1] /= max(row[0], 1)
-        out.append({"speed": speed, **dict(zip(keys, row, strict=True))})
-    return out
+    return [row | {"cut": row["cut"] / max(row["scenes"], 1)} for row in rows.values()]
 
 
 THREADS, ANYWHERE = 1, True  # most scenes are too small for two threads

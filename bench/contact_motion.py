@@ -1,12 +1,11 @@
-"""Motion beside contact, where the answer is known: closed forms, the same scene without contact, or steps of h / 50.
+"""Motion beside contact, where the answer is known: closed forms, the same scene without contact, or converged steps.
 
-Braking of a thin sheet and of a spin, sliding and its derivative, bodies at rest, stacks, grips, crowds and impacts.
+Braking of a thin sheet and of a spin, sliding and its derivative, bodies at rest, stacks and impacts.
 Each row has a value, its reference, a target and whether it is met. "cut" is the mean share of vertices that
 pairs have held up; crossings are edges through triangles and vertices below a plane, counted at ten times of each
 rollout; "not finite" are coordinates and velocities. Milliseconds are of a step without its backward, one thread.
 
-Each function measures one quantity. `barrier` are arguments of PairBarrier that replace the scene's own, as
-{"detections": 10}. Lengths in m, angles in rad, all bodies of 1000 kg/m^3 unless said otherwise.
+Each function measures one quantity. Lengths in m, angles in rad, all bodies of 1000 kg/m^3.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -47,8 +46,7 @@ class Scene:
     x: Tensor | None = None  # [V, 3] [m]; None: at rest
     v: Tensor | None = None  # [V, 3] [m/s]; None: still
     gravity: Any = (0.0, -GRAVITY, 0.0)  # [3] or [V, 3] [m/s^2]
-    walls: tuple[tuple[Sequence[float], float], ...] = ()  # normal and height [m] of planes that nothing may be below
-    prescribed: Callable[[int], Tensor] | None = None  # pinned vertices at the end of step n
+    floor: bool = False  # whether nothing may be below y = 0
     options: dict[str, Any] = field(default_factory=dict)  # of the solver
 
     def state(self) -> tuple[Tensor, Tensor]:
@@ -60,16 +58,10 @@ class Scene:
         solver = dv.VBD(self.time_step, self.sweeps, **self.options)
         return {"solver": solver, "mu": self.mu, "lam": 2 * self.mu, "gravity": self.gravity, **more}
 
-    def finer(self, parts: int) -> Scene:
-        return replace(self, time_step=self.time_step / parts)
-
     def wrong(self, x: Tensor) -> int:
-        """Edges through triangles, and vertices below a wall."""
+        """Edges through triangles, and vertices below the floor."""
         found = 0 if self.model.contact is None else len(dv.contact.intersections(self.model, x))
-        for normal, height in self.walls:
-            n = torch.tensor(normal).to(x)
-            found += int((x @ n < height * n.norm()).sum())
-        return found
+        return found + int((x[:, 1] < 0).sum()) * self.floor
 
 
 @dataclass
@@ -85,14 +77,10 @@ class Course:
     nonfinite: int = 0
     error: str | None = None
 
-    def center(self, at: int = -1, rows: slice = slice(None)) -> Array:
-        """Center of mass of some vertices [m]."""
+    def mean(self, values: Tensor, rows: slice = slice(None)) -> Array:
+        """Of a state's positions or velocities, over the mass of some vertices."""
         mass = self.scene.model.mass.cpu()[rows, None]
-        return ((mass * self.x[at][rows]).sum(0) / mass.sum()).numpy()
-
-    def velocity(self, at: int = -1, rows: slice = slice(None)) -> Array:
-        mass = self.scene.model.mass.cpu()[rows, None]
-        return ((mass * self.v[at][rows]).sum(0) / mass.sum()).numpy()
+        return ((mass * values[rows]).sum(0) / mass.sum()).numpy()
 
 
 @torch.no_grad()
@@ -104,10 +92,9 @@ def march(scene: Scene, steps: int, keep: int = 1, until: Callable[[Tensor], boo
     course.crossings = scene.wrong(x)
     look = max(1, steps // LOOKS)
     for n in range(1, steps + 1):
-        extra = {} if scene.prescribed is None else {"prescribed": scene.prescribed(n)}
         began = time.perf_counter()
         try:
-            x, v = dv.step(scene.model, x, v, **scene.arguments(**extra))
+            x, v = dv.step(scene.model, x, v, **scene.arguments())
         except (RuntimeError, ValueError) as failure:
             course.error = f"step {n}: {str(failure)[:160]}"
             break
@@ -130,105 +117,93 @@ def march(scene: Scene, steps: int, keep: int = 1, until: Callable[[Tensor], boo
 
 
 @torch.no_grad()
-def settled(scene: Scene, steps: int = 40, gravity: Any = None) -> Scene:
+def settled(scene: Scene) -> Scene:
     """The scene, come to rest without friction: long steps of many sweeps, each begun without velocity."""
     x, still = scene.state()[0], torch.zeros_like(scene.state()[0])
     free = {} if scene.model.friction is None else {"friction": 0.0}
     long = replace(scene, time_step=0.05, sweeps=100).arguments(**free)
-    long |= {} if gravity is None else {"gravity": gravity}
-    for _ in range(steps):
+    for _ in range(40):
         x, _ = dv.step(scene.model, x, still, **long)
     return replace(scene, x=x)
 
 
-def within(value: float, goal: float, share: float) -> bool:
-    return abs(value - goal) <= share * abs(goal)
-
-
-def row(course: Course | Iterable[Course], quantity: str, case: str, value: float | None, goal: float | None,
-        target: str, met: bool | None, note: str = "") -> Row:  # fmt: skip
+def row(course: Course, quantity: str, case: str, value: float, goal: float, target: str, met: bool | None,
+        note: str = "") -> Row:  # fmt: skip
     """A row of the tables: a quantity, what it should be, and how the rollouts went that it was taken from.
 
     goal: the reference; met: None where there is no target. An unfinished rollout meets none.
     """
-    courses = [course] if isinstance(course, Course) else list(course)
-    first = courses[0].scene
-    seconds = [s for c in courses for s in c.seconds]
-    cut = [s for c in courses for s in c.cut]
-    bad = any(c.error or c.nonfinite for c in courses)
-    value = math.nan if value is None else float(value)
+    value, scene = float(value), course.scene
+    sound = not course.error and not course.nonfinite and math.isfinite(value)
     return {
-        "quantity": quantity, "case": case, "sweeps": first.sweeps, "time_step": first.time_step,
-        "vertices": first.model.num_vertices, "value": value, "reference": goal, "target": target,
-        "met": None if met is None else bool(met) and not bad and math.isfinite(value),
-        "cut": float(np.mean(cut)) if cut else None, "crossings": sum(c.crossings for c in courses),
-        "nonfinite": sum(c.nonfinite for c in courses),
-        "ms_per_step": 1e3 * float(np.median(seconds)) if seconds else None,
-        "error": next((c.error for c in courses if c.error), None), "note": note,
+        "quantity": quantity, "case": case, "sweeps": scene.sweeps, "time_step": scene.time_step,
+        "vertices": scene.model.num_vertices, "value": value, "reference": goal, "target": target,
+        "met": None if met is None else bool(met and sound),
+        "cut": float(np.mean(course.cut)) if course.cut else None, "crossings": course.crossings,
+        "nonfinite": course.nonfinite,
+        "ms_per_step": 1e3 * float(np.median(course.seconds)) if course.seconds else None,
+        "error": course.error, "note": note,
     }  # fmt: skip
 
 
-Options = dict[str, Any] | None
 SURFACES = ("FloorBarrier", "Plane", "Obstacle, large triangles", "Obstacle, small triangles")
 BLOCK = (0.2, 0.1, 0.2)  # [m], 18 vertices
+BOX = (0.2, 0.2, 0.2)  # [m]
 MODULUS = 1e5  # [Pa], mu of all bodies here; lam is twice that
 KAPPA, DHAT = 1e4, 0.01
+ELASTIC = dv.StableNeoHookean()
 
 
-def pairs(barrier: Options = None, **own: Any) -> dv.PairBarrier:
-    arguments: dict[str, Any] = {"kappa": KAPPA, "dhat": DHAT, **own, **(barrier or {})}
-    return dv.PairBarrier(**arguments)
+def pairs(dhat: float = DHAT, **options: Any) -> dv.PairBarrier:
+    return dv.PairBarrier(kappa=KAPPA, dhat=dhat, **options)
 
 
 def relative(course: Course, quantity: str, case: str, value: float, goal: float, share: float, note: str = "") -> Row:
     """A row whose value has to be within a share of the reference."""
-    return row(course, quantity, case, value, goal, f"within {100 * share:g} %", within(value, goal, share), note)
+    met = abs(value - goal) <= share * abs(goal)
+    return row(course, quantity, case, value, goal, f"within {100 * share:g} %", met, note)
 
 
 # --- sheet and spin: neighbors that must not brake --------------------------------------------------------------------
 
 
-def hanging(contact: bool, sweeps: int, time_step: float, device: str, barrier: Options) -> Scene:
+def hanging(contact: bool, sweeps: int, device: str) -> Scene:
     body = mesh.sheet(9, 9, (0.4, 0.4), 0.005)
-    energies = (dv.StableNeoHookean(), pairs(barrier, dhat=0.02)) if contact else (dv.StableNeoHookean(),)
+    energies = (ELASTIC, pairs(0.02)) if contact else (ELASTIC,)
     # "auto" beside pairs: without them it would be "inertia", where so few sweeps hardly move a thin sheet
     model = dv.Model(body, pinned=torch.from_numpy(body.points[:, 0] < 1e-9), energies=energies, device=device)
-    return Scene(model, MODULUS, time_step, sweeps, options={"start": "predictor"})
+    return Scene(model, MODULUS, 1 / 60, sweeps, options={"start": "predictor"})
 
 
-def sheet(sweeps: int = 20, time_step: float = 1 / 60, device: str = "cpu", barrier: Options = None) -> Row:
+def sheet(sweeps: int = 20, device: str = "cpu") -> Row:
     """Height of the free edge of a sheet of 0.4 m x 0.4 m x 5 mm, pinned at one edge, 0.25 s after it was let go."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # tets this thin want more sweeps; both ways have the same
-        ways = [march(hanging(on, sweeps, time_step, device, barrier), round(0.25 / time_step)) for on in (False, True)]
+        ways = [march(hanging(on, sweeps, device), 15) for on in (False, True)]
     free, own = (float(way.x[-1][way.x[0][:, 0] > 0.4 - 1e-9, 1].mean()) for way in ways)
     return relative(ways[1], "tip y [m]", "self-contact", own, free, 0.03)
 
 
-def spun(gap: float | None, sweeps: int, time_step: float, device: str, barrier: Options, rate: float = 20.0) -> Scene:
+def spun(gap: float | None, device: str, rate: float = 20.0) -> Scene:
     """Two cubes of 0.2 m, the upper one spinning about y, without gravity; one alone and without contact if no gap."""
     box = mesh.box(3, 0.2, split="kuhn").translate((-0.1, 0, -0.1))
     body = box if gap is None else mesh.join([box, box.translate((0, -0.2 - gap, 0))])
-    energies = (dv.StableNeoHookean(),) if gap is None else (dv.StableNeoHookean(), pairs(barrier))
-    model = dv.Model(body, energies=energies, device=device)
+    model = dv.Model(body, energies=(ELASTIC,) if gap is None else (ELASTIC, pairs()), device=device)
     x = model.rest_points
     v = torch.zeros_like(x)
     v[:27] = rate * torch.linalg.cross(torch.tensor(UP).to(x).expand(27, 3), x[:27])
-    return Scene(model, MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0), options={"subspace": None})
+    return Scene(model, MODULUS, 1 / 100, 20, v=v, gravity=(0.0, 0.0, 0.0), options={"subspace": None})
 
 
-def spin(gap: float = 0.002, steps: int = 1, sweeps: int = 20, time_step: float = 1 / 100, device: str = "cpu",
-         barrier: Options = None) -> Row:  # fmt: skip
+def spin(gap: float = 0.002, steps: int = 1, device: str = "cpu") -> Row:
     """Share of its angular momentum that a cube keeps at 20 rad/s beside another that rests."""
 
     def kept(course: Course) -> float:
         mass = course.scene.model.mass.cpu()[:27, None]
-        both = [torch.linalg.cross(x[:27], mass * v[:27]).sum(0)[1] for x, v in ((course.x[k], course.v[k])
-                for k in (0, -1))]  # fmt: skip
+        both = [torch.linalg.cross(course.x[k][:27], mass * course.v[k][:27]).sum(0)[1] for k in (0, -1)]
         return float(both[1] / both[0])
 
-    alone = march(spun(None, sweeps, time_step, device, None), steps)
-    course = march(spun(gap, sweeps, time_step, device, barrier), steps)
+    alone, course = (march(spun(g, device), steps) for g in (None, gap))
     value = kept(course)
     case = f"{1e3 * gap:g} mm from another body, {steps} steps"
     return row(course, "share of spin kept", case, value, kept(alone), ">= 0.97" if steps == 1 else "",
@@ -238,40 +213,31 @@ def spin(gap: float = 0.002, steps: int = 1, sweeps: int = 20, time_step: float 
 # --- sliding ----------------------------------------------------------------------------------------------------------
 
 
-def flat(length: float, width: float, cells: int, turn: Array) -> Obstacle:
-    """A flat surface through the origin from x = -1 on, in squares of two triangles, then turned."""
+def flat(length: float, width: float, cells: int) -> Obstacle:
+    """A flat surface through the origin from x = -1 on, in squares of two triangles."""
     rows = max(1, round(cells * width / length))
     x, z = np.linspace(-1, length - 1, cells + 1), np.linspace(-width / 2, width / 2, rows + 1)
     points = np.stack([*np.meshgrid(x, [0.0], z, indexing="ij")], -1).reshape(-1, 3)
     i, k = (a.ravel() for a in np.meshgrid(np.arange(cells), np.arange(rows), indexing="ij"))
     a = i * (rows + 1) + k
     b, c, d = a + 1, a + rows + 1, a + rows + 2
-    return Obstacle(points @ turn.T, np.concatenate([np.stack([a, b, c], -1), np.stack([c, b, d], -1)]))
+    return Obstacle(points, np.concatenate([np.stack([a, b, c], -1), np.stack([c, b, d], -1)]))
 
 
-def block(surface: str, friction: float, sweeps: int, time_step: float, device: str, barrier: Options, *,
-          angle: float = 0.0, room: float = 24.0) -> Scene:  # fmt: skip
-    """A block at rest on a surface through the origin that rises toward -x by an angle [rad]."""
-    turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
-    normal = tuple(float(n) for n in turn[:, 1])
+def block(surface: str, friction: float, sweeps: int, device: str, room: float = 24.0) -> Scene:
+    """A block at rest on y = 0, a surface as long as `room` [m]."""
+    under: dict[str, Callable[[], Any]] = {
+        "Plane": lambda: Plane((0.0, 0.0, 0.0), UP),
+        SURFACES[2]: lambda: flat(room, room, 1),
+        SURFACES[3]: lambda: flat(room, 0.83, round(room / 0.2)),
+    }
+    if surface not in SURFACES:
+        raise ValueError(f"surface: expected one of {', '.join(SURFACES)}, got {surface}")
     body = mesh.box((3, 2, 3), BLOCK, split="kuhn").translate((-0.1, 0.5 * DHAT, -0.1))
-    body = dv.TetMesh(body.points @ turn.T, body.tets)
-    rubbing = (dv.Friction(friction),) if friction else ()
-    if surface == "FloorBarrier":
-        model = dv.Model(body, energies=(dv.StableNeoHookean(), dv.FloorBarrier(0.0, normal, kappa=KAPPA, dhat=DHAT),
-                                         *rubbing), device=device)  # fmt: skip
-    else:
-        if surface == "Plane":
-            under = Plane((0.0, 0.0, 0.0), normal)
-        elif surface in SURFACES:
-            large = surface == SURFACES[2]
-            under = flat(room, room if large else 0.83, 1 if large else round(room / 0.2), turn)
-        else:
-            raise ValueError(f"surface: expected one of {', '.join(SURFACES)}, got {surface}")
-        model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier, self_contact=False), *rubbing),
-                         colliders=(under,), device=device)  # fmt: skip
-    scene = Scene(model, MODULUS, time_step, sweeps, walls=((normal, 0.0),))
-    return settled(scene, gravity=[-GRAVITY * math.cos(angle) * n for n in normal])
+    barrier = pairs(self_contact=False) if surface in under else dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT)
+    model = dv.Model(body, energies=(ELASTIC, barrier, dv.Friction(friction)), device=device,
+                     colliders=(under[surface](),) if surface in under else ())  # fmt: skip
+    return settled(Scene(model, MODULUS, 1 / 60, sweeps, floor=True))
 
 
 def thrown(scene: Scene, speed: float) -> Scene:
@@ -280,29 +246,29 @@ def thrown(scene: Scene, speed: float) -> Scene:
     return replace(scene, v=v)
 
 
-def slide(surface: str = "Plane", sweeps: int = 20, speed: float = 10.0, friction: float = 0.5,
-          time_step: float = 1 / 60, device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
+def slide(surface: str = "Plane", sweeps: int = 20, speed: float = 10.0, device: str = "cpu") -> Row:
     """How far a block slides until its center moves slower than 1 cm/s, at most in twice the time that is right.
 
     The reference is v^2 / (2 mu_f g) less the v h / 2 by which steps of backward Euler fall short of it.
     """
+    friction = 0.5
     right = speed / (friction * GRAVITY)
-    scene = block(surface, friction, sweeps, time_step, device, barrier, room=2 * speed * right + 4)
-    course = march(thrown(scene, speed), round(2 * right / time_step), until=lambda v: float(v[:, 0].mean()) < 0.01)
-    travel = course.center()[0] - course.center(0)[0]
-    return relative(course, "stopping distance [m]", surface, travel, 0.5 * speed * (right - time_step), 0.03,
-                    f"moved for {time_step * (len(course.x) - 1):.3g} s, {right:.3g} s is right")  # fmt: skip
+    scene = block(surface, friction, sweeps, device, room=2 * speed * right + 4)
+    h = scene.time_step
+    course = march(thrown(scene, speed), round(2 * right / h), until=lambda v: float(v[:, 0].mean()) < 0.01)
+    travel = (course.mean(course.x[-1]) - course.mean(course.x[0]))[0]
+    return relative(course, "stopping distance [m]", surface, travel, 0.5 * speed * (right - h), 0.03,
+                    f"moved for {h * (len(course.x) - 1):.3g} s, {right:.3g} s is right")  # fmt: skip
 
 
-def slide_gradient(surface: str = "Plane", speed: float = 1.0, sweeps: int = 20, friction: float = 0.1,
-                   time_step: float = 1 / 60, device: str = "cpu", barrier: Options = None) -> list[Row]:  # fmt: skip
+def slide_gradient(surface: str = "Plane", speed: float = 1.0, device: str = "cpu") -> list[Row]:
     """The derivative of the way that a block slides in 0.1 s, which is 0.1 s at each speed, and Newton's method.
 
     Newton starts at 0.7 times the speed and looks for the one that goes as far as Coulomb's law says of `speed`.
     """
-    scene = block(surface, friction, sweeps, time_step, device, barrier)
-    steps = round(0.1 / time_step)
-    start = scene.state()[0]
+    friction = 0.1
+    scene = block(surface, friction, 20, device)
+    steps, start = 6, scene.state()[0]
 
     def travel(v0: float) -> tuple[float, float]:
         leaf = torch.tensor(v0, dtype=start.dtype, device=start.device, requires_grad=True)
@@ -314,9 +280,9 @@ def slide_gradient(surface: str = "Plane", speed: float = 1.0, sweeps: int = 20,
         return float(way.detach()), float(slope)
 
     course = march(thrown(scene, speed), steps)
-    time = steps * time_step
+    time = steps * scene.time_step
     # backward Euler's own sum, whose derivative is the time, too
-    goal = speed * time - 0.5 * friction * GRAVITY * time * (time + time_step)
+    goal = speed * time - 0.5 * friction * GRAVITY * time * (time + scene.time_step)
     way, slope = travel(speed)
     guess, off, taken = 0.7 * speed, math.inf, 0
     while taken < 8:
@@ -336,14 +302,10 @@ def slide_gradient(surface: str = "Plane", speed: float = 1.0, sweeps: int = 20,
     ]  # fmt: skip
 
 
-BOX = (0.2, 0.2, 0.2)  # [m]
-
-
 # --- at rest ----------------------------------------------------------------------------------------------------------
 
 
-def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, device: str = "cpu",
-         barrier: Options = None) -> Row:  # fmt: skip
+def rest(support: str = "Plane", sweeps: int = 5, device: str = "cpu") -> Row:
     """Sideways speed of a block without friction, 0.4 s after it lay at rest.
 
     It lies on a Plane, on a wider "box" with a pinned bottom, or on a "pinned box" of which nothing moves. Dented
@@ -359,13 +321,13 @@ def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, de
         lower = mesh.box((4, 3, 4), (0.3, 0.2, 0.3), split="kuhn").translate((-0.053, -0.2, -0.047))
         body, colliders = mesh.join([body, lower]), ()
         pinned = torch.from_numpy(body.points[:, 1] < (1e-9 if support == "pinned box" else -0.2 + 1e-9))
-    energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False))
-    model = dv.Model(body, pinned=pinned, energies=energies, colliders=colliders, device=device)
-    scene = settled(Scene(model, MODULUS, time_step, sweeps))
+    model = dv.Model(body, pinned=pinned, energies=(ELASTIC, pairs(self_contact=False)), colliders=colliders,
+                     device=device)  # fmt: skip
+    scene = settled(Scene(model, MODULUS, 1 / 100, sweeps))
 
     def speed(scene: Scene) -> tuple[float, Course]:
-        course = march(scene, round(0.4 / time_step))
-        return float(np.hypot(*course.velocity(rows=slice(size))[[0, 2]])), course
+        course = march(scene, 40)
+        return float(np.hypot(*course.mean(course.v[-1], slice(size))[[0, 2]])), course
 
     value, course = speed(scene)
     goal = 0.0 if support == "Plane" else speed(replace(scene, sweeps=400))[0]
@@ -373,28 +335,20 @@ def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, de
                abs(value - goal) <= 1e-3)  # fmt: skip
 
 
-def tower(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float = 0.5, time_step: float = 1 / 100,
-          device: str = "cpu", barrier: Options = None) -> Scene:  # fmt: skip
-    """Boxes 0.2 m wide on each other, not quite in line."""
+def stack(count: int = 5, sweeps: int = 5, height: float = 0.2, seconds: float = 2.0, device: str = "cpu") -> Row:
+    """Sway of boxes 0.2 m wide on each other, not quite in line: the largest distance that a box's center has moved
+    sideways in 2 s.
+
+    They stand if no box sways by half its width, and the top one keeps 0.9 of its height. A column of this
+    material buckles under its weight from about 1.1 m on, so ten boxes have to be flat.
+    """
     box, gap, rng = mesh.box(2, (BOX[0], height, BOX[2]), split="kuhn"), 0.3 * DHAT, np.random.default_rng(0)
     lifts = gap + np.arange(count) * (height + gap)
     body = mesh.join([box.translate((x, y, z)) for y, (x, z) in zip(lifts, rng.uniform(-0.005, 0.005, (count, 2)),
                       strict=True)])  # fmt: skip
-    energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False), dv.Friction(friction),
-                dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT))  # fmt: skip
-    model = dv.Model(body, energies=energies, device=device)
-    return Scene(model, 2 * MODULUS, time_step, sweeps, walls=((UP, 0.0),))
-
-
-def stack(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float = 0.5, seconds: float = 2.0,
-          time_step: float = 1 / 100, device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
-    """Sway of a :func:`tower`: the largest distance that a box's center has moved sideways in 2 s.
-
-    It stands if no box sways by half its width, and the top one keeps 0.9 of its height. A column of this
-    material buckles under its weight from about 1.1 m on, so ten boxes have to be flat.
-    """
-    scene = tower(count, sweeps, height, friction, time_step, device, barrier)
-    course = march(scene, round(seconds / time_step), keep=5)
+    floor = dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT)
+    model = dv.Model(body, energies=(ELASTIC, pairs(self_contact=False), dv.Friction(0.5), floor), device=device)
+    course = march(Scene(model, 2 * MODULUS, 1 / 100, sweeps, floor=True), round(100 * seconds), keep=5)
     centers = torch.stack([x.reshape(count, -1, 3).mean(1) for x in course.x])
     sway = float((centers - centers[0])[..., [0, 2]].norm(dim=-1).max())
     top = float(centers[-1, -1, 1] / centers[0, -1, 1])
@@ -403,30 +357,23 @@ def stack(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float 
                f"top at {top:.3f} of its height")  # fmt: skip
 
 
-# --- many bodies ------------------------------------------------------------------------------------------------------
+# --- impact -----------------------------------------------------------------------------------------------------------
 
 
-# --- flight and impact ------------------------------------------------------------------------------------------------
-
-
-def struck(count: int, gap: float, speed: float, time_step: float = 1 / 100, sweeps: int = 10, device: str = "cpu",
-           barrier: Options = None) -> Row:  # fmt: skip
+def struck(count: int, gap: float, speed: float, time_step: float = 1 / 100, device: str = "cpu") -> Row:
     """The most momentum that a row of cubes of 0.1 m gains or loses in a step, of which the first is thrown at the
     others: over what it had."""
     cube = mesh.cube(2, size=0.1, split="kuhn")
     body = mesh.join([cube.translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)])
-    model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier, dhat=1e-3)), device=device)
+    model = dv.Model(body, energies=(ELASTIC, pairs(1e-3)), device=device)
     v = torch.zeros_like(model.rest_points)
     v[: cube.num_vertices, 0] = speed
-    scene = Scene(model, 2 * MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0))
+    scene = Scene(model, 2 * MODULUS, time_step, 10, v=v, gravity=(0.0, 0.0, 0.0))
     course = march(scene, max(10, round(count * gap / speed / time_step) + 10))
-    momentum = [float(course.velocity(n)[0]) for n in range(len(course.v))]
+    momentum = [float(course.mean(v)[0]) for v in course.v]
     worst = max(abs(p - momentum[0]) for p in momentum) / momentum[0]
     case = f"{count} cubes, {1e3 * gap:g} mm apart, {speed:g} m/s"
     return row(course, "momentum lost", case, worst, 0.0, "<= 0.01", worst <= 0.01)
-
-
-# --- grip -------------------------------------------------------------------------------------------------------------
 
 
 SPEEDS = (0.2, 1.0, 3.0, 10.0)  # [m/s]

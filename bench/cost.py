@@ -30,20 +30,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench import paper
-from bench.exactness import (
-    PRESET,
-    UNROLLED,
-    Case,
-    Row,
-    Scene,
-    Solves,
-    build,
-    expected_of,
-    gradient_error,
-    result_of,
-    verify_forward,
-)
+from bench import exactness, paper
+from bench.exactness import GLOBAL, PRESET, UNROLLED, Case, Row, Scene, build, expected_of
 from bench.measure import Card, kept_bytes, peak_memory, reset_peak_memory
 from bench.tables import Table, times
 from diffvbd import testing
@@ -51,15 +39,7 @@ from diffvbd import testing
 SWEEPS = 20
 TOLERANCE = 1e-10  # of the linear solves: the default, and about the errors in the paper's table
 FULL, COMPACT = "reverse sweep, full tape", "reverse sweep, compact tape"
-GLOBAL = ("global, assembled", "global, matrix-free")
 ROUTES = (FULL, COMPACT, UNROLLED, *GLOBAL)
-
-
-def route(name: str, solves: Solves | None = None) -> Any:
-    """The adjoint of a route."""
-    if name in GLOBAL:
-        return dv.GlobalAdjoint(assembled=name == GLOBAL[0], tolerance=TOLERANCE, on_failure="warn", report=solves)
-    return dv.Unrolled() if name == UNROLLED else dv.ReverseSweep()
 
 
 def preset(quick: bool) -> Case:
@@ -75,7 +55,7 @@ class Task:
         self.leaves = tuple(t.clone().requires_grad_() for t in (scene.x, scene.v, *moduli))
         self.options = scene.options(SWEEPS)
         self.options["solver"] = replace(self.options["solver"], tape="compact" if name == COMPACT else "full")
-        self.scene, self.adjoint = scene, route(name)
+        self.scene, self.adjoint = scene, exactness.adjoint_of(name, TOLERANCE)
         rng = testing.generator("loss")
         self.weights = [torch.from_numpy(rng.standard_normal(tuple(like.shape))).to(like) for _ in range(2)]
         self.weights[1] *= case.time_step
@@ -112,9 +92,6 @@ def _growth_here(name: str, quick: bool) -> int:
         before = reset_peak_memory()
         task.both()
     return peak_memory() - before
-
-
-# --- where the time of a global route goes ----------------------------------------------------------------------------
 
 
 PRESET_MODULUS = 1e4  # [Pa]
@@ -164,10 +141,10 @@ def interleaved(card: Card, tasks: dict[Any, Task], rounds: dict[Any, int]) -> d
 
 def accuracy(scene: Scene, name: str, expected: dict[str, Tensor]) -> Row:
     """Gradient error of a route, its forward verified first, and what its linear solves took."""
-    solves = Solves()
-    got = result_of(scene, SWEEPS, route(name, solves))
-    forward = verify_forward(scene, got, expected, name)
-    return {"error": gradient_error(got, expected), "forward": forward, **solves.summary()}
+    solves: list[Any] = []
+    got = exactness.result_of(scene, SWEEPS, exactness.adjoint_of(name, TOLERANCE, solves.append))
+    forward = exactness.verified_forward(got, expected, scene.case.time_step, name)
+    return {"error": exactness.gradient_error(got, expected), "forward": forward, **exactness.summary(solves)}
 
 
 def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:

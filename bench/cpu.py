@@ -18,6 +18,8 @@ import diffvbd as dv
 from bench.measure import Card, kept_bytes, least
 from bench.tables import Table, times
 
+MATERIAL = ("state", "material")  # of which gradients are wanted
+
 
 def clamped_cube(n: int, dtype: torch.dtype = torch.float64, energies: tuple = ()) -> tuple[dv.Model, Tensor]:
     """The peers' scene (docs/performance.md): unit cube, five tets a cell, one face pinned; slightly off rest."""
@@ -51,34 +53,33 @@ def time_step(
 
 def throughput(n: int, sweeps: int, quick: bool) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
-    repetitions = 3 if quick else 15
-    material = ("state", "material")
     rows = []
-    targets = {
-        ("forward", torch.float64): 8.0,
-        ("forward", torch.float32): 12.0,
-        ("reverse, full tape", torch.float64): 3.5,
+    targets = {("forward", torch.float64): 8.0, ("forward", torch.float32): 12.0,
+               ("reverse, full tape", torch.float64): 3.5}  # fmt: skip
+    parts = {
+        "forward": ((), "full", 0),
+        "forward with full tape": (MATERIAL, "full", 0),
+        "reverse, full tape": (MATERIAL, "full", 1),
+        "reverse, compact tape": (MATERIAL, "compact", 1),
     }
     for dtype in (torch.float64, torch.float32):
         model, x = clamped_cube(n, dtype)
-        updates = model.num_active * sweeps / 1e6
-        seconds = {
-            "forward": least(lambda m=model, a=x: time_step(m, a, sweeps, ())[0], repetitions),
-            "forward with full tape": least(lambda m=model, a=x: time_step(m, a, sweeps, material)[0], repetitions),
-            "reverse, full tape": least(lambda m=model, a=x: time_step(m, a, sweeps, material)[1], repetitions),
-            "reverse, compact tape": least(
-                lambda m=model, a=x: time_step(m, a, sweeps, material, "compact")[1], repetitions
-            ),
-        }
-        for name, value in seconds.items():
-            rows.append({
-                "name": f"{model.num_vertices} v / {model.num_tets} t, K = {sweeps}, 1 core, {name}, {str(dtype)[6:]}",
-                "unit": "M vertex updates/s",
-                "value": updates / value,
-                "target": targets.get((name, dtype)),
-                "ms_per_step": value * 1e3,
-            })  # fmt: skip
+        for part, (wants, tape, at) in parts.items():
+            seconds = least_part(model, x, sweeps, wants, tape, at, 3 if quick else 15)
+            name = f"{model.num_vertices} v / {model.num_tets} t, K = {sweeps}, 1 core, {part}, {str(dtype)[6:]}"
+            rows.append(speed(name, model.num_active * sweeps, seconds, targets.get((part, dtype))))
     return rows
+
+
+def least_part(model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...], tape: str, at: int, repetitions: int
+               ) -> float:  # fmt: skip
+    """Least seconds of the forward (at 0) or the backward (1) of a step."""
+    return least(lambda: time_step(model, x, sweeps, wants, tape)[at], repetitions)
+
+
+def speed(name: str, updates: int, seconds: float, target: float | None) -> dict[str, Any]:
+    return {"name": name, "unit": "M vertex updates/s", "value": updates / 1e6 / seconds, "target": target,
+            "ms_per_step": seconds * 1e3}  # fmt: skip
 
 
 def scaling(n: int, threads: int, quick: bool) -> list[dict[str, Any]]:
@@ -87,15 +88,13 @@ def scaling(n: int, threads: int, quick: bool) -> list[dict[str, Any]]:
     seconds: dict[int, tuple[float, float]] = {}
     for count in (1, threads):
         torch.set_num_threads(count)
-        forward = least(lambda: time_step(model, x, sweeps, ())[0], repetitions)
-        reverse = least(lambda: time_step(model, x, sweeps, ("state", "material"))[1], repetitions)
-        seconds[count] = (forward, reverse)
+        seconds[count] = (least_part(model, x, sweeps, (), "full", 0, repetitions),
+                          least_part(model, x, sweeps, MATERIAL, "full", 1, repetitions))  # fmt: skip
     rows = []
     for i, part in enumerate(("forward", "reverse, full tape")):
         one, all_ = seconds[1][i], seconds[threads][i]
         name = f"{model.num_vertices} v, K = {sweeps}, float64, {part}"
-        rows.append({"name": f"{name}, one core", "unit": "M vertex updates/s", "target": None,
-                     "value": model.num_active * sweeps / one / 1e6, "ms_per_step": one * 1e3})  # fmt: skip
+        rows.append(speed(f"{name}, one core", model.num_active * sweeps, one, None))
         rows.append({"name": f"{name}, {threads} cores against one", "unit": "times faster", "target": 1.7,
                      "value": one / all_, "ms_per_step": all_ * 1e3})  # fmt: skip
     return rows
@@ -105,24 +104,21 @@ def building(quick: bool) -> list[dict[str, Any]]:
     rows = []
     for n in (10, 20) if quick else (15, 30, 59):
         mesh = dv.mesh.beam(n, n, n, size=(1.0, 1.0, 1.0), split="kuhn")
-        start = time.perf_counter()
-        model = dv.Model(mesh)
-        rows.append(_built(f"grid, {mesh.num_vertices} v / {mesh.num_tets} t", model, start, 2.0 if n == 59 else None))
+        rows.append(_built(f"grid, {mesh.num_vertices} v / {mesh.num_tets} t", mesh, 2.0 if n == 59 else None))
     cube = dv.mesh.cube(size=0.003, split="kuhn")
     for count in (1_000,) if quick else (10_000, 100_000, 1_000_000):
         i = np.arange(count)
         offsets = np.stack([i % 100, i // 100 % 100, i // 10_000], -1) * 0.01
         mesh = dv.mesh.replicate(cube, offsets)
-        start = time.perf_counter()
-        model = dv.Model(mesh)
-        rows.append(
-            _built(f"{count} cubes joined, {mesh.num_vertices} v", model, start, 40.0 if count == 1_000_000 else None)
-        )
-        del mesh, model
+        target = 40.0 if count == 1_000_000 else None
+        rows.append(_built(f"{count} cubes joined, {mesh.num_vertices} v", mesh, target))
+        del mesh
     return rows
 
 
-def _built(name: str, model: dv.Model, start: float, target: float | None) -> dict[str, Any]:
+def _built(name: str, mesh: dv.TetMesh, target: float | None) -> dict[str, Any]:
+    start = time.perf_counter()
+    model = dv.Model(mesh)
     seconds = time.perf_counter() - start
     return {"name": f"Model of {name}", "unit": "s", "value": seconds, "target": target, "colors": model.num_colors}
 
@@ -140,19 +136,16 @@ def requirements(n: int, quick: bool) -> list[dict[str, Any]]:
         ("elastic, saturated and relaxed", (), {"saturation": 0.1, "relaxation": 1.5}),
     ):
         model, x = clamped_cube(n, energies=energies)
-        for wants in ((), ("state",), ("state", "material"), ("state", "material", "rest")):
+        for wants in ((), ("state",), MATERIAL, (*MATERIAL, "rest")):
 
             def once(m: Any = model, a: Any = x, w: Any = wants, o: Any = options) -> tuple[float, float]:
                 return time_step(m, a, sweeps, w, **o)
 
             forward = least(lambda once=once: once()[0], repetitions)
             backward = least(lambda once=once: once()[1], repetitions) if wants else None
-            rows.append({
-                "name": f"{label}, gradients: {' + '.join(wants) or 'none'}",
-                "forward_ms": forward * 1e3,
-                "backward_ms": None if backward is None else backward * 1e3,
-                "kept_bytes": kept_bytes(once),
-            })  # fmt: skip
+            rows.append({"name": f"{label}, gradients: {' + '.join(wants) or 'none'}", "forward_ms": forward * 1e3,
+                         "backward_ms": None if backward is None else backward * 1e3,
+                         "kept_bytes": kept_bytes(once)})  # fmt: skip
     return rows
 
 

@@ -24,7 +24,7 @@ is the disagreement of two references that sum in another order.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,21 +88,20 @@ class Scene:
         return Scene(self.case, self.model.to(device), self.x.to(device), self.v.to(device))
 
 
-def load_mesh(case: Case) -> tuple[Case, dv.TetMesh]:
-    """The mesh of a case. Without scipy, which Delaunay meshes need, a structured one, and the case says so."""
-    if case.kind == "file":
-        return case, dv.mesh.load(RABBIT)
+def mesh_of(kind: str, size: str) -> tuple[str, dv.TetMesh]:
+    """Kind and mesh. Without scipy, which Delaunay meshes need, a structured one of nearly as many vertices."""
+    if kind == "file":
+        return kind, dv.mesh.load(RABBIT)
     try:
-        return case, dv.TetMesh(*testing.build_mesh(case.kind, case.size))
+        return kind, dv.TetMesh(*testing.build_mesh(kind, size))
     except ImportError:
-        case = replace(case, kind="structured")
-        return case, dv.TetMesh(*testing.build_mesh(case.kind, case.size))
+        return "structured", dv.TetMesh(*testing.build_mesh("structured", size))
 
 
 def build(case: Case, device: str = "cpu") -> Scene:
     """The scene of a case, its initial state a deterministic function of the case."""
-    case, mesh = load_mesh(case)
-    points = mesh.points
+    kind, mesh = mesh_of(case.kind, case.size)
+    case, points = replace(case, kind=kind), mesh.points
     low, high = points.min(0), points.max(0)
     along = (points[:, 0] - low[0]) / (high[0] - low[0])
     pinned = along < 0.1
@@ -123,46 +122,24 @@ def build(case: Case, device: str = "cpu") -> Scene:
 # --- routes -----------------------------------------------------------------------------------------------------------
 
 
-class Solves:
-    """Collects the reports of a GlobalAdjoint: one linear solve for each step of a backward."""
-
-    def __init__(self) -> None:
-        self.reports: list[Any] = []
-
-    def __call__(self, report: Any) -> None:
-        self.reports.append(report)
-
-    def summary(self) -> Row:
-        """Iterations of the longest solve and of all, and whether every one converged; nothing where none was made."""
-        if not self.reports:
-            return {}
-        counts = [int(torch.as_tensor(report.iterations).max()) for report in self.reports]
-        return {"iterations": max(counts), "total_iterations": sum(counts),
-                "converged": all(bool(report.converged) for report in self.reports)}  # fmt: skip
+def summary(solves: list[Any]) -> Row:
+    """Of the linear solves of a backward: iterations of the longest and of all, and whether every one converged. Empty
+    where none was made."""
+    if not solves:
+        return {}
+    counts = [int(torch.as_tensor(solve.iterations).max()) for solve in solves]
+    return {"iterations": max(counts), "total_iterations": sum(counts),
+            "converged": all(bool(solve.converged) for solve in solves)}  # fmt: skip
 
 
-def global_route(assembled: bool) -> Callable[[Solves | None, float], Any]:
-    return lambda solves, tolerance: dv.GlobalAdjoint(assembled=assembled, tolerance=tolerance, on_failure="warn",
-                                                      report=solves)  # fmt: skip
+ROUTES = (OURS, UNROLLED, *GLOBAL)
 
 
-# Adjoints by the collector of their solves and the tolerance of these
-ROUTES: dict[str, Callable[[Solves | None, float], Any]] = {
-    OURS: lambda solves, tolerance: dv.ReverseSweep(),
-    UNROLLED: lambda solves, tolerance: dv.Unrolled(),
-    GLOBAL[0]: global_route(True),
-    GLOBAL[1]: global_route(False),
-}
-
-
-def end_of(scene: Scene, sweeps: int, adjoint: Any, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions and velocities at the end of the scene's rollout, every tape kept."""
-    done = dv.rollout(scene.model, x, v, adjoint=adjoint, checkpoint_every=None, save="last", **scene.options(sweeps))
-    return done.x[-1], done.v[-1]
-
-
-def inputs_of(scene: Scene) -> dict[str, Any]:
-    return {"x": scene.x, "v": scene.v}
+def adjoint_of(route: str, tolerance: float = TIGHT, report: Callable[[Any], None] | None = None) -> Any:
+    """The adjoint of a route; tolerance: of its linear solves, of which each is reported."""
+    if route in GLOBAL:
+        return dv.GlobalAdjoint(assembled=route == GLOBAL[0], tolerance=tolerance, on_failure="warn", report=report)
+    return dv.Unrolled() if route == UNROLLED else dv.ReverseSweep()
 
 
 def expected_of(scene: Scene, sweeps: int) -> dict[str, Tensor]:
@@ -174,18 +151,20 @@ def expected_of(scene: Scene, sweeps: int) -> dict[str, Tensor]:
         done = reference.rollout(here.model, x, v, **options)
         return done.x[-1], done.v[-1]
 
-    return testing.evaluate(run, inputs_of(here), here.case.time_step)
+    return testing.evaluate(run, {"x": here.x, "v": here.v}, here.case.time_step)
 
 
 def result_of(scene: Scene, sweeps: int, adjoint: Any) -> dict[str, Tensor]:
-    """End state and gradients by one of the package's routes."""
+    """End state and gradients by one of the package's routes, every tape kept."""
 
     def run(x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        return end_of(scene, sweeps, adjoint, x, v)
+        done = dv.rollout(scene.model, x, v, adjoint=adjoint, checkpoint_every=None, save="last",
+                          **scene.options(sweeps))  # fmt: skip
+        return done.x[-1], done.v[-1]
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a solve that fails is a column of the tables
-        return testing.evaluate(run, inputs_of(scene), scene.case.time_step)
+        return testing.evaluate(run, {"x": scene.x, "v": scene.v}, scene.case.time_step)
 
 
 def forward_error(got: dict[str, Tensor], expected: dict[str, Tensor], time_step: float) -> float:
@@ -199,9 +178,9 @@ def gradient_error(got: dict[str, Tensor], expected: dict[str, Tensor]) -> float
     return max(testing.relative_error(got[f"grad_{name}"], expected[f"grad_{name}"]) for name in "xv")
 
 
-def verify_forward(scene: Scene, got: dict[str, Tensor], expected: dict[str, Tensor], route: str) -> float:
+def verified_forward(got: dict[str, Tensor], expected: dict[str, Tensor], time_step: float, route: str) -> float:
     """The error of a route's end state; a gradient of another forward would measure nothing, so that raises."""
-    error, most = forward_error(got, expected, scene.case.time_step), testing.tolerance("forward")
+    error, most = forward_error(got, expected, time_step), testing.tolerance("forward")
     if not error <= most:
         raise RuntimeError(f"{route}: expected the reference's end state within {most:g}, got an error of {error:.2g}")
     return error
@@ -223,40 +202,33 @@ def residuals(scene: Scene, sweeps: int) -> Row:
     for x, v, end in zip(done.x[:-1], done.v[:-1], done.x[1:], strict=True):
         y = x + c.time_step * v + c.time_step**2 * options["gravity"]
         y = torch.where(free[:, None], y, x)
-        left, first = (
-            float(reference.residual(here.model, at, y, c.mu, c.lam, c.time_step)[free].norm()) for at in (end, y)
-        )
+        left, first = (float(reference.residual(here.model, at, y, c.mu, c.lam, c.time_step)[free].norm())
+                       for at in (end, y))  # fmt: skip
         norms.append(left)
         shares.append(left / first)
     return {"residual": max(norms), "relative_residual": max(shares)}
 
 
-def measure(scene: Scene, sweeps: int, routes: Iterable[str] = ROUTES, tolerance: float = TIGHT) -> Row:
+def measure(scene: Scene, sweeps: int) -> Row:
     """Forward and gradient error of each route on one scene, and how far the two global ones disagree."""
     expected, gradients = expected_of(scene, sweeps), {}
     c = scene.case
     row: Row = {"mesh": scene.name, "mu": c.mu, "lam": c.lam, "time_step": c.time_step, "steps": c.steps,
                 "sweeps": sweeps, "forward": 0.0, **residuals(scene, sweeps), "routes": {}}  # fmt: skip
-    for route in routes:
-        solves = Solves()
-        gradients[route] = got = result_of(scene, sweeps, ROUTES[route](solves, tolerance))
-        forward = verify_forward(scene, got, expected, route)
+    for route in ROUTES:
+        solves: list[Any] = []
+        gradients[route] = got = result_of(scene, sweeps, adjoint_of(route, TIGHT, solves.append))
+        forward = verified_forward(got, expected, c.time_step, route)
         row["forward"] = max(row["forward"], forward)
-        row["routes"][route] = {"error": gradient_error(got, expected), "forward": forward, **solves.summary()}
-    if all(route in gradients for route in GLOBAL):
-        row["global_difference"] = gradient_error(*(gradients[route] for route in GLOBAL))
+        row["routes"][route] = {"error": gradient_error(got, expected), "forward": forward, **summary(solves)}
+    row["global_difference"] = gradient_error(*(gradients[route] for route in GLOBAL))
     return row
 
 
 def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
-    return {
-        "scenes": {
-            name: [measure(build(case, device), k) for k in SWEEPS]
-            for name, case in (("preset", PRESET), ("soft", SOFT))
-        },
-        "meshes": meshes(quick, device),
-        "axes": axes(quick, device),
-    }
+    cases = {"preset": PRESET, "soft": SOFT}
+    scenes = {name: [measure(build(case, device), k) for k in SWEEPS] for name, case in cases.items()}
+    return {"scenes": scenes, "meshes": meshes(quick, device), "axes": axes(quick, device)}
 
 
 def meshes(quick: bool, device: str) -> list[Row]:
@@ -294,8 +266,9 @@ def _worst_over_sweeps(scene: Scene, quick: bool) -> Row:
     found = []
     for k in SWEEPS[:1] if quick else SWEEPS:
         expected = expected_of(scene, k)
-        got, other = (result_of(scene, k, adjoint) for adjoint in (dv.ReverseSweep(), dv.Unrolled()))
-        forward = max(verify_forward(scene, g, expected, r) for g, r in ((got, OURS), (other, UNROLLED)))
+        got, other = (result_of(scene, k, adjoint_of(route)) for route in (OURS, UNROLLED))
+        h = scene.case.time_step
+        forward = max(verified_forward(g, expected, h, r) for g, r in ((got, OURS), (other, UNROLLED)))
         here = scene.to("cpu")
         options = here.options(k)
         inputs = {"x": here.x, "v": here.v, **{name: options[name] for name in ("mu", "lam", "gravity")}}

@@ -18,7 +18,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -77,71 +77,55 @@ class Extreme:
         return self.block == "exact" and not self.floor
 
 
-def _materials() -> list[Extreme]:
+def _materials() -> Iterator[Extreme]:
     """All decades of mu, lam / mu and h; moduli stay below 1e12 Pa."""
-    out = []
-    for mu, ratio, h in itertools.product(
-        [1e-2, 1.0, 1e2, 1e4, 1e6, 1e8, 1e10, 1e12], [0, 1, 1e3, 1e6], [1e-6, 1e-3, 1 / 60, 1]
-    ):
+    decades, ratios, times = (1e-2, 1.0, 1e2, 1e4, 1e6, 1e8, 1e10, 1e12), (0, 1, 1e3, 1e6), (1e-6, 1e-3, 1 / 60, 1)
+    for mu, ratio, h in itertools.product(decades, ratios, times):
         if mu * ratio <= 1e12:
             quick = mu in (1e-2, 1e6, 1e12) and ratio in (0, 1e6, 1) and h in (1e-6, 1)
             name = f"mu {mu:g}, lam/mu {ratio:g}, h {h:.3g}"
-            out.append(Extreme("mu, lam, lam/mu, h", name, mu=mu, lam=mu * ratio, time_step=h, quick=quick))
-    zero = [(0.0, 1e-2), (0.0, 1e12), (0.0, 0.0), (1e5, -1e5), (1e5, -0.6e5)]
-    return out + [Extreme("mu = 0, lam < 0", f"mu {m:g}, lam {la:g}", mu=m, lam=la, quick=la <= 0) for m, la in zero]
+            yield Extreme("mu, lam, lam/mu, h", name, mu=mu, lam=mu * ratio, time_step=h, quick=quick)
+    for mu, lam in ((0.0, 1e-2), (0.0, 1e12), (0.0, 0.0), (1e5, -1e5), (1e5, -0.6e5)):
+        yield Extreme("mu = 0, lam < 0", f"mu {mu:g}, lam {lam:g}", mu=mu, lam=lam, quick=lam <= 0)
 
 
-def _cases() -> list[Extreme]:
-    out = _materials()
+SAFE: dict[str, Any] = {"saturation": 0.1, "regularization": 1e-6}
 
-    def add(axis: str, name: str, **options: Any) -> None:
-        out.append(Extreme(axis, name, **options))
 
+def _cases() -> Iterator[Extreme]:
+    yield from _materials()
     for c in (1e2, 1e4, 1e6):
-        add("stiffness contrast", f"{c:g}", contrast=c, mu=1e3, lam=1e3, quick=c == 1e6)
-        add("stiffness contrast", f"{c:g}, K = 50", contrast=c, mu=1e3, lam=1e3, sweeps=50)
-    for size in (1e-6, 1e-3, 1e3, 1e4):
-        for density in (1e-3, 1e5):
-            name = f"{size:g} m, {density:g} kg/m^3"
-            add("size, density", name, size=size, density=density, quick=size in (1e-6, 1e4))
-            add("size, density", f"{name}, paper preset", size=size, density=density, block="paper", saturation=0.1,
-                regularization=1e-6)  # fmt: skip
+        yield (soft := Extreme("stiffness contrast", f"{c:g}", contrast=c, mu=1e3, lam=1e3, quick=c == 1e6))
+        yield replace(soft, name=f"{c:g}, K = 50", sweeps=50, quick=False)
+    for size, density in itertools.product((1e-6, 1e-3, 1e3, 1e4), (1e-3, 1e5)):
+        name = f"{size:g} m, {density:g} kg/m^3"
+        yield Extreme("size, density", name, size=size, density=density, quick=size in (1e-6, 1e4))
+        yield Extreme("size, density", f"{name}, paper preset", size=size, density=density, block="paper", **SAFE)
     for m in (1e2, 1e4, 1e8):
-        add("mass ratio", f"{m:g}", mass_contrast=m, density=1e-3, quick=m == 1e8)
-        add("mass ratio", f"{m:g}, soft", mass_contrast=m, density=1e-3, mu=10, lam=10)
+        yield Extreme("mass ratio", f"{m:g}", mass_contrast=m, density=1e-3, quick=m == 1e8)
+        yield Extreme("mass ratio", f"{m:g}, soft", mass_contrast=m, density=1e-3, mu=10, lam=10)
     for thin in (1e-3, 1e-6, 1e-9):
-        add("slivers", f"layer of {thin:g}", mesh="layer", sliver=thin, quick=thin == 1e-6)
-        add("slivers", f"flat tet of {thin:g}", mesh="sliver", sliver=thin, pinned=False, quick=thin == 1e-6)
+        yield Extreme("slivers", f"layer of {thin:g}", mesh="layer", sliver=thin, quick=thin == 1e-6)
+        yield Extreme("slivers", f"flat tet of {thin:g}", mesh="sliver", sliver=thin, pinned=False, quick=thin == 1e-6)
     for state in ("mirrored", "flat", "line", "point", "half", "scattered"):
-        for block in ("exact", "paper"):
-            safe = {"saturation": 0.1, "regularization": 1e-6} if block == "paper" else {}
-            add("inverted, collapsed", f"{state}, {block}", state=state, block=block, quick=block == "exact", **safe)
-        add("inverted, collapsed", f"{state}, free", state=state, pinned=False, sweeps=20)
-    for stretch in (10.0, 1e2, 1e3, 1e4, 1e5, 1e6):
-        for k in (1, 20):
-            add("huge strain", f"{stretch:g}, K = {k}", state="far scattered", stretch=stretch, sweeps=k, pinned=False)
+        yield Extreme("inverted, collapsed", f"{state}, exact", state=state, quick=True)
+        yield Extreme("inverted, collapsed", f"{state}, paper", state=state, block="paper", **SAFE)
+        yield Extreme("inverted, collapsed", f"{state}, free", state=state, pinned=False, sweeps=20)
+    for far, k in itertools.product((10.0, 1e2, 1e3, 1e4, 1e5, 1e6), (1, 20)):
+        yield Extreme("huge strain", f"{far:g}, K = {k}", state="far scattered", stretch=far, sweeps=k, pinned=False)
     for k in (0, 1, 20, 100, 1000):
-        add("sweeps", f"K = {k}", sweeps=k, cells=1 if k == 1000 else 2, mu=1e7, lam=1e7, quick=k <= 20)
-    for omega in (0.1, 1.5, 1.7, 1.9, 1.99):
-        for state in ("jitter", "mirrored", "scattered"):
-            add("relaxation", f"{omega}, {state}", relaxation=omega, state=state, sweeps=10, quick=omega == 1.9)
+        yield Extreme("sweeps", f"K = {k}", sweeps=k, cells=1 if k == 1000 else 2, mu=1e7, lam=1e7, quick=k <= 20)
+    for omega, state in itertools.product((0.1, 1.5, 1.7, 1.9, 1.99), ("jitter", "mirrored", "scattered")):
+        yield Extreme("relaxation", f"{omega}, {state}", relaxation=omega, state=state, sweeps=10, quick=omega == 1.9)
     for speed in (1.0, 1e2, 1e4):
-        add(
-            "floor",
-            f"fall at {speed:g} m/s",
-            floor=True,
-            pinned=False,
-            speed=speed,
-            state="falling",
-            quick=speed == 1e4,
-        )
-        add("floor", f"fall at {speed:g} m/s, 4 steps", floor=True, pinned=False, speed=speed, state="falling", steps=4)
+        falling = Extreme("floor", f"fall at {speed:g} m/s", floor=True, pinned=False, speed=speed, state="falling")
+        yield replace(falling, quick=speed == 1e4)
+        yield replace(falling, name=f"{falling.name}, 4 steps", steps=4)
     for k, n in ((1, 20), (5, 4)):
-        add("steps", f"{n} steps, K = {k}", sweeps=k, steps=n, quick=n == 4)
-    return out
+        yield Extreme("steps", f"{n} steps, K = {k}", sweeps=k, steps=n, quick=n == 4)
 
 
-CASES: list[Extreme] = _cases()
+CASES = list(_cases())
 
 
 @dataclass(frozen=True)
@@ -175,13 +159,9 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
     energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
     if case.floor:
         energies += (dv.FloorBarrier(height=-0.05 * case.size, kappa=1e4, dhat=0.04 * case.size, damping=10.0),)
-    model = dv.Model(
-        mesh,
-        density=torch.where(half, case.density * case.mass_contrast, case.density).to(torch.float64),
-        pinned=mesh.points[:, 0] < 1e-9 * case.size if case.pinned else None,
-        energies=energies,
-    )
-    stiff = torch.where(half, case.contrast, 1.0).to(torch.float64)
+    model = dv.Model(mesh, density=of_halves(half, case.density, case.mass_contrast), energies=energies,
+                     pinned=mesh.points[:, 0] < 1e-9 * case.size if case.pinned else None)  # fmt: skip
+    stiff = of_halves(half, 1.0, case.contrast)
     noise = torch.from_numpy(rng.uniform(-1, 1, (2, *mesh.points.shape)))
     x = _state(case, points, noise[0])
     v = case.size * case.speed * noise[1]
@@ -192,6 +172,11 @@ def build(case: Extreme) -> tuple[dv.Model, dict[str, Any]]:
                               "rest_points": points, "force": 0.1 * model.mass[:, None] * noise[1],
                               "gravity": torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)}  # fmt: skip
     return model, inputs
+
+
+def of_halves(half: Tensor, value: float, contrast: float) -> Tensor:
+    """A value of each tet, of one half of the body so many times as large."""
+    return torch.where(half, value * contrast, value).to(torch.float64)
 
 
 def _mesh(case: Extreme) -> tuple[np.ndarray, np.ndarray]:
@@ -208,8 +193,7 @@ def _mesh(case: Extreme) -> tuple[np.ndarray, np.ndarray]:
 def _state(case: Extreme, points: Tensor, noise: Tensor) -> Tensor:
     cell = case.size / case.cells
     x = points + case.jitter * cell * noise * (case.sliver if case.mesh != "cube" else 1.0)
-    along_x = torch.tensor([1.0, 0.0, 0.0], dtype=points.dtype)
-    along_y = torch.tensor([0.0, 1.0, 0.0], dtype=points.dtype)
+    along_x, along_y, _ = torch.eye(3, dtype=points.dtype)
     return {
         "jitter": x,
         "falling": x,
@@ -306,37 +290,34 @@ def _rounding_scale(model: dv.Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tens
 
 def check_rollout(case: Rollout) -> dict[str, Any]:
     mesh = dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
-    energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
-    if case.floor:
-        energies += (dv.FloorBarrier(height=-0.2, kappa=1e4, damping=1.0),)
+    floor = (dv.FloorBarrier(height=-0.2, kappa=1e4, damping=1.0),) if case.floor else ()
     make = dv.VBD.paper if case.block == "paper" else dv.VBD
     solver = make(1 / 60, case.sweeps, relaxation=case.relaxation)
     pinned = None if case.floor else mesh.points[:, 0] < 1e-9
-    model = dv.Model(mesh, pinned=pinned, energies=energies)
+    model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(), *floor))
     x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
     weights = torch.from_numpy(testing.generator("rollout").standard_normal(tuple(x.shape)))
     lowest: list[float] = []
 
-    def loss(scale: Tensor, steps: int = case.steps) -> Tensor:
-        trajectory = dv.rollout(model, x, v, solver, steps=steps, mu=1e5 * scale, lam=1.5e5 * scale, save="last")
+    def loss(scale: Tensor) -> Tensor:
+        trajectory = dv.rollout(model, x, v, solver, steps=case.steps, mu=1e5 * scale, lam=1.5e5 * scale, save="last")
         lowest.append(float(trajectory.x[-1][:, 1].detach().min()))
         return (weights * trajectory.x[-1]).sum()
 
     scale = torch.ones((), dtype=torch.float64, requires_grad=True)
     value = loss(scale)
     (gradient,) = torch.autograd.grad(value, scale)
-    differences = []
+    off = difference_error(loss, scale, float(gradient), (1e-3, 1e-4, 1e-5))
+    finite = bool(torch.isfinite(value)) and bool(torch.isfinite(gradient))
+    return {**asdict(case), "finite": finite, "gradient": float(gradient), "difference_error": off,
+            "lowest": min(lowest)}  # fmt: skip
+
+
+def difference_error(loss: Callable[[Tensor], Tensor], at: Tensor, slope: float, steps: Sequence[float]) -> float:
+    """Relative error of a slope against central differences, the least over their steps."""
     with torch.no_grad():
-        for step in (1e-3, 1e-4, 1e-5):
-            ahead, behind = loss(scale + step), loss(scale - step)
-            differences.append(abs(float(ahead - behind) / (2 * step) - float(gradient)) / abs(float(gradient)))
-    return {
-        **asdict(case),
-        "finite": bool(torch.isfinite(value)) and bool(torch.isfinite(gradient)),
-        "gradient": float(gradient),
-        "difference_error": min(differences),
-        "lowest": min(lowest),
-    }
+        found = [float(loss(at + d) - loss(at - d)) / (2 * d) for d in steps]
+    return min(abs(f - slope) / max(abs(slope), 1e-300) for f in found)
 
 
 def verdict(row: dict[str, Any]) -> str:
@@ -469,26 +450,23 @@ def build_feature(case: Case) -> tuple[dv.Model, Tensor, Tensor, dict[str, Any]]
     tets = bodies(case)
     scaled = tets.transform(case.size * np.eye(3))
     upper = np.array(tets.points[tets.tets].mean(1)[:, 0] > 0.5 * np.ptp(tets.points[:, 0]))
-    half = torch.from_numpy(upper)
+    half, size = torch.from_numpy(upper), case.size
     energies: list[Any] = [dv.StableNeoHookean()]
     # about as stiff as the softer half
-    barrier: dict[str, Any] = {"kappa": case.mu * case.size, "dhat": 0.05 * case.size}
-    colliders: tuple[Any, ...] = ()
+    barrier: dict[str, Any] = {"kappa": case.mu * size, "dhat": 0.05 * size}
     if kind == "floor":
         energies.append(dv.FloorBarrier(**barrier))
     if kind in ("plane", "sphere", "pairs", "horseshoe"):
         energies.append(dv.PairBarrier(**barrier, self_contact=kind == "horseshoe"))
-    if kind == "plane":
-        colliders = (dv.colliders.Plane(),)
-    elif kind == "sphere":
-        colliders = (dv.colliders.Sphere((0.2 * case.size, -0.5 * case.size, 0.2 * case.size), 0.5 * case.size),)
+    under = {"plane": dv.colliders.Plane(),
+             "sphere": dv.colliders.Sphere((0.2 * size, -0.5 * size, 0.2 * size), 0.5 * size)}  # fmt: skip
+    colliders = (under[kind],) if kind in under else ()
     if friction:
         energies.append(dv.Friction(friction, velocity=0.01 * case.speed))
     pinned = np.isclose(tets.points[:, 0], 0.0) if kind == "pinned" else None
-    density = torch.where(half, case.density * case.mass_contrast, case.density).to(torch.float64)
     dtype = torch.float32 if case.single else torch.float64
-    model = dv.Model(scaled, density=density.to(dtype), pinned=pinned, energies=energies, colliders=colliders,
-                     dtype=dtype)  # fmt: skip
+    density = of_halves(half, case.density, case.mass_contrast).to(dtype)
+    model = dv.Model(scaled, density, pinned, energies, colliders=colliders, dtype=dtype)
     stiffness = torch.where(half, case.contrast, 1.0).to(dtype) * case.mu
     lam = stiffness * (2 * case.poisson / (1 - 2 * case.poisson))
     points = torch.from_numpy(tets.points.copy()).to(dtype)
@@ -521,16 +499,11 @@ def check_feature(case: Case) -> dict[str, Any]:
         try:
             row |= _run(case)
         except (ValueError, RuntimeError) as error:
-            row |= {
-                "raised": str(error).split("\n")[0][:200],
-                "finite": False,
-                "gain": math.nan,
-                "gradient_finite": False,
-            }
+            row |= {"raised": str(error).split("\n")[0][:200], "finite": False, "gain": math.nan,
+                    "gradient_finite": False}  # fmt: skip
     row["warned"] = ", ".join(sorted({str(w.message).split(":")[0] for w in found}))
-    useless = not row["finite"] or not row["gain"] <= GAIN or not row["gradient_finite"]
-    row["useless"] = useless
-    row["silent"] = useless and not row["raised"] and not row["warned"]
+    row["useless"] = not row["finite"] or not row["gain"] <= GAIN or not row["gradient_finite"]
+    row["silent"] = row["useless"] and not row["raised"] and not row["warned"]
     return row
 
 
@@ -539,15 +512,15 @@ def _run(case: Case) -> dict[str, Any]:
     solver = dv.VBD(case.time_step, case.sweeps, **FEATURES[case.feature][2])
     options: dict[str, Any] = {"steps": case.steps, "solver": solver}
     begun = time.perf_counter()
-    given: dict[str, Any] = {**options, **material}
     with torch.no_grad():
-        motion = dv.rollout(model, x, v, **given)
+        motion = dv.rollout(model, x, v, **options, **material)  # type: ignore[arg-type]
     seconds = time.perf_counter() - begun
     finite = bool(torch.isfinite(motion.x).all()) and bool(torch.isfinite(motion.v).all())
     row: dict[str, Any] = {"finite": finite, "seconds": seconds, "gain": math.nan}
     if finite:
         corners = motion.x[-1][model.tets].to(torch.float64)
-        row |= {"gain": gained(case, motion, material), "inverted": int((_volumes(corners) < 0).sum()),
+        volumes = torch.linalg.det(corners[:, 1:] - corners[:, :1])
+        row |= {"gain": gained(case, motion, material), "inverted": int((volumes < 0).sum()),
                 "crossings": _crossings(case, model, motion)}  # fmt: skip
     return row | _gradient(case, model, x, v, material, options)
 
@@ -588,10 +561,6 @@ def _crossings(case: Case, model: dv.Model, motion: dv.results.Trajectory) -> in
     return int((body[surface.edges[found[:, 1], 0].long()] != body[surface.triangles[found[:, 2], 0].long()]).sum())
 
 
-def _volumes(corners: Tensor) -> Tensor:
-    return torch.linalg.det(corners[:, 1:] - corners[:, :1])
-
-
 def _gradient(case: Case, model: dv.Model, x: Tensor, v: Tensor, material: dict[str, Tensor],
               options: dict[str, Any]) -> dict[str, Any]:  # fmt: skip
     """Whether the gradient is finite, and its error against differences along one direction (None in float32)."""
@@ -612,10 +581,7 @@ def _gradient(case: Case, model: dv.Model, x: Tensor, v: Tensor, material: dict[
     row: dict[str, Any] = {"gradient_finite": bool(torch.isfinite(slope)), "gradient": float(slope), "difference": None}
     if case.single or not row["gradient_finite"]:
         return row
-    with torch.no_grad():
-        found = [float(loss(at + d) - loss(at - d)) / (2 * d) for d in DIFFERENCES]
-    scale = max(abs(float(slope)), 1e-300)
-    return row | {"difference": min(abs(f - float(slope)) / scale for f in found)}
+    return row | {"difference": difference_error(loss, at, float(slope), DIFFERENCES)}
 
 
 def gradient_verdict(row: dict[str, Any]) -> str:

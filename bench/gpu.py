@@ -43,34 +43,27 @@ from diffvbd.testing import regime
 GRADIENTS = ("x", "v", "material")
 
 
+def steps_of(card: Card) -> int:
+    """Steps of one graph."""
+    return 2 if card.quick else 10
+
+
 def label(model: dv.Model, sweeps: int) -> str:
     return f"{model.num_vertices} v / {model.num_tets} t, K = {sweeps}, {str(model.dtype)[6:]}"
 
 
-def timed_forward(
-    card: Card, scene: Scene, sweeps: int, steps: int, tape: Any = "auto", budget: float | None = None
-) -> Row:
-    """Graph and eager time per step; with a tape where a tensor of the scene requires grad."""
-    work = forward(scene, sweeps, steps, tape)
-    eager = card.eager(work)
-    return {"ms": milliseconds(card.graph(work, budget=budget), steps), "eager_ms": milliseconds(eager, steps)}
+def spans(card: Card, work: Work, steps: int, budget: float | None = None, calls: int = 5, replays: int = 20) -> Row:
+    """Graph and eager milliseconds a step."""
+    eager = card.eager(work, calls)
+    return {"ms": milliseconds(card.graph(work, replays, budget), steps), "eager_ms": milliseconds(eager, steps)}
 
 
-def timed_reverse(
-    card: Card, scene: Scene, sweeps: int, steps: int, tape: Any = "auto", budget: float | None = None
-) -> tuple[Row, Row]:
+def timed_reverse(card: Card, scene: Scene, sweeps: int, steps: int, tape: Any = "auto", budget: float | None = None
+                  ) -> tuple[Row, Row]:  # fmt: skip
     """Times per step of the forward with tape, and of the reverse: forward with reverse, less the former."""
-    taped = timed_forward(card, scene, sweeps, steps, tape, budget)
-    work = forward_reverse(scene, sweeps, steps, tape)
-    eager = milliseconds(card.eager(work), steps)
-    both = milliseconds(card.graph(work, budget=budget), steps)
-    reverse = {
-        "ms": None if both is None or taped["ms"] is None else both - taped["ms"],
-        "eager_ms": None if eager is None else eager - taped["eager_ms"],
-        "both_ms": both,
-        "both_eager_ms": eager,
-    }
-    return taped, reverse
+    taped, both = (spans(card, make(scene, sweeps, steps, tape), steps, budget) for make in (forward, forward_reverse))
+    reverse = {key: None if both[key] is None else both[key] - taped[key] for key in both}
+    return taped, reverse | {f"both_{key}": value for key, value in both.items()}
 
 
 # --- one mesh, many scenes --------------------------------------------------------------------------------------------
@@ -82,15 +75,15 @@ def timed_parts(card: Card, rows: list[Row], about: Row, scene: Scene, sweeps: i
     """Rows of a forward without tape, and of a forward with each tape and its reverse."""
     about = {"name": label(scene.model, sweeps), "steps": steps, **about}
     attempt(card, rows, {**about, "part": "forward", "target_ms": targets[0]},
-            lambda: timed_forward(card, scene, sweeps, steps))  # fmt: skip
+            lambda: spans(card, forward(scene, sweeps, steps), steps))  # fmt: skip
     for tape in tapes:
 
         def both(tape: str = tape) -> list[Row]:
             taped, reverse = timed_reverse(card, scene.requiring(*wrt), sweeps, steps, tape)
             whole = {"ms": reverse["both_ms"], "eager_ms": reverse["both_eager_ms"]}
-            parts = {f"forward with {tape} tape": taped, f"reverse, {tape} tape": reverse, "forward + reverse": whole}
-            return [{"part": part, "target_ms": targets[1] if "reverse," in part else None, **row}
-                    for part, row in parts.items()]  # fmt: skip
+            return [{"part": f"forward with {tape} tape", "target_ms": None, **taped},
+                    {"part": f"reverse, {tape} tape", "target_ms": targets[1], **reverse},
+                    {"part": "forward + reverse", "target_ms": None, **whole}]  # fmt: skip
 
         attempt(card, rows, {**about, "part": f"reverse, {tape} tape"}, both)
 
@@ -103,10 +96,9 @@ def steps(card: Card) -> list[Row]:
         model = model_of(dv.mesh.cube(n, split="five"), card)
         for material in ("scalar", "per tet"):
             scene = scene_of(model, material=material)
-            timed_parts(card, rows, {"material": material}, scene, 20, 2 if card.quick else 10, ("full", "compact"),
-                        targets)  # fmt: skip
+            timed_parts(card, rows, {"material": material}, scene, 20, steps_of(card), ("full", "compact"), targets)
     single = scene_of(model_of(dv.mesh.cube(4 if card.quick else 58, split="five"), card, torch.float32))
-    timed_parts(card, rows, {"material": "scalar"}, single, 20, 2 if card.quick else 10, (), (1.8, None))
+    timed_parts(card, rows, {"material": "scalar"}, single, 20, steps_of(card), (), (1.8, None))
     return rows
 
 
@@ -125,19 +117,19 @@ def cubes(card: Card) -> list[Row]:
     scene = scene_of(model, scenes, "per scene", noise=1e-5)
     for note, plain in (("", False), (", sweeps alone", True)):
         about = {"name": f"{scenes} scenes of {label(model, 5)}{note}", "material": "per scene"}
-        timed_parts(card, rows, about, replace(scene, plain=plain), 5, 2 if card.quick else 10, ("recompute",),
-                    (1.2, None), ("x", "v", "mu"))  # fmt: skip
+        timed_parts(card, rows, about, replace(scene, plain=plain), 5, steps_of(card), ("recompute",), (1.2, None),
+                    ("x", "v", "mu"))  # fmt: skip
     return rows
 
 
 def batches(card: Card, sweeps: int = 10) -> list[Row]:
     """Scenes of 1,331 vertices in one call; throughput and its share of the best of the series."""
-    model, count = model_of(dv.mesh.cube(3 if card.quick else 11, split="five"), card), 2 if card.quick else 10
+    model, count = model_of(dv.mesh.cube(3 if card.quick else 11, split="five"), card), steps_of(card)
     rows: list[Row] = []
     for scenes in (2, 4) if card.quick else (128, 256, 512, 1024, 2048, 4096, 8192):
 
         def one(scenes: int = scenes) -> Row:
-            row = timed_forward(card, scene_of(model, scenes), sweeps, count)
+            row = spans(card, forward(scene_of(model, scenes), sweeps, count), count)
             return row | {"updates": model.num_active * sweeps * scenes / 1e6 / (row["ms"] or row["eager_ms"])}  # [G/s]
 
         attempt(card, rows, {"name": f"{scenes} scenes of {label(model, sweeps)}", "steps": count}, one)
@@ -167,11 +159,6 @@ def rollout_reverse(scene: Scene, sweeps: int, steps: int, tape: Any, every: Any
     return work
 
 
-def room(card: Card) -> int:
-    """Bytes that a measurement may take."""
-    return int(0.5 * torch.cuda.get_device_properties(card.device).total_memory) if card.cuda else 2**30
-
-
 # --- sweeps x vertices ------------------------------------------------------------------------------------------------
 
 
@@ -194,7 +181,7 @@ def _grid_row(card: Card, mesh: dv.TetMesh, sweeps: int) -> Row:
     scene = scene_of(model).requiring(*GRADIENTS)
     size = model.num_vertices * sweeps
     count = 10 if size < 2_000_000 else 3
-    row: Row = {"steps": count, **timed_forward(card, scene_of(model), sweeps, count, budget=2.0)}
+    row: Row = {"steps": count, **spans(card, forward(scene_of(model), sweeps, count), count, 2.0)}
     taped, reverse = timed_reverse(card, scene, sweeps, count, budget=2.0)
     row |= {"taped_ms": taped["ms"], "reverse_ms": reverse["ms"], "reverse_eager_ms": reverse["eager_ms"]}
     if reverse["ms"] is not None:
@@ -205,16 +192,11 @@ def _grid_row(card: Card, mesh: dv.TetMesh, sweeps: int) -> Row:
         return {**row, "note": f"peak of {GRID_STEPS} steps not measured"}
     row["rollout_peak"] = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "auto", "auto"))
     predicted = dv.memory(model, dv.VBD(0.01, sweeps, tape="full"), steps=GRID_STEPS, checkpoint_every=None)
-    if predicted["total"] < room(card):
+    if predicted["total"] < int(0.5 * torch.cuda.get_device_properties(card.device).total_memory):
         own = card.allocated() - before - scene.bytes
-        peak = card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None))
-        if peak is not None:
-            row["full_peak"] = peak + own
-            row["full_peak_bytes_per_vertex_sweep_step"] = (peak + own) / (size * GRID_STEPS)
+        row["full_peak"] = own + (card.peak(rollout_reverse(scene, sweeps, GRID_STEPS, "full", None)) or 0)
+        row["full_peak_bytes_per_vertex_sweep_step"] = row["full_peak"] / (size * GRID_STEPS)
     return row
-
-
-# --- memory -----------------------------------------------------------------------------------------------------------
 
 
 # --- regimes ----------------------------------------------------------------------------------------------------------
@@ -301,98 +283,59 @@ def _cover(card: Card) -> list[Row]:
     fall = cover_the_spot.Fall(settings, cover_the_spot.RADIUS,
                                cover_the_spot.QUICK if card.quick else cover_the_spot.FULL)  # fmt: skip
 
-    def forward() -> Tensor:
-        with torch.no_grad():
-            return fall.simulate()
-
-    def both() -> tuple[Tensor, ...]:
-        return torch.autograd.grad(fall.simulate().sum(), (fall.velocity, fall.offset))
-
     about = {"vertices": fall.model.num_vertices, "scenes": 1, "sweeps": fall.version.sweeps}
-    return _timed(card, about, fall.version.steps, forward, both, (0.25, 0.6))
-
-
-def landed_step(card: Card) -> Work:
-    """A step and its gradients where disks lie on the floor and on one another."""
-    settings = Settings(Path("unused"), str(card.device))
-    fall = cover_the_spot.Fall(settings, cover_the_spot.RADIUS, cover_the_spot.FULL)
-    given: dict[str, Any] = {"mu": cover_the_spot.MU, "lam": cover_the_spot.LAM,
-                             "solver": dv.VBD(cover_the_spot.TIME_STEP, cover_the_spot.SWEEPS)}  # fmt: skip
-    x, v = fall.model.rest_points, fall.velocity[:, None].expand(-1, fall.disk.num_vertices, -1).flatten(0, 1)
-    with torch.no_grad():
-        end = dv.rollout(fall.model, x, v, steps=fall.version.steps, save="last", **given)
-    leaves = tuple(t[-1].detach().requires_grad_() for t in (end.x, end.v))
-    return lambda: torch.autograd.grad(sum(t.sum() for t in dv.step(fall.model, *leaves, **given)), leaves)
+    return _timed(card, about, fall.version.steps, fall.simulate, (fall.velocity, fall.offset), (0.25, 0.6))
 
 
 def _grippers(card: Card, scenes: int) -> list[Row]:
-    about, forward, both = grippers(card, scenes, CLAMPED_STEPS)
-    many = scenes >= 1024
-    rows = _timed(card, about, CLAMPED_STEPS, forward, both, (None, None))
-    for row, target in zip(rows, (1e5, 3.5e4), strict=True):
-        row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
-        row["target_rate"] = target if many else None
-    return rows
-
-
-def grippers(card: Card, scenes: int, steps: int) -> tuple[Row, Work, Work]:
-    """Scenes in which clamps hold a bar: what they are, some steps of them, and these with their gradients."""
+    """Scenes in which clamps hold a bar: some steps of them, and these with their gradients."""
     scene = gripper(5, (3, 5, 5), detections=DETECTIONS, reach=REACH)
     model, clamps = scene.model.to(card.device), scene.given["prescribed"]
     rest = model.rest_points
     shares = torch.ones((scenes, 1, 3)).to(rest)  # they close differently, and lift alike
     shares[..., 0] += 0.5 * torch.rand((scenes, 1), generator=torch.Generator().manual_seed(0)).to(rest)
     x, v = rest.expand(scenes, -1, -1).clone(), rest.new_zeros((scenes, *rest.shape))
+    ends = [rest + shares * (clamps((k + 1) * CLAMPED_STEP).to(rest) - rest) for k in range(CLOSING + CLAMPED_STEPS)]
 
-    def ends(step: int) -> Tensor:
-        end = clamps(step * CLAMPED_STEP).to(rest)
-        return rest + shares * (end - rest)
+    def moved(at: Tensor, speed: Tensor, clamped: list[Tensor]) -> tuple[Tensor, Tensor]:
+        solver = dv.VBD(CLAMPED_STEP, CLAMPED_SWEEPS)
+        for end in clamped:
+            at, speed = dv.step(model, at, speed, solver, mu=1e5, lam=2e5, prescribed=end)
+        return at, speed
 
-    def step(at: Tensor, speed: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        return dv.step(model, at, speed, dv.VBD(CLAMPED_STEP, CLAMPED_SWEEPS), mu=1e5, lam=2e5, prescribed=ends_of[k])
-
-    ends_of = [ends(k + 1) for k in range(CLOSING + steps)]
     with torch.no_grad():
-        for k in range(CLOSING):
-            x, v = step(x, v, k)
-    leaves = tuple(t.requires_grad_() for t in (x, v))
-
-    def moved() -> Tensor:
-        at, speed = leaves
-        for k in range(CLOSING, CLOSING + steps):
-            at, speed = step(at, speed, k)
-        return at
-
-    def forward() -> Tensor:
-        with torch.no_grad():
-            return moved()
-
-    def both() -> tuple[Tensor, ...]:
-        return torch.autograd.grad(moved().sum(), leaves)
-
-    forward()
+        x, v = moved(x, v, ends[:CLOSING])
+        moved(x, v, ends[CLOSING:])
+    leaves = x.requires_grad_(), v.requires_grad_()
     status = dv.contact.status(model)
     pairs = status.pairs / scenes
     dv.contact.reserve(model, math.ceil(SPARE * pairs))
     held_up = sum(status.truncated) / (scenes * model.num_active)
-    about: dict[str, Any] = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": CLAMPED_SWEEPS,
-                             "pairs_per_scene": pairs, "held_up": held_up}  # fmt: skip
-    return about, forward, both
-
-
-def _timed(card: Card, about: dict[str, Any], steps: int, forward: Any, both: Any,
-           targets: tuple[float | None, float | None]) -> list[Row]:  # fmt: skip
-    """A row of the forward and one of forward and reverse, in milliseconds a step."""
-    rows: list[Row] = []
-    for part, work, target in zip(("forward", "forward + reverse"), (forward, both), targets, strict=True):
-        eager = milliseconds(card.eager(work, 3), steps)
-        ms = milliseconds(card.graph(work, 5, 3.0), steps)
-        rows.append(about | {"part": part, "ms": ms, "eager_ms": eager, "target_ms": target})
-        card.tidy()
+    about = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": CLAMPED_SWEEPS, "pairs_per_scene": pairs,
+             "held_up": held_up}  # fmt: skip
+    rows = _timed(card, about, CLAMPED_STEPS, lambda: moved(x, v, ends[CLOSING:])[0], leaves, (None, None))
+    for row, target in zip(rows, (1e5, 3.5e4), strict=True):
+        row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
+        row["target_rate"] = target if scenes >= 1024 else None
     return rows
 
 
-DEVICE = "cuda"
+def _timed(card: Card, about: Row, steps: int, end: Callable[[], Tensor], leaves: tuple[Tensor, ...],
+           targets: tuple[float | None, float | None]) -> list[Row]:  # fmt: skip
+    """A row of the forward and one of forward and reverse, in milliseconds a step."""
+
+    def forward() -> Tensor:
+        with torch.no_grad():
+            return end()
+
+    def both() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(end().sum(), leaves)
+
+    rows: list[Row] = []
+    for part, work, target in zip(PARTS, (forward, both), targets, strict=True):
+        rows.append(about | {"part": part, **spans(card, work, steps, 3.0, 3, 5), "target_ms": target})
+        card.tidy()
+    return rows
 
 
 DEVICE, ANYWHERE = "cuda", True

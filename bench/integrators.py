@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from bench import tradeoff
 from bench.tables import Table
 from diffvbd import colliders, reference
 
@@ -22,7 +23,7 @@ MATERIAL: dict[str, Any] = {"mu": 1e5, "lam": 2e5}
 def beam(quick: bool) -> list[dict[str, Any]]:
     """A cantilever of 0.6 m released from rest: error of its end state over its motion after 0.4 s, and the time that
     takes, of ladders of steps. Sweeps fall with the step, so that each ladder does about the same number of them."""
-    mesh = dv.mesh.beam(*((7, 3, 3) if quick else (13, 4, 4)), size=(0.6, 0.15, 0.15), split="kuhn")
+    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15), split="kuhn") if quick else tradeoff.beam()
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 

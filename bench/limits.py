@@ -1,5 +1,4 @@
-"""Where the solver's limits lie: the F = 0 well, float32, conditioning, relaxation, rest, stiff
-directions.
+"""Where the solver's limits lie: the F = 0 well, float32, conditioning, relaxation, rest, stiff directions.
 
 The last two are of one direction that is far stiffer than the others: small gaps to planes, and lam far above mu. There
 the gradient farthest from a step in 120 digits has a row: its error over what an ulp in every input does to that
@@ -8,8 +7,10 @@ gradient, the worst of one and three sweeps, full and compact tape.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -26,6 +27,12 @@ from diffvbd.model.system import system_of
 from diffvbd.testing import many_digits
 
 ARGUMENTS = ("grad_x", "grad_v", "grad_mu", "grad_lam")
+TIME_STEP = 1 / 60  # [s]
+
+
+def step_of(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD) -> dict[str, Tensor]:
+    """End state and gradients of one step."""
+    return testing.evaluate(partial(dv.step, model, solver=solver), inputs, solver.time_step)
 
 
 # --- the F = 0 well ---------------------------------------------------------------------------------------------------
@@ -50,8 +57,7 @@ def well(quick: bool) -> list[dict[str, Any]]:
         for margin in (0.5, 0.99, 1.01, 1.2, 1.5, 2.0):
             f = rng.standard_normal((100 if quick else 1000, 3, 3))
             f *= margin * np.sqrt(3) * critical / np.linalg.norm(f, axis=(1, 2), keepdims=True)
-            share = float(_collapsed(model, torch.from_numpy(f), mu, lam).double().mean())
-            row[f"collapsed_at_{margin:g}"] = share
+            row[f"collapsed_at_{margin:g}"] = float(_collapsed(model, torch.from_numpy(f), mu, lam).double().mean())
         out.append(row)
     return out
 
@@ -72,45 +78,31 @@ def _collapsed(model: dv.Model, f: Tensor, mu: float, lam: float) -> Tensor:
 
 def float32(quick: bool) -> list[dict[str, Any]]:
     """float32 gradients of one step of a 1 m cube (cells of 0.5 m and 0.25 m) far from the origin."""
-    out = []
+    out, solver = [], dv.VBD(TIME_STEP, 10)
     for cells, offset in [(2, 0), (2, 1e3)] if quick else [(n, o) for n in (2, 4) for o in (0, 10, 1e3, 1e5)]:
         points, tets = testing.structured((cells,) * 3)
         model = dv.Model(dv.TetMesh(points + offset, tets), pinned=points[:, 0] < 1e-9)
         rng = testing.generator("float32")
         x = model.rest_points + 0.05 / cells * torch.from_numpy(rng.uniform(-1, 1, points.shape))
-        exact = {
-            "x": x,
-            "v": torch.from_numpy(rng.uniform(-0.1, 0.1, points.shape)),
-            "mu": torch.full((len(tets),), 1e4, dtype=torch.float64),
-            "lam": torch.full((len(tets),), 2e4, dtype=torch.float64),
-        }
-        small = {k: t.float() for k, t in exact.items()}
-        same = {k: t.double() for k, t in small.items()}
-        local, truth = _float32_step(model.to(dtype=torch.float32), small), _float32_step(model, same)
-        naive = testing.reference_result(model.to(dtype=torch.float32), small, dv.VBD(1 / 60, 10))
-        unrounded = _float32_step(model, exact)
+        v = torch.from_numpy(rng.uniform(-0.1, 0.1, points.shape))
+        mu = torch.full((len(tets),), 1e4, dtype=torch.float64)
+        exact = {"x": x, "v": v, "mu": mu, "lam": 2 * mu}
+        single, small = model.to(dtype=torch.float32), {k: t.float() for k, t in exact.items()}
+        local, truth = step_of(single, small, solver), step_of(model, {k: t.double() for k, t in small.items()}, solver)
+        naive = testing.reference_result(single, small, solver)
 
         def worst(value: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
             return max(testing.relative_error(value[k], expected[k]) for k in ARGUMENTS)
 
-        versions = ((model, exact), (model.to(dtype=torch.float32), small))
-        options = {"mu": 1e4, "lam": 2e4, "save": "last", "solver": dv.VBD(1 / 60, 10)}
-        ends = [dv.rollout(m, i["x"], i["v"], steps=100, **options).x[-1] for m, i in versions]
-        row = {
-            "offset": float(offset),
-            "edge": 1 / cells,
-            "resolution": torch.finfo(torch.float32).eps * max(offset, 1.0) * cells,
-            "body_local": worst(local, truth),
-            "global": worst(naive, truth),
-            "body_local_and_input": worst(local, unrounded),
-            "rollout_error_over_edge": float((ends[1].double() - ends[0]).norm(dim=-1).max()) * cells,
-        }
-        out.append(row)
+        options = {"mu": 1e4, "lam": 2e4, "save": "last", "solver": solver}
+        ends = [dv.rollout(m, i["x"], i["v"], steps=100, **options).x[-1] for m, i in ((model, exact), (single, small))]
+        out.append({"offset": float(offset), "edge": 1 / cells,
+                    "resolution": torch.finfo(torch.float32).eps * max(offset, 1.0) * cells,
+                    "body_local": worst(local, truth), "global": worst(naive, truth),
+                    "body_local_and_input": worst(local, step_of(model, exact, solver)),
+                    "rollout_error_over_edge": float((ends[1].double() - ends[0]).norm(dim=-1).max()) * cells,
+                    })  # fmt: skip
     return out
-
-
-def _float32_step(model: dv.Model, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-    return testing.evaluate(lambda **o: dv.step(model, solver=dv.VBD(1 / 60, 10), **o), inputs, 1 / 60)
 
 
 # --- conditioning of the gradient -------------------------------------------------------------------------------------
@@ -120,26 +112,19 @@ def conditioning(quick: bool) -> list[dict[str, Any]]:
     """Error of the compiled gradient and disagreement of two references, over the strain of one step."""
     out = []
     for strain in (1e-6, 1e2) if quick else (1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e2, 1e3, 1e4):
-        case = replace(
-            testing.CASES["plain"], speed=60 * strain, jitter=min(strain, 0.01), force=0.0, gravity=(0, 0, 0)
-        )
+        case = replace(testing.CASES["plain"], speed=60 * strain, jitter=min(strain, 0.01), force=0.0,
+                       gravity=(0, 0, 0))  # fmt: skip
         with mock.patch.dict(testing.CASES, {"strain": case}):
             scene = testing.build_scene("strain")
         model, inputs, solver = scene.model(), scene.inputs(), scene.solver(5)
         expected = testing.reference_result(model, inputs, solver)
         spread = testing.spread(model, inputs, solver, expected=expected)
-        got = testing.evaluate(lambda m=model, s=solver, **o: dv.step(m, solver=s, **o), inputs, solver.time_step)
+        got = step_of(model, inputs, solver)
         errors = {k: testing.relative_error(got[k], expected[k]) for k in expected if k.startswith("grad_")}
         worst = max(errors, key=lambda k: errors[k])
-        out.append(
-            {
-                "strain": strain,
-                "error": errors[worst],
-                "argument": worst.removeprefix("grad_"),
-                "spread": max(spread[k] for k in errors),
-                "error_x_v": max(errors["grad_x"], errors["grad_v"]),
-            }
-        )
+        out.append({"strain": strain, "error": errors[worst], "argument": worst.removeprefix("grad_"),
+                    "spread": max(spread[k] for k in errors),
+                    "error_x_v": max(errors["grad_x"], errors["grad_v"])})  # fmt: skip
     return out
 
 
@@ -159,7 +144,7 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
     out = []
     for omega in (1.0, 1.9) if quick else (1.0, 1.5, 1.6, 1.7, 1.8, 1.85, 1.9, 1.95):
         model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
-        grown, total = 0, 0
+        grown = 0
         for h in (1 / 60, 0.2):
             x = torch.where(model.pinned[:, None], points, states)
             v, lost = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool)
@@ -169,30 +154,27 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
                 lost |= (~torch.isfinite(x).all(-1) | (x.norm(dim=-1) > 30)).any(-1)
                 x, v = torch.where(lost[:, None, None], points, x), torch.where(lost[:, None, None], 0.0, v)
             grown += int(lost.sum())
-            total += len(lost)
-        out.append({"relaxation": omega, "grown": grown, "rollouts": total})
+        out.append({"relaxation": omega, "grown": grown, "rollouts": 2 * len(states)})
     return out
 
 
 # --- bodies at rest ---------------------------------------------------------------------------------------------------
 
 REST_SWEEPS = (0, 1, 2, 3, 5, 10)
-H, GROUND = 0.01, {"height": 0.0, "kappa": 1e3, "dhat": 1e-2}
 
 
 def at_rest(quick: bool, device: str) -> list[dict[str, Any]]:
     """A cube of 27 vertices, 0.2 m and 3000 kg/m^3, let go 2 mm above where the barrier of a frictionless floor begins,
     1,500 steps."""
     mesh = dv.mesh.cube(3, size=0.2, split="kuhn").translate((0.0, 0.012, 0.0))
-    energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND))
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=0.0, kappa=1e3, dhat=1e-2))
     model, out = dv.Model(mesh, density=3000.0, energies=energies, device=device), []
     steps = 50 if quick else (1500 if device == "cpu" else 400)
-    for subspace in (None, "rigid"):
-        for sweeps in (1, 5) if quick else REST_SWEEPS:
-            for relaxation in (1.0,) if quick else (0.5, 1.0, 1.6):
-                solver = dv.VBD(H, sweeps, relaxation=relaxation, subspace=subspace)
-                row = {"rigid": subspace == "rigid", "sweeps": sweeps, "relaxation": relaxation, "steps": steps}
-                out.append(row | _watched(model, solver, steps))
+    counts, relaxations = ((1, 5), (1.0,)) if quick else (REST_SWEEPS, (0.5, 1.0, 1.6))
+    for subspace, sweeps, relaxation in itertools.product((None, "rigid"), counts, relaxations):
+        solver = dv.VBD(0.01, sweeps, relaxation=relaxation, subspace=subspace)
+        row = {"rigid": subspace == "rigid", "sweeps": sweeps, "relaxation": relaxation, "steps": steps}
+        out.append(row | _watched(model, solver, steps))
     return out
 
 
@@ -209,12 +191,8 @@ def _watched(model: dv.Model, solver: dv.VBD, steps: int) -> dict[str, Any]:
             break
         low = torch.minimum(low, x[:, 1].min())
     moved = (x - model.rest_points).mean(0)
-    return {
-        "lowest_gap": float(low),
-        "gap": float(x[:, 1].min()),
-        "speed": float(v.norm(dim=-1).max()),
-        "drift": float(moved[[0, 2]].norm()),
-    }
+    return {"lowest_gap": float(low), "gap": float(x[:, 1].min()), "speed": float(v.norm(dim=-1).max()),
+            "drift": float(moved[[0, 2]].norm())}  # fmt: skip
 
 
 # --- one direction far stiffer than the others ------------------------------------------------------------------------
@@ -228,7 +206,6 @@ GRAVITY = (0.0, -9.81, 0.0)
 PLACE = np.array([0.3, 0.7, 0.2])  # of the cube [m]: coordinates without zeros have an ulp to move by
 STATE = ("x", "mu", "lam")
 PLANES = ("floor_height", "floor_normal", "floor_kappa", "floor_dhat")
-TIME_STEP = 1 / 60  # [s]
 
 
 class Scene(NamedTuple):
@@ -255,14 +232,9 @@ def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
     away = np.linalg.pinv(planes) @ np.full(len(planes), 0.01 * gap * 60)
     v = noise - (noise + np.array(GRAVITY) / 60) @ across + away
     number = {"kappa": 2e4, "dhat": 0.1, "height": height, "normal": planes}
-    inputs = {
-        "x": torch.from_numpy(points),
-        "v": torch.from_numpy(v),
-        "mu": torch.tensor(1e4, dtype=torch.float64),
-        "lam": torch.tensor(2e4, dtype=torch.float64),
-        "gravity": torch.tensor(GRAVITY, dtype=torch.float64),
-        **{f"floor_{k}": torch.as_tensor(v, dtype=torch.float64) for k, v in number.items()},
-    }
+    values = {"x": points, "v": v, "mu": 1e4, "lam": 2e4, "gravity": GRAVITY,
+              **{f"floor_{k}": value for k, value in number.items()}}  # fmt: skip
+    inputs = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in values.items()}
     return Scene(model, inputs, STATE + PLANES, {"subspace": None})
 
 
@@ -274,13 +246,9 @@ def volumetric(ratio: float, block: str = "exact") -> Scene:
     pinned = mesh.points[:, 0] < 1e-9
     model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(),))
     mu = 1e4 * torch.from_numpy(rng.uniform(0.8, 1.2, mesh.num_tets))
-    inputs = {
-        "x": points + 0.05 * torch.from_numpy(rng.uniform(-1, 1, points.shape)) + torch.from_numpy(PLACE),
-        "v": torch.from_numpy(rng.uniform(-1, 1, points.shape)),
-        "mu": mu,
-        "lam": ratio * mu,
-    }
-    return Scene(model, inputs, STATE, {"block": block})
+    x = points + 0.05 * torch.from_numpy(rng.uniform(-1, 1, points.shape)) + torch.from_numpy(PLACE)
+    v = torch.from_numpy(rng.uniform(-1, 1, points.shape))
+    return Scene(model, {"x": x, "v": v, "mu": mu, "lam": ratio * mu}, STATE, {"block": block})
 
 
 class Errors(NamedTuple):
@@ -291,9 +259,8 @@ class Errors(NamedTuple):
 
     def ratios(self) -> dict[str, float]:
         """Of each gradient, its error over what an ulp in the inputs does to it; below an ulp counts as an ulp."""
-        return {
-            k: e / max(self.sensitivity[k], many_digits.ULP) for k, e in self.errors.items() if k.startswith("grad_")
-        }
+        return {k: e / max(self.sensitivity[k], many_digits.ULP)
+                for k, e in self.errors.items() if k.startswith("grad_")}  # fmt: skip
 
     def worst(self) -> str:
         ratios = self.ratios()
@@ -302,13 +269,7 @@ class Errors(NamedTuple):
 
 def measure(scene: Scene, truth: many_digits.Exact, sweeps: int, tape: Any = "full", device: str = "cpu") -> Errors:
     """A step and its gradients against 120 digits, which `exact` has of the same scene."""
-    there, solver = scene.model.to(device), scene.solver(sweeps, tape)
-
-    def run(**options: Any) -> tuple[Tensor, Tensor]:
-        return dv.step(there, solver=solver, **options)
-
-    found = testing.evaluate(run, testing.on_device(scene.inputs, device), TIME_STEP)
-    found = testing.on_device(found, "cpu")
+    found = step_of(scene.model.to(device), testing.on_device(scene.inputs, device), scene.solver(sweeps, tape))
     errors = {name: testing.relative_error(found[name], value) for name, value in truth.values.items()}
     return Errors(truth.sensitivity, errors)
 
@@ -329,21 +290,20 @@ def row(scene: Scene, device: Any) -> dict[str, Any]:
         found += [(measure(scene, truth, k, tape, str(device)), k) for tape in ("full", "compact")]
     errors, sweeps = max(found, key=lambda entry: max(entry[0].ratios().values()))
     name = errors.worst()
-    return {
-        "sweeps": sweeps,
-        "argument": name.removeprefix("grad_"),
-        "error": errors.errors[name],
-        "sensitivity": errors.sensitivity[name],
-        "error_over_sensitivity": errors.ratios()[name],
-    }
+    return {"sweeps": sweeps, "argument": name.removeprefix("grad_"), "error": errors.errors[name],
+            "sensitivity": errors.sensitivity[name], "error_over_sensitivity": errors.ratios()[name]}  # fmt: skip
+
+
+def of_cpu(group: Callable[[bool], list[dict[str, Any]]]) -> Callable[[Card], list[dict[str, Any]]]:
+    """A group that has no device of its own."""
+    return lambda card: [] if card.cuda else group(card.quick)
 
 
 GROUPS: dict[str, Callable[[Card], list[dict[str, Any]]]] = {
-    # these have no device of their own
-    "well": lambda card: [] if card.cuda else well(card.quick),
-    "float32": lambda card: [] if card.cuda else float32(card.quick),
-    "conditioning": lambda card: [] if card.cuda else conditioning(card.quick),
-    "relaxation": lambda card: [] if card.cuda else relaxation(card.quick),
+    "well": of_cpu(well),
+    "float32": of_cpu(float32),
+    "conditioning": of_cpu(conditioning),
+    "relaxation": of_cpu(relaxation),
     "rest": lambda card: at_rest(card.quick, str(card.device)),
     "oblique": lambda card: [
         {"normals": str(normals), "gap": gap, **row(oblique(gap, normals), card.device)}

@@ -50,22 +50,12 @@ class Card:
         return statistics.median(self._spans(work, 1 + (2 if self.quick else repetitions))[1:])
 
     def graph(self, work: Work, replays: int = 20, budget: float | None = None) -> float | None:
-        """Median seconds of replays of `work`, captured in one CUDA graph; None on the CPU.
-
-        Captures after two calls on a side stream, as torch asks for. A budget [s] replays slow work less often.
-        """
+        """Median seconds of replays of `work`, captured in one CUDA graph; None on the CPU. A budget [s] replays slow
+        work less often."""
         if not self.cuda:
             return None
         with torch.cuda.device(self.device):
-            side = torch.cuda.Stream()
-            side.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(side):
-                for _ in range(2):
-                    work()
-            torch.cuda.current_stream().wait_stream(side)
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                kept = work()  # holds what the graph writes, tapes included, as a user's code would
+            graph, kept = capture(work)  # kept: what the graph writes, tapes included, as a user's code would
             first = self._spans(graph.replay, 2)[1]
             if budget is not None:
                 replays = max(3, min(replays, int(budget / first)))
@@ -76,16 +66,9 @@ class Card:
     def _spans(self, work: Work, count: int) -> list[float]:
         """Seconds of each of several calls; on CUDA by events, so that the host's share shows only where it is late."""
         if not self.cuda:
-            out = []
-            for _ in range(count):
-                start = time.perf_counter()
-                work()
-                out.append(time.perf_counter() - start)
-            return out
+            return [timed(work) for _ in range(count)]
         with torch.cuda.device(self.device):
-            events = [
-                (torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) for _ in range(count)
-            ]
+            events = [[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in range(count)]
             for start, end in events:
                 start.record()
                 work()
@@ -104,6 +87,19 @@ class Card:
         work()
         torch.cuda.synchronize(self.device)
         return torch.cuda.max_memory_allocated(self.device) - before
+
+
+def capture(work: Work) -> tuple[torch.cuda.CUDAGraph, Any]:
+    """A graph of `work` and what it writes, captured after two calls on a side stream, as torch asks for."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(2):
+            work()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        return graph, work()
 
 
 def attempt(card: Card, rows: list[Row], about: Row, measure: Callable[[], Row | list[Row]]) -> None:
@@ -200,11 +196,11 @@ def milliseconds(seconds: float | None, steps: int = 1) -> float | None:
 # --- time and memory of this process ---------------------------------------------------------------------------------
 
 
-def timed(work: Work) -> float:
+def timed(work: Work, clock: Callable[[], float] = time.perf_counter) -> float:
     """Seconds of a call."""
-    begun = time.perf_counter()
+    begun = clock()
     work()
-    return time.perf_counter() - begun
+    return clock() - begun
 
 
 def least(function: Callable[[], float], repetitions: int) -> float:

@@ -18,7 +18,6 @@ EXACTNESS = {
     20: {"residual": 1.0e-14, "reverse sweep": 2.1e-15, "global, assembled": 9.7e-10, "global, matrix-free": 1.6e-10},
 }
 WORST_OF_ALL_AXES = 3.6e-15
-GLOBAL_DIFFERENCE = 2e-16  # between its two global routes
 
 # Table "Backward cost": |V| = 115, K = 20, four steps, an RTX 4090 Laptop GPU. Milliseconds, MB, iterations.
 COST = {
@@ -63,26 +62,17 @@ DEPTH = {
 DEPTH_T = {(5, 20): 1.87, (5, 100): 2.16, (20, 100): 0.11}
 BOUNCE_DISTANCE = 0.013
 
-# Table "Measured K x |V| grid", an RTX A6000, 50 steps: (vertices, K): forward [ms], backward [ms], peak [MB]
-GRID = {
-    (558, 5): (1.4, 4.3, 12), (558, 10): (1.5, 1.6, 22), (558, 20): (2.7, 2.7, 42), (558, 50): (6.4, 6.2, 100),
-    (558, 100): (12.5, 12.2, 201), (558, 200): (24.8, 24.0, 393),
-    (3766, 10): (2.8, 3.2, 149), (3766, 50): (12.6, 14.4, 677), (3766, 100): (24.9, 28.3, 1336),
-    (27169, 10): (17.0, 17.1, 1074), (27169, 20): (31.7, 32.9, 2025), (27169, 50): (76.0, 80.5, 4926),
-    (201341, 10): (113.3, 115.8, 8136), (201341, 20): (214.0, 224.5, 15001),
-}  # fmt: skip
+# Table "Measured K x |V| grid", an RTX A6000, 50 steps, 558 to 201,341 vertices, K = 5 to 200
 GRID_RATIO = (0.96, 1.14)  # backward over forward, without the first call at K = 5
 GRID_KB = (3.6, 4.6)  # peak over |V| K, "about 4"
 GRID_MORE_VERTICES, GRID_MORE_MEMORY = 360, 370  # at one K
 
-# Section "Runtime and scaling": a bunny of 339 vertices and 897 tets, ms of a step; the CUDA path and the Warp backend
-BUNNY_MS, BUNNY_WARP_MS, WARP_SLOWER = (3, 5), (34.7, 146.4), (7, 22)
-BUNNY_RATIO, BUNNY_WARP_RATIO = 1.7, 4.2  # backward over forward, appendix on the grid
+# Section "Runtime and scaling" and appendix on the grid: a bunny of 339 vertices and 897 tets, ms of a step on CUDA
+BUNNY_MS, BUNNY_RATIO = (3, 5), 1.7  # the second is backward over forward
 
 # Appendix "Inverse-problem tasks in detail" [s], [Pa]; the dress is of (1500, 800), Adam starts at (5000, 3000)
 COVER_SECONDS = 40
 DRESS_SINGLE_STAGE = {"dress-mu-lam": (1471, 880), "dress-silhouette": (1528, 900)}
-DRESS_ALTERNATION = (1325, 3310)  # stage B alone: a fixed point that is none of the problem
 
 
 @dataclass(frozen=True)
@@ -124,25 +114,31 @@ TASKS = {
 
 OURS, GLOBAL = "reverse sweep", ("global, assembled", "global, matrix-free")
 FULL, UNROLLED = "reverse sweep, full tape", "unrolled autograd"
+Results = dict[str, Any]
+Figure = Callable[[Any], Any]  # of results or of a task's history
 Line = tuple[Any, ...]  # figure, paper, ours on the CPU and on a GPU
 
 
 def beside(results: Path) -> str:
     """A table of what the paper says and what we measure on each device, from a folder of results; a figure that is not
     there is "-"."""
-    lines = [*_exactness(results), *_ablation(results), *_cost(results), *_differences(results), *_grid(results),
-             *_bunny(results), *_depth(results), *_cover(results / "tasks"), *_dress(results / "tasks")]  # fmt: skip
-    return markdown_table(("figure", "paper", "ours, CPU", "ours, GPU"), lines)
+    lines: list[Line] = []
+    for name, figures in (("exactness", _exactness()), ("ablation", _ablation()), ("cost", _cost()), ("fd", _fd())):
+        lines += [(label, theirs, *_both(results, name, ours)) for label, theirs, ours in figures]
+    groups = _content(results / "gpu.json").get("results", {})
+    lines += [(label, theirs, None, ours) for label, theirs, ours in (*_grid(groups), *_bunny(groups))]
+    lines += [(label, theirs, *_both(results, "depth", ours)) for label, theirs, ours in _depth()]
+    return markdown_table(("figure", "paper", "ours, CPU", "ours, GPU"), [*lines, *_tasks(results / "tasks")])
 
 
 def _content(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
-def _both(results: Path, name: str, figure: Callable[[dict[str, Any]], Any]) -> list[Any]:
-    """A figure of a benchmark's results on the CPU and on a GPU."""
-    contents = [_content(results / f"{name}{suffix}.json").get("results") for suffix in ("", "-cuda")]
-    return [None if content is None else figure(content) for content in contents]
+def _both(folder: Path, name: str, figure: Figure, key: str = "results") -> list[Any]:
+    """A figure of what a benchmark or a task has kept of the CPU and of a GPU."""
+    contents = [_content(folder / f"{name}{suffix}.json").get(key) for suffix in ("", "-cuda")]
+    return [figure(content) if content else None for content in contents]
 
 
 def _range(values: Iterable[Any]) -> str | None:
@@ -154,96 +150,84 @@ def _slashed(values: Iterable[Any]) -> str:
     return " / ".join(cell(value) for value in values)
 
 
-def _exactness(results: Path) -> Iterator[Line]:
+def _exactness() -> Iterator[tuple[str, Any, Figure]]:
     """By K: the reverse sweep, and the worse global route."""
     for n, (sweeps, theirs) in enumerate(EXACTNESS.items()):
         for label, names in ((OURS, (OURS,)), ("global adjoint", GLOBAL)):
 
-            def worst(r: dict[str, Any], n: int = n, names: tuple[str, ...] = names) -> float:
+            def worst(r: Results, n: int = n, names: tuple[str, ...] = names) -> float:
                 return max(r["scenes"]["preset"][n]["routes"][name]["error"] for name in names)
 
-            ours = _both(results, "exactness", worst)
-            yield f"gradient error, K = {sweeps}, {label}", max(theirs[name] for name in names), *ours
+            yield f"gradient error, K = {sweeps}, {label}", max(theirs[name] for name in names), worst
 
 
-def _ablation(results: Path) -> Iterator[Line]:
+def _ablation() -> Iterator[tuple[str, Any, Figure]]:
     for variant, theirs in ABLATION.items():
 
-        def error(r: dict[str, Any], wanted: tuple = (variant, 631, 1)) -> float | None:
+        def error(r: Results, wanted: tuple = (variant, 631, 1)) -> float | None:
             rows = {(row["variant"], row["vertices"], row["sweeps"]): row["error"] for row in r["rows"]}
             return rows.get(wanted)
 
         if "diffvbd" not in variant:
-            yield f"ablation, {variant}", theirs[631], *_both(results, "ablation", error)
+            yield f"ablation, {variant}", theirs[631], error
 
 
-def _cost(results: Path) -> Iterator[Line]:
-    def of(route: str, key: str = "backward_ms") -> Callable[[dict[str, Any]], float]:
-        return lambda r: next(row[key] for row in r["routes"] if row["route"] == route)
+def _cost() -> Iterator[tuple[str, Any, Figure]]:
+    def of(r: Results, route: str, key: str = "backward_ms") -> float:
+        return next(row[key] for row in r["routes"] if row["route"] == route)
 
-    def unrolled(key: str) -> Callable[[dict[str, Any]], float]:
-        return lambda r: of(UNROLLED, key)(r) / of(FULL, key)(r)
-
-    def faster(r: dict[str, Any]) -> float:
-        return min(of(name)(r) for name in GLOBAL) / of(FULL)(r)
-
-    def stiff(r: dict[str, Any]) -> str:
+    def stiff(r: Results) -> str:
         row = next(row for row in r["stiffness"] if row["modulus"] == STIFF_MODULUS)
         return _slashed(row["routes"][name]["total_iterations"] for name in GLOBAL)
 
-    lines: list[tuple[str, Any, Callable[[dict[str, Any]], Any]]] = [
-        ("backward of four steps [ms]", COST[FULL]["backward_ms"], of(FULL)),
-        ("less time than unrolled autograd, backward", LESS_TIME_THAN_UNROLLED, unrolled("backward_ms")),
-        ("less peak memory than unrolled autograd", LESS_MEMORY_THAN_UNROLLED, unrolled("memory")),
-        ("less time than the faster global route", LESS_TIME_THAN_GLOBAL, faster),
-        (f"global routes at {STIFF_MODULUS:g} Pa, iterations", STIFF_ITERATIONS, stiff),
-    ]
-    yield from ((label, theirs, *_both(results, "cost", ours)) for label, theirs, ours in lines)
+    yield "backward of four steps [ms]", COST[FULL]["backward_ms"], lambda r: of(r, FULL)
+    for what, theirs, key in (("time than unrolled autograd, backward", LESS_TIME_THAN_UNROLLED, "backward_ms"),
+                              ("peak memory than unrolled autograd", LESS_MEMORY_THAN_UNROLLED, "memory")):  # fmt: skip
+        yield f"less {what}", theirs, lambda r, key=key: of(r, UNROLLED, key) / of(r, FULL, key)
+    yield ("less time than the faster global route", LESS_TIME_THAN_GLOBAL,
+           lambda r: min(of(r, name) for name in GLOBAL) / of(r, FULL))  # fmt: skip
+    yield f"global routes at {STIFF_MODULUS:g} Pa, iterations", STIFF_ITERATIONS, stiff
 
 
-def _differences(results: Path) -> Iterator[Line]:
-    worst = lambda r: max(row["error"] for row in r["checks"] if "error" in row)  # noqa: E731
-    yield "finite differences, worst check", max(FINITE_DIFFERENCES.values()), *_both(results, "fd", worst)
+def _fd() -> Iterator[tuple[str, Any, Figure]]:
+    yield ("finite differences, worst check", max(FINITE_DIFFERENCES.values()),
+           lambda r: max(row["error"] for row in r["checks"] if "error" in row))  # fmt: skip
 
 
-def _grid(results: Path) -> Iterator[Line]:
-    rows = _content(results / "gpu.json").get("results", {}).get("grid", {}).get("rows", [])
+def _grid(groups: Results) -> Iterator[tuple[str, Any, Any]]:
+    rows = groups.get("grid", {}).get("rows", [])
     sizes = sorted({row["vertices"] for row in rows})
     peaks = {(row["vertices"], row["sweeps"]): row["full_peak"] for row in rows if row.get("full_peak")}
     ends = [peaks[n, 10] for n in (sizes[0], sizes[-1]) if (n, 10) in peaks] if sizes else []
     more = (None, None) if len(ends) < 2 else (sizes[-1] / sizes[0], ends[1] / ends[0])
     each = [peak / vertices / sweeps / 1e3 for (vertices, sweeps), peak in peaks.items()]
-    yield "K x V grid, backward over forward", _range(GRID_RATIO), None, _range(row.get("ratio") for row in rows)
-    yield "grid, peak memory [KB per vertex and sweep]", f"about 4, {_range(GRID_KB)}", None, _range(each)
+    yield "K x V grid, backward over forward", _range(GRID_RATIO), _range(row.get("ratio") for row in rows)
+    yield "grid, peak memory [KB per vertex and sweep]", f"about 4, {_range(GRID_KB)}", _range(each)
     yield ("grid at K = 10, times more vertices / times more memory", _slashed((GRID_MORE_VERTICES, GRID_MORE_MEMORY)),
-           None, _slashed(more))  # fmt: skip
+           _slashed(more))  # fmt: skip
 
 
-def _bunny(results: Path) -> Iterator[Line]:
-    rows = _content(results / "gpu.json").get("results", {}).get("bunny", {}).get("rows", [])
-    found = {row["part"]: row.get("ms") for row in rows}
+def _bunny(groups: Results) -> Iterator[tuple[str, Any, Any]]:
+    found = {row["part"]: row.get("ms") for row in groups.get("bunny", {}).get("rows", [])}
     both = found.get("forward with full tape"), found.get("reverse, full tape")
-    ratio = both[1] / both[0] if both[0] and both[1] else None
-    yield "bunny, K = 20: forward / backward of a step [ms]", f"about {_slashed(BUNNY_MS)}", None, _slashed(both)
-    yield "bunny, backward over forward", BUNNY_RATIO, None, ratio
+    yield "bunny, K = 20: forward / backward of a step [ms]", f"about {_slashed(BUNNY_MS)}", _slashed(both)
+    yield "bunny, backward over forward", BUNNY_RATIO, both[1] / both[0] if both[0] and both[1] else None
 
 
-def _depth(results: Path) -> Iterator[Line]:
+def _depth() -> Iterator[tuple[str, Any, Figure]]:
+    def shown(row: dict[str, Any]) -> str:
+        return f"{row['mean']:.3f} +- {row['std']:.3f}"
+
     for n, (sweeps, theirs) in enumerate(DEPTH.items()):
-        found = _both(results, "depth", lambda r, n=n: f"{r['depths'][n]['mean']:.3f} +- {r['depths'][n]['std']:.3f}")
-        yield f"cube-bounce, {sweeps} sweeps: mean distance [m]", f"{theirs['mean']:.3f} +- {theirs['std']:.3f}", *found
+        yield f"cube-bounce, {sweeps} sweeps: mean distance [m]", shown(theirs), lambda r, n=n: shown(r["depths"][n])
 
 
-def _cover(logs: Path) -> Iterator[Line]:
-    histories = [_content(logs / f"cover-the-spot{suffix}.json").get("history", []) for suffix in ("", "-cuda")]
+def _tasks(logs: Path) -> Iterator[Line]:
+    def found(history: Any) -> str | None:
+        first = [row for row in history if row["stage"] == 0]
+        return f"({first[-1]['mu']:.0f}, {first[-1]['lam']:.0f})" if first else None
+
     yield ("cover-the-spot [s], 600 evaluations", f"< {COVER_SECONDS}",
-           *(f"{h[-1]['seconds']:.0f}" if h else None for h in histories))  # fmt: skip
-
-
-def _dress(logs: Path) -> Iterator[Line]:
+           *_both(logs, "cover-the-spot", lambda history: f"{history[-1]['seconds']:.0f}", "history"))  # fmt: skip
     for name, theirs in DRESS_SINGLE_STAGE.items():
-        found = []
-        for suffix in ("", "-cuda"):
-            first = [row for row in _content(logs / f"{name}{suffix}.json").get("history", []) if row["stage"] == 0]
-            found.append(f"({first[-1]['mu']:.0f}, {first[-1]['lam']:.0f})" if first else None)
-        yield f"{name}, one stage of Adam, (mu, lam) [Pa]", str(theirs), *found
+        yield f"{name}, one stage of Adam, (mu, lam) [Pa]", str(theirs), *_both(logs, name, found, "history")

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import torch
@@ -40,35 +41,26 @@ LONGEST = 330  # [s] of a tool and a scene
 # torch gives tensors memory that others have written, with room at their ends; so each has its own
 UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 WORKERS = 14  # processes side by side: each keeps one core and little of the device busy
-Scene = Callable[[], tuple[dv.Model, Tensor, dict[str, Any]]]
+Scene = tuple[dv.Model, Tensor, dict[str, Any]]  # Model, velocities, regime and options of the solver
 
 
-def _free(regime: str | None, energies: tuple[Any, ...] = (), dtype: torch.dtype = torch.float64, **solver: Any
-          ) -> Scene:  # fmt: skip
+def _free(regime: str | None, *energies: Any, dtype: torch.dtype = torch.float64, **solver: Any) -> Scene:
     """Scenes without pairs: a beam that is held at one end, bent by its weight, and one that flies."""
-
-    def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
-        body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
-        both = mesh.join([body, body.translate((0.0, 0.3, 0.0))])
-        held = torch.tensor((both.points[:, 0] < 1e-9) & (both.body == 0))
-        model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, dtype=dtype)
-        return model, _moving(model, 3), {"regime": regime, "solver": solver}
-
-    return scene
+    body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
+    both = mesh.join([body, body.translate((0.0, 0.3, 0.0))])
+    held = torch.tensor((both.points[:, 0] < 1e-9) & (both.body == 0))
+    model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, dtype=dtype)
+    return model, _moving(model, 3), {"regime": regime, "solver": solver}
 
 
 def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, ...] = (),
               dtype: torch.dtype = torch.float64, **solver: Any) -> Scene:  # fmt: skip
     """Three cubes that fly into one another, on what else there is."""
-
-    def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
-        cube = mesh.box(size, 0.1, split="kuhn")
-        bodies = mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
-        model = dv.Model(bodies, energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=2e-3), *energies),
-                         colliders=colliders, device=DEVICE, dtype=dtype)  # fmt: skip
-        return model, _moving(model, scenes), {"regime": None, "solver": solver}
-
-    return scene
+    cube = mesh.box(size, 0.1, split="kuhn")
+    bodies = mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
+    model = dv.Model(bodies, energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=2e-3), *energies),
+                     colliders=colliders, device=DEVICE, dtype=dtype)  # fmt: skip
+    return model, _moving(model, scenes), {"regime": None, "solver": solver}
 
 
 def _moving(model: dv.Model, scenes: int) -> Tensor:
@@ -81,27 +73,27 @@ def _moving(model: dv.Model, scenes: int) -> Tensor:
 
 FLOOR, FRICTION = dv.FloorBarrier(height=-0.003, kappa=1e4, dhat=2e-3), dv.Friction(0.5)
 PLANE = dv.colliders.Plane((0.0, -0.003, 0.0))
-SCENES: dict[str, Scene] = {
-    "thread": _free("thread"),
-    "block": _free("block"),
-    "grid": _free("grid"),
-    "color": _free("color"),
-    "floor, float32": _free("block", (FLOOR,), dtype=torch.float32),
-    "floor, thread": _free("thread", (FLOOR,)),
-    "floor and friction": _free("color", (FLOOR, FRICTION)),
-    "coarse": _free(None, subspace="coarse", relaxation=1.5),
-    "pairs": _touching(1),
-    "pairs, friction, a collider": _touching(2, FRICTION, colliders=(PLANE,)),
-    "pairs, floor, float32": _touching(2, FLOOR, dtype=torch.float32),
-    "pairs, coarse": _touching(1, subspace="coarse"),
-    "pairs, many scenes": _touching(70),
-    "pairs, a larger scene": _touching(1, size=12),
+SCENES: dict[str, Callable[[], Scene]] = {
+    "thread": partial(_free, "thread"),
+    "block": partial(_free, "block"),
+    "grid": partial(_free, "grid"),
+    "color": partial(_free, "color"),
+    "floor, float32": partial(_free, "block", FLOOR, dtype=torch.float32),
+    "floor, thread": partial(_free, "thread", FLOOR),
+    "floor and friction": partial(_free, "color", FLOOR, FRICTION),
+    "coarse": partial(_free, None, subspace="coarse", relaxation=1.5),
+    "pairs": partial(_touching, 1),
+    "pairs, friction, a collider": partial(_touching, 2, FRICTION, colliders=(PLANE,)),
+    "pairs, floor, float32": partial(_touching, 2, FLOOR, dtype=torch.float32),
+    "pairs, coarse": partial(_touching, 1, subspace="coarse"),
+    "pairs, many scenes": partial(_touching, 70),
+    "pairs, a larger scene": partial(_touching, 1, size=12),
 }
 
 
 def step_of(scene: Scene, steps: int, sweeps: int) -> None:
     """Some steps and their gradients with respect to state and material, with each tape."""
-    model, v, options = scene()
+    model, v, options = scene
     x = model.rest_points.expand_as(v).clone()
     tapes = ("full",) if model.touches else ("full", "compact", "recompute")
     for tape in tapes:
@@ -187,7 +179,7 @@ def main(arguments: list[str]) -> None:
     global DEVICE
     DEVICE, steps, sweeps = arguments[0], *map(int, arguments[1:3])
     for name in arguments[3:]:
-        step_of(SCENES[name], steps, sweeps)
+        step_of(SCENES[name](), steps, sweeps)
         print(f"done {name}", flush=True)
 
 

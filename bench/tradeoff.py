@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,24 +28,32 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import common
-from bench.advice import DHAT, FRAMES, Run, Runs, Scene, advised
+from bench.advice import DHAT, ERRORS, FRAMES, Row, Run, Runs, Scene, advised
 from bench.tables import Table
 from diffvbd import mesh
 
 ELASTIC = dv.StableNeoHookean()
 
 
+def beam() -> dv.TetMesh:
+    """0.6 m long."""
+    return mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+
+
+def still(model: dv.Model) -> Tensor:
+    return torch.zeros_like(model.rest_points)
+
+
 def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, speed: float = 0.0, name: str = "") -> Scene:
     """A beam of 0.6 m held at one end, some swings of it. contrast: of its two halves' stiffness, in layers; speed:
     of its free end at first [m/s], where it would hardly sag."""
-    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    body = beam()
     model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
     lam = 2 * mu * poisson / (1 - 2 * poisson)
     share = np.where(body.points[body.tets].mean(1)[:, 1] > 0.075, 1.0, 1 / contrast)
     scale = torch.tensor(share) if contrast > 1 else torch.tensor(1.0, dtype=torch.float64)
-    swing = math.sqrt(1e5 / mu)
-    duration = float(np.clip(0.4 * swing, 0.02, 0.4))
-    v = torch.zeros_like(model.rest_points)
+    duration = float(np.clip(0.4 * math.sqrt(1e5 / mu), 0.02, 0.4))
+    v = still(model)
     v[:, 1] = speed * (model.rest_points[:, 0] / 0.6) ** 2
     material = {"mu": mu * scale, "lam": lam * scale}
     return Scene(name or f"cantilever, mu = {mu:.0e} Pa", model, v, duration, material)
@@ -57,12 +65,12 @@ def cloth() -> Scene:
     points = torch.tensor(body.points)
     corner = (points[:, 0] < 1e-9) & ((points[:, 2] < 0.02) | (points[:, 2] > 0.28))
     model = dv.Model(body, pinned=corner)
-    return Scene("cloth of 15 mm", model, torch.zeros_like(model.rest_points), 0.3, {"mu": 3e4, "lam": 3e4})
+    return Scene("cloth of 15 mm", model, still(model), 0.3, {"mu": 3e4, "lam": 3e4})
 
 
 def twist() -> Scene:
     """A bar whose ends are turned against each other by half a turn in 0.3 s."""
-    body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15), split="kuhn")
+    body = beam()
     rest = torch.tensor(body.points)
     left, right = rest[:, 0] < 1e-9, rest[:, 0] > 0.6 - 1e-9
     model = dv.Model(body, pinned=left | right)
@@ -78,8 +86,8 @@ def twist() -> Scene:
             out[end, 2] = middle[2] + s * arm[:, 1] + c * arm[:, 2]
         return out
 
-    return Scene("twist by half a turn", model, torch.zeros_like(rest), 0.3,
-                 {"mu": 1e5, "lam": 2e5, "prescribed": turned})  # fmt: skip
+    given = {"mu": 1e5, "lam": 2e5, "prescribed": turned}
+    return Scene("twist by half a turn", model, still(model), 0.3, given)
 
 
 def drop() -> Scene:
@@ -87,19 +95,22 @@ def drop() -> Scene:
     body = mesh.blob(5, 1, 0.1)
     body = body.translate((0, 0.01 + DHAT - body.points[:, 1].min(), 0))
     model = dv.Model(body, energies=(ELASTIC, dv.FloorBarrier(kappa=1e3, dhat=DHAT)))
-    v = torch.zeros_like(model.rest_points)
+    v = still(model)
     v[:, 1] = -1.0
     return Scene("drop on a floor", model, v, 0.1, {"young": 1e5, "poisson": 0.3})
 
 
-def pile(**barrier: Any) -> Scene:
+def pairs(**barrier: Any) -> dv.PairBarrier:
+    return dv.PairBarrier(kappa=1e4, dhat=DHAT, self_contact=False, **barrier)
+
+
+def pile() -> Scene:
     """Three boxes that fall on each other and on a floor, with friction."""
     rng, box = np.random.default_rng(1), mesh.box(3, 0.1, split="kuhn")
     shifts = [(float(x), 0.005 + 0.105 * n, float(z)) for n, (x, z) in enumerate(rng.uniform(-0.01, 0.01, (3, 2)))]
-    pairs = dv.PairBarrier(**{"kappa": 1e4, "dhat": DHAT, "self_contact": False} | barrier)
-    energies = (ELASTIC, pairs, dv.Friction(0.4), dv.FloorBarrier(kappa=1e4, dhat=DHAT))
+    energies = (ELASTIC, pairs(), dv.Friction(0.4), dv.FloorBarrier(kappa=1e4, dhat=DHAT))
     model = dv.Model(mesh.join([box.translate(shift) for shift in shifts]), energies=energies)
-    return Scene("pile of three boxes", model, torch.zeros_like(model.rest_points), 0.15, {"mu": 1e5, "lam": 2e5})
+    return Scene("pile of three boxes", model, still(model), 0.15, {"mu": 1e5, "lam": 2e5})
 
 
 def gripper(n: int = 3, plates: tuple[int, int, int] = (2, 3, 3), **barrier: Any) -> Scene:
@@ -115,8 +126,7 @@ def gripper(n: int = 3, plates: tuple[int, int, int] = (2, 3, 3), **barrier: Any
     x = torch.tensor(body.points)
     outer = (x[:, 0] < -thick - 0.5 * DHAT) | (x[:, 0] > size + thick + 0.5 * DHAT)
     outer[: cube.num_vertices] = False
-    pairs = dv.PairBarrier(**{"kappa": 1e4, "dhat": DHAT, "self_contact": False} | barrier)
-    model = dv.Model(body, pinned=outer, energies=(ELASTIC, pairs, dv.Friction(0.8)))
+    model = dv.Model(body, pinned=outer, energies=(ELASTIC, pairs(**barrier), dv.Friction(0.8)))
     inward = torch.where(outer, torch.where(x[:, 0] < 0, 1.0, -1.0), 0.0)
 
     def clamps(t: float) -> Tensor:
@@ -125,7 +135,7 @@ def gripper(n: int = 3, plates: tuple[int, int, int] = (2, 3, 3), **barrier: Any
         out[:, 1] += torch.where(outer, 0.3 * max(0.0, t - 0.05), 0.0)
         return out
 
-    return Scene("gripper", model, torch.zeros_like(x), 0.15, {"mu": 1e5, "lam": 2e5, "prescribed": clamps})
+    return Scene("gripper", model, still(model), 0.15, {"mu": 1e5, "lam": 2e5, "prescribed": clamps})
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
@@ -141,8 +151,6 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 LONGEST = 1 / 30  # [s], the first step
-ERRORS = (0.1, 0.01, 0.001)
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -158,8 +166,7 @@ class Effort:
 FULL, QUICK = Effort(0.5, 40.0, 40.0, 3e-4), Effort(0.05, 1.0, 1.0, 2e-2)
 
 
-@dataclass(frozen=True)
-class Way:
+class Way(NamedTuple):
     """A solver but for its step, and numbers of sweeps."""
 
     name: str
@@ -210,16 +217,14 @@ class Front:
         self.effort = effort
         self.scene = replace(scene, model=scene.model.to(device))
         self.runs = Runs(self.scene, gradient=True)
+        self.first_steps = FRAMES * math.ceil(scene.duration / (FRAMES * LONGEST))
         self.truth, self.unsure = self.reference()
-
-    def first_steps(self) -> int:
-        return FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST))
 
     def reference(self) -> tuple[Run, tuple[float, float]]:
         """The last of ever finer runs, and how far its motion and its gradient may be off."""
         solver = _vbd(integrator=SDIRK2) if self.scene.touches else _vbd(integrator=SDIRK2, **COARSE)
         solver = replace(solver, sweeps=80 if self.scene.touches else 20)
-        steps, last, off = self.first_steps(), None, (math.inf, math.inf)
+        steps, last, off = self.first_steps, None, (math.inf, math.inf)
         while True:
             now = self.runs.run(solver, steps)
             if last is not None and now.x is not None:
@@ -242,7 +247,7 @@ class Front:
         forward, both = (Runs(self.scene, gradient, way.dtype) for gradient in (False, True))
         out = []
         for sweeps in way.sweeps:
-            solver, steps = replace(way.solver, sweeps=sweeps), self.first_steps()
+            solver, steps = replace(way.solver, sweeps=sweeps), self.first_steps
             while True:
                 run, back = (runs.run(solver, steps, way.checkpoint_every) for runs in (forward, both))
                 motion, gradient = self.runs.apart(back if back.gradient else run, self.truth)
@@ -280,7 +285,10 @@ def measured(name: str, quick: bool, device: str) -> Row:
                 rows += front.way(way)
             except (ValueError, NotImplementedError) as error:  # what this scene does not support
                 rows.append({"way": way.name, "why": str(error)[:160]})
-        others = peers(front.scene, front.distance, quick) if name in ("soft", "stiff") and device == "cpu" else []
+        others: list[Row] = []
+        if name in ("soft", "stiff") and device == "cpu":
+            others = [*converged(front.scene, front.distance, 1 if quick else 5),
+                      *newton(front.scene, front.distance, quick)]  # fmt: skip
         advised = front.advised()
     print(f"{name}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
     return {"scene": front.scene.name, "vertices": model.num_vertices, "duration": front.scene.duration,
@@ -301,26 +309,16 @@ def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | N
     return {name: results[name] for name in SCENES if name in results}
 
 
-def best(rows: list[Row], error: float, by: str = "error", time: str = "ms") -> Row | None:
-    """The row that takes the least time of those within an error."""
-    within = [r for r in rows if isinstance(r.get(by), float) and r[by] <= error and isinstance(r[time], float)]
-    return min(within, key=lambda r: r[time], default=None)
-
-
-def front_of(rows: list[Row], by: str = "error", time: str = "ms") -> list[Row]:
+def front_of(rows: list[Row]) -> list[Row]:
     """Those that no other beats in both time and error, fastest first."""
     out: list[Row] = []
-    for row in sorted((r for r in rows if isinstance(r.get(by), float)), key=lambda r: r[time]):
-        if not out or row[by] < out[-1][by]:
+    for row in sorted(rows, key=lambda r: r["ms"]):
+        if not out or row["error"] < out[-1]["error"]:
             out.append(row)
     return out
 
 
 # --- other solvers of the same law ------------------------------------------------------------------------------------
-
-
-def peers(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
-    return [*converged(scene, distance, 1 if quick else 5), *newton(scene, distance, quick)]
 
 
 def converged(scene: Scene, distance: Distance, rungs: int) -> list[Row]:
@@ -386,13 +384,18 @@ def newton_model(engine: Any, scene: Scene) -> Any:
 # --- tables and picture -----------------------------------------------------------------------------------------------
 
 
+def numbers(rows: list[Row]) -> list[Row]:
+    """Rows of which error and time are numbers."""
+    return [r for r in rows if isinstance(r.get("error"), float) and isinstance(r["ms"], float)]
+
+
 def least_of(rows: list[Row]) -> Row:
     """Of rows of one way or solver, that of the least error."""
     return min((r for r in rows if isinstance(r.get("error"), float)), key=lambda r: r["error"], default={})
 
 
-def time_to(error: float) -> Any:
-    return lambda rows: (best(rows, error) or {}).get("ms")
+def time_to(error: float) -> Callable[[list[Row]], Any]:
+    return lambda rows: min((r["ms"] for r in numbers(rows) if r["error"] <= error), default=None)
 
 
 TIMES: dict[str, Any] = {
@@ -412,28 +415,29 @@ def draw(results: dict[str, Any], path: Path) -> None:
     """Points of the common ways, the front of all, and what dv.advise says."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    figure = Figure(layout="constrained")
     drawn = {"implicit Euler": ("o", "C1"), "implicit Euler, coarse": ("s", "C3"), "SDIRK2": ("^", "C0"),
              "SDIRK2, coarse": ("D", "C2"), "BDF2, coarse": ("v", "C4")}  # fmt: skip
     groups = list(results.values())
     columns = min(3, len(groups))
-    figure.set_size_inches(10, 3.0 * -(-len(groups) // columns))
-    all_axes = figure.subplots(-(-len(groups) // columns), columns, squeeze=False).ravel()
+    lines = math.ceil(len(groups) / columns)
+    figure.set_size_inches(10, 3.0 * lines)
+    all_axes = figure.subplots(lines, columns, squeeze=False).ravel()
     for ax, group in zip(all_axes, groups, strict=False):
-        rows = [r for r in group["rows"] if isinstance(r.get("error"), float) and isinstance(r["ms"], float)]
-        rows = [r for r in rows if r["way"] not in ASIDE]
+
+        def plot(rows: list[Row], style: str, ax: Any = ax, **options: Any) -> None:
+            ax.loglog([r["ms"] for r in rows], [r["error"] for r in rows], style, **options)
+
+        rows = [r for r in numbers(group["rows"]) if r["way"] not in ASIDE]
         for name, (marker, color) in drawn.items():
-            shown = [r for r in rows if r["way"] == name]
-            ax.loglog([r["ms"] for r in shown], [r["error"] for r in shown], marker, color=color, markersize=3,
-                      alpha=0.7, label=name)  # fmt: skip
-        front = front_of(rows)
-        ax.loglog([r["ms"] for r in front], [r["error"] for r in front], "k-", linewidth=0.8, label="front of all")
+            plot([r for r in rows if r["way"] == name], marker, color=color, markersize=3, alpha=0.7, label=name)
+        plot(front_of(rows), "k-", linewidth=0.8, label="front of all")
         told = [a for a in group["advised"] if a["reached"] and isinstance(a["error"], float)]
-        ax.loglog([a["ms"] for a in told], [a["error"] for a in told], "*", color="k", label="dv.advise")
+        plot(told, "*", color="k", label="dv.advise")
         if isinstance(group["unsure"], float):
             ax.axhline(group["unsure"], color="0.6", linestyle=":", label="the reference's own error")
         ax.set_title(group["scene"], fontsize="small")
-        ax.set(ylim=(1e-5, 3), xlabel="ms of a rollout")
+        ax.set_ylim(1e-5, 3)
         ax.xaxis.set_minor_formatter("")
         ax.set_xlabel("ms of a rollout", fontsize="small")
         ax.grid(alpha=0.3)

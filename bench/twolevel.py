@@ -4,9 +4,8 @@ Error: the largest distance of a vertex from where converged steps of the same h
 steps. Time: a whole step, on one thread, everything included; on CUDA that of a graph. With coarse corrections
 relaxation is 1.5; plain sweeps have the best of three relaxations and two starts at each K.
 
-One correction: its time in
-sweeps, by differences over K; `reverse` the backward to state and material alone. Targets: 2.5 sweeps, and 3 in
-reverse.
+One correction: its time in sweeps, by differences over K; `reverse` the backward to state and material alone. Targets:
+2.5 sweeps, and 3 in reverse.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.measure import Card, timed
-from bench.sweeps import MATERIAL, bar
+from bench.sweeps import MATERIAL, STEP, bar
 from bench.tables import Table
 from diffvbd.model.system import system_of
 
@@ -31,18 +30,17 @@ RELAXATION = 1.5  # with corrections
 
 @dataclass(frozen=True)
 class Scene:
+    """A body at rest."""
+
     name: str
     mesh: dv.TetMesh
     pinned: np.ndarray
     material: dict[str, Any]  # mu, lam [Pa]
-    time_step: float = 1 / 60
-    x: Tensor | None = None  # None: at rest
-    v: Tensor | None = None
     device: str = "cpu"
 
     def state(self) -> tuple[Tensor, Tensor]:
-        x = torch.from_numpy(self.mesh.points.copy()) if self.x is None else self.x
-        return x.to(self.device), (torch.zeros_like(x) if self.v is None else self.v).to(self.device)
+        x = torch.from_numpy(self.mesh.points.copy()).to(self.device)
+        return x, torch.zeros_like(x)
 
     @cached_property
     def model(self) -> dv.Model:
@@ -50,7 +48,7 @@ class Scene:
 
     def solver(self, sweeps: int = 1, subspace: Any = "coarse", relaxation: float = RELAXATION, start: Any = "auto"
                ) -> dv.VBD:  # fmt: skip
-        return dv.VBD(self.time_step, sweeps, subspace=subspace, relaxation=relaxation, start=start)
+        return dv.VBD(STEP, sweeps, subspace=subspace, relaxation=relaxation, start=start)
 
     def rolled(self, solver: dv.VBD, steps: int, save: Any = "all") -> dv.results.Trajectory:
         with torch.no_grad():
@@ -86,8 +84,7 @@ def cantilever(counts: tuple[int, int, int]) -> Scene:
 
 
 def hanging_bar() -> Scene:
-    model = bar()
-    return Scene("hanging bar", model.mesh, model.pinned.numpy(), dict(MATERIAL))
+    return Scene("hanging bar", bar().mesh, bar().pinned.numpy(), dict(MATERIAL))
 
 
 def sheet(ratio: float, cells: int = 20) -> Scene:
@@ -208,24 +205,19 @@ def cost(card: Card) -> list[dict[str, Any]]:
 
 def _cost(card: Card, scene: Scene, scenes: int) -> dict[str, Any]:
     scene = replace(scene, device=str(card.device))
-    took: dict[tuple, float] = {}
+    took: dict[tuple[str, str, int], float] = {}  # [ms], by part of a step
     for subspace in ("rigid", "coarse"):
         for sweeps in (FEW, MANY):
-            for backward in (False, True):
-                seconds = _seconds(card, scene, scene.solver(sweeps, subspace), scenes, backward)
-                took[subspace, sweeps, backward] = 1e3 * seconds
+            solver = scene.solver(sweeps, subspace)
+            alone, both = (1e3 * _seconds(card, scene, solver, scenes, backward) for backward in (False, True))
+            took |= {("forward", subspace, sweeps): alone, ("reverse", subspace, sweeps): both - alone}
         card.tidy()
-    corrections = dv.CoarseSpace().corrections(MANY) - dv.CoarseSpace().corrections(FEW)
+    few, many = (dv.CoarseSpace().corrections(sweeps) for sweeps in (FEW, MANY))
     row: dict[str, Any] = {"scene": scene.name, "functions": functions(scene)}
-    for part, minus in (("forward", False), ("reverse", True)):
-
-        def of(subspace: str, sweeps: int, part: str = part, minus: bool = minus) -> float:
-            whole = took[subspace, sweeps, part == "reverse"]
-            return whole - took[subspace, sweeps, False] if minus else whole
-
-        sweep = (of("rigid", MANY) - of("rigid", FEW)) / (MANY - FEW)
-        one = (of("coarse", MANY) - of("coarse", FEW) - (of("rigid", MANY) - of("rigid", FEW))) / corrections
-        besides = of("coarse", FEW) - of("rigid", FEW) - one * dv.CoarseSpace().corrections(FEW)
+    for part in ("forward", "reverse"):
+        rigid, coarse = (took[part, subspace, MANY] - took[part, subspace, FEW] for subspace in ("rigid", "coarse"))
+        sweep, one = rigid / (MANY - FEW), (coarse - rigid) / (many - few)
+        besides = took[part, "coarse", FEW] - took[part, "rigid", FEW] - one * few
         row |= {f"{part}_sweep_ms": sweep, f"{part}_correction_ms": one, f"{part}_besides_ms": besides}
     for name, unit in (("forward", "forward"), ("reverse", "forward"), ("reverse", "reverse")):
         row[f"{name}_correction_in_{unit}_sweeps"] = row[f"{name}_correction_ms"] / row[f"{unit}_sweep_ms"]

@@ -129,7 +129,8 @@ def test_quick_run_bears_out_the_claims(name: str, quick: Callable[[str], dict[s
 def test_a_forward_that_differs_is_refused() -> None:
     scene = exactness.build(exactness.Case(kind="structured", size="small", steps=1))
     expected = exactness.expected_of(scene, 1)
-    got = exactness.result_of(scene, 1, exactness.ROUTES[OURS](None, 0.0))
-    assert exactness.verify_forward(scene, got, expected, OURS) <= tolerance("forward")
+    got = exactness.result_of(scene, 1, exactness.adjoint_of(OURS))
+    h = scene.case.time_step
+    assert exactness.verified_forward(got, expected, h, OURS) <= tolerance("forward")
     with pytest.raises(RuntimeError, match="reverse sweep: expected the reference's end state"):
-        exactness.verify_forward(scene, {**got, "x": got["x"] + 1e-12}, expected, OURS)
+        exactness.verified_forward({**got, "x": got["x"] + 1e-12}, expected, h, OURS)

@@ -4,12 +4,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 import diffvbd as dv
-from bench import extremes, floors, tables
+from bench import extremes, tables
 from bench.__main__ import main
 from diffvbd.testing import tolerance
 
@@ -49,23 +48,6 @@ def test_nothing_crosses_in_scenes_that_are_drawn(tmp_path: Path) -> None:
     assert sum(row["scene_steps"] for row in rows) >= 150
     assert all(row["crossings"] == row["nonfinite"] == 0 for row in rows)
     assert max(row["cut"] for row in rows) > 0.05
-
-
-def a_ball(friction: float) -> floors.Scene:
-    """71 vertices, which meet the floor at 2 m/s."""
-    mesh = floors.ball(0.05, 0.025)
-    mesh = mesh.translate((0.0, 0.004 - mesh.points[:, 1].min(), 0.0))
-    body = floors.Body(mesh.points, mesh.tets, 1e5, 0.3, 2e-3, 6e4, 3e-3, friction=friction, gravity=(0.0, -9.81, 0.0))
-    return floors.Scene("ball", mesh, body, np.zeros_like(mesh.points) + (0.5, -2.0, 0.0), 12)
-
-
-@pytest.mark.parametrize(("subspace", "friction"), [("rigid", 0.0), ("rigid", 0.3), ("coarse", 0.0)])
-def test_sweeps_on_a_floor_come_to_a_converged_step_that_shares_no_code(subspace: Any, friction: float) -> None:
-    scene = a_ball(friction)
-    exact = scene.body.rollout(scene.mesh.points, scene.v, scene.steps)
-    assert max(scene.body.iterations) > 3 and exact[1][-1, :, 1].mean() > 0.5  # it has left the floor again
-    motion, _, _ = scene.executed(200, subspace=subspace)
-    assert max(floors.apart(scene, motion, exact).values()) < tolerance("converged_floor")
 
 
 def test_integrators_of_second_order_and_impacts_that_gain_nothing(tmp_path: Path) -> None:

@@ -1,10 +1,11 @@
-"""Animations of what diffvbd does, rendered into docs/images/gallery: `python -m bench gallery [--only NAME,...]`.
+"""Renders animations of what diffvbd does into docs/images/gallery: `python docs/images/gallery.py [NAME ...]`.
 
-No measurement: small scenes at modest resolution, some minutes in all on one core. Needs the extra [viz].
+Small scenes at modest resolution, some minutes in all on one core. Needs the extra [viz].
 """
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import sys
 import tempfile
@@ -16,30 +17,34 @@ import numpy as np
 import torch
 
 import diffvbd as dv
-from bench.common import ROOT, chosen
 from diffvbd import losses, viz
 from diffvbd.tasks import TASKS, Settings, beam, dress, solve
 from diffvbd.viz.motion import load_motions
 
-FOLDER = ROOT / "docs" / "images" / "gallery"
+FOLDER = Path(__file__).parent / "gallery"
 MOST_BYTES = 400_000
 SIZE = (440, 300)
 
 
-def main(only: str | None = None, out: Path | None = None) -> int:
-    """Render all, or some by name; returns the exit status."""
-    names = chosen(only, SCENES)
-    folder = out or FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
+def main() -> None:
+    """Render all, or some by name."""
+    parser = argparse.ArgumentParser(description="Renders animations.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(SCENES)} (default: all)")
+    parser.add_argument(
+        "--out", type=Path, default=FOLDER, help="folder of the animations (default: docs/images/gallery)"
+    )
+    options = parser.parse_args()
+    if unknown := [name for name in options.names if name not in SCENES]:
+        parser.error(f"NAME: expected names among {', '.join(SCENES)}, got {', '.join(unknown)}")
+    options.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
-    for name in names:
-        begun, path = time.perf_counter(), folder / f"{name}.webp"
+    for name in options.names or SCENES:
+        begun, path = time.perf_counter(), options.out / f"{name}.webp"
         SCENES[name](path)
         size = path.stat().st_size
         print(f"{path}: {size / 1e3:.0f} kB, {time.perf_counter() - begun:.0f} s", flush=True)
         if size > MOST_BYTES:
             sys.exit(f"{path}: expected at most {MOST_BYTES} bytes, got {size}")
-    return 0
 
 
 def still(model: dv.Model) -> tuple[torch.Tensor, torch.Tensor]:
@@ -207,3 +212,7 @@ SCENES: dict[str, Callable[[Path], None]] = {
     "bunny_bounce": bounce,
     "cubes": many_cubes,
 }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Pictures of the viewer's page for docs/viewer.md: `python -m bench screenshots`. Needs playwright and Chromium."""
+"""Takes the pictures of docs/viewer.md: `python docs/images/screenshots.py`. Needs playwright and Chromium."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from typing import Any
 import torch
 
 import diffvbd as dv
-from bench.common import ROOT
 
-FOLDER = ROOT / "docs" / "images"
+FOLDER = Path(__file__).parent
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SETTLED = 4.0  # [s] until a browser that draws in software has drawn
 
 
-def main(out: Path | None = None) -> int:
-    """Take all pictures; returns the exit status."""
+def main() -> None:
+    """Take all pictures."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         sys.exit("screenshots: expected chromium or google-chrome in PATH, got neither")
@@ -31,12 +30,11 @@ def main(out: Path | None = None) -> int:
         chromium = tools.chromium.launch(executable_path=browser, args=[*ARGUMENTS])
         for name, show in PICTURES.items():
             page = chromium.new_page(viewport={"width": 900, "height": 620}, device_scale_factor=1)
-            path = (out or FOLDER) / f"viewer_{name}.webp"
+            path = FOLDER / f"viewer_{name}.webp"
             show(lambda viewer, page=page, path=path: take(viewer, page, path))
             page.close()
             print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
         chromium.close()
-    return 0
 
 
 def take(viewer: dv.viz.Viewer, page: Any, path: Path) -> None:
@@ -117,3 +115,7 @@ PICTURES: dict[str, Callable[[Callable[[dv.viz.Viewer], None]], None]] = {
     "optimisation": optimisation,
     "sliders": sliders,
 }
+
+
+if __name__ == "__main__":
+    main()
