@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -39,10 +40,12 @@ from ..step.predict import energy_data
 
 
 class ForceParts(NamedTuple):
-    """Forces [N], shape [..., 3]: ``normal`` by barriers and damping, ``tangential`` by friction."""
+    """Forces [N], shape [..., 3]: ``normal`` by barriers and damping, ``tangential`` by friction. ``torque`` [N m] is
+    that of both, about the point given to :func:`forces`."""
 
     normal: Tensor
     tangential: Tensor
+    torque: Tensor
 
     @property
     def total(self) -> Tensor:
@@ -60,6 +63,7 @@ class Forces:
         between: On body a of each of these by body b, [..., M, 3]; b bears the opposite.
         colliders: On each body by each collider, [..., N, colliders, 3].
         floors: On each body by each plane of the FloorBarrier, [..., N, planes, 3].
+        bodies: On each body by all others, colliders and planes, [..., N, 3].
     """
 
     vertices: ForceParts
@@ -67,6 +71,7 @@ class Forces:
     between: ForceParts
     colliders: ForceParts
     floors: ForceParts
+    bodies: ForceParts
 
     def __str__(self) -> str:
         """A line for each two bodies, each collider and each plane that press; of batches the shapes alone."""
@@ -76,7 +81,7 @@ class Forces:
         lines = []
 
         def add(name: str, parts: ForceParts, at: tuple[int, ...]) -> None:
-            normal, tangential = (t.detach().reshape(t.shape[len(scenes) :])[at].tolist() for t in parts)
+            normal, tangential = (t.detach().reshape(t.shape[len(scenes) :])[at].tolist() for t in parts[:2])
             if any(normal) or any(tangential):
                 words = (" ".join(f"{value:.4g}" for value in force) for force in (normal, tangential))
                 lines.append(f"{name}: normal ({next(words)}) N, friction ({next(words)}) N")
@@ -91,7 +96,13 @@ class Forces:
 
 
 def forces(
-    model: Model, x: Tensor, solver: VBD | None = None, *, previous: tuple[Tensor, Tensor] | None = None, **inputs: Any
+    model: Model,
+    x: Tensor,
+    solver: VBD | None = None,
+    *,
+    previous: tuple[Tensor, Tensor] | None = None,
+    about: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
+    **inputs: Any,
 ) -> Forces:
     """Forces that pairs, colliders and floors exert at x, by vertex, by two bodies, by collider and by plane.
 
@@ -104,6 +115,7 @@ def forces(
         x: Positions [m], shape [..., V, 3].
         solver: That of the step, whose time step is read.
         previous: State (x, v) from which one step led to ``x``, of x's shape; v is not read.
+        about: Point that torques are about [m], shape [3] or [..., 3]. Each force acts where its corner point is.
         inputs: As in :func:`diffvbd.step`; those of the barriers, friction, colliders and colliders_before are read.
 
     Returns:
@@ -127,23 +139,46 @@ def forces(
     _refuse_below(given, {"x": x, "previous: x": start})
     state = _contact_at(given, x, previous)
     lead, dtype = x.shape[:-2], x.dtype
+    point = _points_about(about, x)
 
-    def shaped(normal: Tensor, tangential: Tensor) -> ForceParts:
-        return ForceParts(*(t.reshape(*lead, *t.shape[1:]).to(dtype) for t in (normal, tangential)))
+    def shaped(normal: Tensor, tangential: Tensor, torque: Tensor) -> ForceParts:
+        return ForceParts(*(t.reshape(*lead, *t.shape[1:]).to(dtype) for t in (normal, tangential, torque)))
 
     surface = given.model.surface_of_contact
     labels = given.model.body
     bodies = int(labels.max()) + 1 if labels.numel() else 0
-    floors = [_by_label(part, labels, bodies) for part in (state.floor, state.floor_friction)]
-    sums = _OfBodies(state, bodies, 0 if surface is None else len(surface.rows), surface.body if surface else labels)
+    arms = state.points[:, : len(labels)] - point[:, None]
+
+    def with_torque(normal: Tensor, tangential: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        arm = arms if normal.dim() == 3 else arms[:, :, None].expand(normal.shape)
+        return normal, tangential, cross(arm, normal + tangential)
+
+    floors = [_by_label(part, labels, bodies) for part in with_torque(state.floor, state.floor_friction)]
+    sums = _OfBodies(state, bodies, 0 if surface is None else len(surface.rows), surface.body if surface else labels,
+                     point)  # fmt: skip
     body_pairs, *between = sums.between()
     return Forces(
-        vertices=shaped(*state.on_vertices()),
+        vertices=shaped(*with_torque(*state.on_vertices())),
         body_pairs=body_pairs,
         between=shaped(*between),
         colliders=shaped(*sums.colliders()),
         floors=shaped(*floors),
+        bodies=shaped(*(own + floor.sum(2) for own, floor in zip(sums.bodies(), floors, strict=True))),
     )
+
+
+def _points_about(about: Tensor | Sequence[float], x: Tensor) -> Tensor:
+    """The point of each scene [B, 3] in float64."""
+    point, lead = torch.as_tensor(about, dtype=torch.float64, device=x.device), x.shape[:-2]
+    if (
+        point.shape[-1:] != (3,)
+        or point.dim() > len(lead) + 1
+        or any(n not in (1, m) for n, m in zip(point.shape[-2::-1], lead[::-1], strict=False))
+    ):
+        fail("about", f"a point of shape [3] or {[*lead, 3]}", f"shape {list(point.shape)}")
+    if looks_at(point):
+        name_value("about", "finite coordinates", point, torch.isfinite(point))
+    return point.expand(*lead, 3).reshape(lead.numel(), 3)
 
 
 def _refuse_non_finite(model: Model, where: dict[str, Tensor | None]) -> None:
@@ -189,42 +224,53 @@ def _by_label(values: Tensor, labels: Tensor, count: int) -> Tensor:
 
 
 class _OfBodies:
-    """Forces of pairs, added up by the bodies of their two sides; colliders count on from the ``bodies``."""
+    """Forces of pairs and their torques, added up by the bodies of their two sides; colliders count on from the
+    ``bodies``."""
 
-    def __init__(self, state: ContactState, bodies: int, colliders: int, labels: Tensor) -> None:
-        self.bodies, self.count, self.scenes = bodies, colliders, len(state.points)
+    def __init__(self, state: ContactState, bodies: int, colliders: int, labels: Tensor, about: Tensor) -> None:
+        self.count, self.colliding, self.scenes = bodies, colliders, len(state.points)
         parts: list[tuple[NearPairs, Tensor, int]] = [(state.pairs, state.barrier, 0)]
         if state.lagged is not None:
             parts += [(state.lagged, state.damping, 0), (state.lagged, state.friction, 1)]
         rows = []
         for pairs, on_corners, part in parts:
-            (a, b), force = (side.long() for side in pairs.sides(labels)), pairs.of_first(on_corners)
-            turned = a > b  # bodies before colliders, and the lower one first
-            force = torch.where(turned[:, None], -force, force)
-            rows.append((pairs.scene, torch.minimum(a, b), torch.maximum(a, b), torch.full_like(a, part), force))
-        self.scene, self.a, self.b, self.part, self.force = (torch.cat(column) for column in zip(*rows, strict=True))
+            torque = cross(pairs.positions(state.points) - about[pairs.scene, None], on_corners)
+            both = torch.cat([on_corners, torque], -1)  # [Q, 4, 6]
+            first = pairs.of_first(both)
+            rows.append((pairs.scene, *(side.long() for side in pairs.sides(labels)), torch.full_like(pairs.kind, part),
+                         first, both.sum(1) - first))  # fmt: skip
+        self.scene, a, b, self.part, of_a, of_b = (torch.cat(column) for column in zip(*rows, strict=True))
+        turned = a > b  # bodies before colliders, and the lower one first
+        self.a, self.b = torch.minimum(a, b), torch.maximum(a, b)
+        self.of_a, self.of_b = (torch.where(turned[:, None], *both) for both in ((of_b, of_a), (of_a, of_b)))
 
-    def between(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Body pairs [M, 2], normal and tangential forces on their first bodies [B, M, 3]."""
-        own = (self.b < self.bodies) & (self.a < self.b)
-        key = self.a[own] * self.bodies + self.b[own]
+    def between(self) -> tuple[Tensor, ...]:
+        """Body pairs [M, 2], normal and tangential forces and torques on their first bodies [B, M, 3]."""
+        own = (self.b < self.count) & (self.a < self.b)
+        key = self.a[own] * self.count + self.b[own]
         keys, column = key.unique(return_inverse=True)
-        found = torch.stack([keys // max(1, self.bodies), keys % max(1, self.bodies)], -1)
-        return found, *self._sums(own, column, len(keys))
+        found = torch.stack([keys // max(1, self.count), keys % max(1, self.count)], -1)
+        return found, *self._sums(own, self.of_a, column, len(keys))
 
-    def colliders(self) -> tuple[Tensor, Tensor]:
-        """Normal and tangential forces on bodies by colliders [B, bodies, colliders, 3]."""
-        own = self.b >= self.bodies
-        column = self.a[own] * self.count + self.b[own] - self.bodies
-        normal, tangential = self._sums(own, column, self.bodies * self.count)
-        shape = (self.scenes, self.bodies, self.count, 3)
-        return normal.reshape(shape), tangential.reshape(shape)
+    def colliders(self) -> tuple[Tensor, ...]:
+        """Normal and tangential forces and torques on bodies by colliders [B, bodies, colliders, 3]."""
+        own = self.b >= self.count
+        column = self.a[own] * self.colliding + self.b[own] - self.count
+        shape = (self.scenes, self.count, self.colliding, 3)
+        return tuple(t.reshape(shape) for t in self._sums(own, self.of_a, column, self.count * self.colliding))
 
-    def _sums(self, own: Tensor, column: Tensor, columns: int) -> tuple[Tensor, Tensor]:
-        total = self.force.new_zeros(2 * self.scenes * columns, 3)
+    def bodies(self) -> tuple[Tensor, ...]:
+        """Normal and tangential forces and torques on bodies by others and by colliders [B, bodies, 3]."""
+        apart, moves = self.a < self.b, self.b < self.count
+        first = self._sums(apart, self.of_a, self.a[apart], self.count)
+        second = self._sums(apart & moves, self.of_b, self.b[apart & moves], self.count)
+        return tuple(one + two for one, two in zip(first, second, strict=True))
+
+    def _sums(self, own: Tensor, values: Tensor, column: Tensor, columns: int) -> tuple[Tensor, ...]:
+        total = values.new_zeros(2 * self.scenes * columns, 6)
         index = (self.part[own] * self.scenes + self.scene[own]) * columns + column
-        normal, tangential = total.index_add(0, index, self.force[own]).reshape(2, self.scenes, columns, 3)
-        return normal, tangential
+        normal, tangential = total.index_add(0, index, values[own]).reshape(2, self.scenes, columns, 6)
+        return normal[..., :3], tangential[..., :3], (normal + tangential)[..., 3:]
 
 
 # --- pins and material ------------------------------------------------------------------------------------------------

@@ -76,6 +76,46 @@ def test_at_rest_forces_carry_the_weight(device: str, support: str) -> None:
         assert not borne[:8].any() and float((borne.sum(0) - up).abs().max()) <= least
 
 
+@pytest.mark.parametrize("support", ("floor", "plane", "body"))
+def test_at_rest_torques_balance_the_weights(device: str, support: str) -> None:
+    model = resting(support, device)
+    x = settled(model)
+    mass = model.mass[:8, None]
+    center, weight = (mass * x[:8]).sum(0) / mass.sum(), x.new_tensor([0.0, float(mass.sum()) * GRAVITY, 0.0])
+    about = center + x.new_tensor([0.3, -0.2, 0.5])
+    found = dv.contact.forces(model, x, about=about)
+    expected = torch.linalg.cross(center - about, weight)
+    ground = {"floor": found.floors, "plane": found.colliders, "body": found.between}[support]
+    for torque in (ground.torque.reshape(3), found.bodies.torque[0], per_body(model, found.vertices.torque)[0]):
+        assert float((torque - expected).abs().max()) <= tolerance("closed_form") * float(weight.norm())
+    own = dv.contact.forces(model, x, about=center).bodies
+    assert float(own.torque[0].norm()) <= tolerance("closed_form") * float(weight.norm())
+
+
+def test_torques_are_differentiated_and_turn_with_the_point() -> None:
+    model, options = run(contact_scenes.SCENES["obstacles"](), 5)
+    x = options.pop("x").detach()
+
+    def torque(at: torch.Tensor, about: torch.Tensor) -> torch.Tensor:
+        found = dv.contact.forces(model, at, about=about, **options)
+        return found.colliders.torque.sum((-3, -2)) + found.bodies.torque.sum(-2)
+
+    point, way = x.new_tensor([0.1, 0.2, -0.3]), contact_scenes.noise("torque", shape=x.shape, size=1.0)
+    at = x.clone().requires_grad_()
+    slope = float((torch.autograd.grad(torque(at, point)[0], at)[0] * way).sum())
+    h = 1e-9
+    central = float((torque(x + h * way, point) - torque(x - h * way, point))[0]) / (2 * h)
+    assert slope != 0 and abs(slope - central) <= 1e-5 * abs(slope)
+    found = dv.contact.forces(model, x, about=point, **options).bodies
+    moved = dv.contact.forces(model, x, about=point + way[0], **options).bodies
+    shifted = found.torque - torch.linalg.cross(way[0].expand_as(found.total), found.total)
+    assert float((moved.torque - shifted).abs().max()) <= 1e-10 * float(
+        found.torque.abs().max() + found.total.abs().max()
+    )
+    with pytest.raises(ValueError, match="about: expected a point"):
+        dv.contact.forces(model, x, about=(0.0, 1.0), **options)
+
+
 def test_printed_they_say_who_presses_whom() -> None:
     model = resting("body", "cpu")
     x = settled(model)
