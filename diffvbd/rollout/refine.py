@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .._common.checks import check_positive, fail, to_float
+from .._common.checks import check_bool, check_positive, fail, to_float
 from .._common.constants import ELASTIC
 from .._common.context import Finer, record_to, refined
 from .._common.messages import percent
@@ -22,7 +22,7 @@ from ..model.solver import VBD
 from ..step.integrators import History, is_step_of
 from ..step.residual import UNBALANCED, left_of_solve, share
 from .checks import check_checks
-from .trajectory import PerStep, StepAverage, Trajectory, stacked
+from .trajectory import PerStep, StepAverage, Trajectory, mapped, stacked
 
 MOST = 16  # times the sweeps, until the forces of the finest run balance
 STEPS = (0.01, 0.1)  # of a parameter, of central differences
@@ -200,8 +200,7 @@ def refine(
     began = None if before is None else _scalar("before", before)
     if began is not None and not math.isfinite(began):
         fail("before", "a finite loss", began)
-    if not isinstance(mesh, bool):
-        raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
+    check_bool("mesh", mesh)
     runs = _Runs(loss, _parameters(gradient))
     once = runs.run("own", Finer(1, 1, []))
     if began is not None and not began > once:
@@ -318,6 +317,7 @@ def _scalar(name: str, value: Tensor | float) -> float:
 
 # --- a rollout over the same time with smaller steps, more sweeps or smaller tets, as dv.refine -----------------------
 
+NO_STAGES = "refine: expected prescribed positions without those of stages"
 _MOVING = ("prescribed", "colliders", "colliders_before")  # other inputs are held over the smaller steps
 
 
@@ -416,7 +416,7 @@ def _moving(value: Any, parts: int, model: Model) -> Any:
         else:
             end = value.values[step // parts] if isinstance(value, PerStep) else value
         if not isinstance(end, Tensor):
-            raise NotImplementedError("refine: expected prescribed positions without those of stages")
+            raise NotImplementedError(NO_STAGES)
         way = begin + (end - begin) * ((step % parts + 1) / parts)
         # a policy has given elsewhere where vertices were: that is checked in the first smaller step, and old in others
         return torch.where(pinned, way, end if step % parts == 0 else x)
@@ -480,15 +480,12 @@ def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, An
     count = fine.vertices
     tets, pinned = model.num_tets, fine.model.pinned[:, None]
 
-    def mapped(name: str, change: Callable[[Any], Any]) -> Any:
-        value = given[name]
-        if isinstance(value, PerStep):  # [steps] is a number for each
-            return value if value.values.dim() == 1 else PerStep(change(value.values))
-        if isinstance(value, StepAverage):
-            return value.then(change)
-        if callable(value) and not isinstance(value, Tensor):
-            return lambda k, x, v: change(value(k, x[..., :count, :], v[..., :count, :]))
-        return change(value)
+    def changed(value: Any, change: Callable[[Any], Any]) -> Any:
+        if isinstance(value, PerStep) and value.values.dim() == 1:  # [steps] is a number for each
+            return value
+        if isinstance(value, (Tensor, StepAverage)) or not callable(value):
+            return mapped(value, change)
+        return lambda k, x, v: change(value(k, x[..., :count, :], v[..., :count, :]))
 
     def pushed(force: Any) -> Any:
         if force is None:
@@ -501,21 +498,16 @@ def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, An
         return fine.between(gravity) if each else gravity
 
     def moved(ends: Any) -> Any:
-        if ends is None:
-            return None
-        if not isinstance(ends, Tensor):
-            raise NotImplementedError("refine: expected prescribed positions without those of stages")
-        return torch.where(pinned, fine.between(ends), torch.nan)
+        if isinstance(ends, Tensor):
+            return torch.where(pinned, fine.between(ends), torch.nan)
+        if ends is not None:
+            raise NotImplementedError(NO_STAGES)
+        return None
 
-    def shaped(points: Any) -> Any:
-        return None if points is None else fine.between(points)
-
-    def of_each(value: Any) -> Any:
-        return of_parts(value, tets)
-
-    changes = {"force": pushed, "gravity": accelerated, "prescribed": moved, "rest_points": shaped}
-    changes |= dict.fromkeys((*MODULI, "density"), of_each)
-    return {name: mapped(name, changes[name]) if name in changes else value for name, value in given.items()}
+    changes = {"force": pushed, "gravity": accelerated, "prescribed": moved,
+               "rest_points": lambda points: None if points is None else fine.between(points)}  # fmt: skip
+    changes |= dict.fromkeys((*MODULI, "density"), lambda value: of_parts(value, tets))
+    return {name: changed(value, changes[name]) if name in changes else value for name, value in given.items()}
 
 
 # --- when a run may be called a reference -----------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import math
 import time
@@ -38,7 +37,7 @@ from .refine import (
     with_more_sweeps,
 )
 from .rollout import rollout
-from .trajectory import PerStep, StepAverage, Trajectory, refuse_average
+from .trajectory import PerStep, StepAverage, Trajectory, mapped, refuse_average
 
 
 @dataclass(frozen=True)
@@ -484,22 +483,16 @@ def changes(given: dict[str, Any]) -> bool:
 
 
 def converted(value: Any, **to: Any) -> Any:
-    """Tensors, those in a dict and what functions of time return, on another device or of another floating dtype."""
-    if isinstance(value, Tensor):
-        floats = value.is_floating_point()
-        return value.to(**{name: kind for name, kind in to.items() if floats or name != "dtype"})
-    if isinstance(value, dict):
-        return {name: converted(part, **to) for name, part in value.items()}
-    if isinstance(value, StepAverage):
-        return value.then(lambda found: converted(found, **to))
-    if not callable(value):
-        return value
+    """Tensors, those in a dict and what functions return, on another device or of another floating dtype."""
 
-    @functools.wraps(value)  # with its arguments, by which policies are told from functions of time
-    def made(*at: Any) -> Any:
-        return converted(value(*at), **to)
+    def change(found: Any) -> Any:
+        if isinstance(found, dict):
+            return {name: converted(part, **to) for name, part in found.items()}
+        floats = isinstance(found, Tensor) and found.is_floating_point()
+        kinds = {name: kind for name, kind in to.items() if floats or name != "dtype"}
+        return found.to(**kinds) if isinstance(found, Tensor) else found
 
-    return made
+    return mapped(value, change)
 
 
 def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:
@@ -633,10 +626,9 @@ class _Search:
         left = math.inf  # of forces, by the run that was last taken for the reference
         unseen = "what changes in time" if changes(p.given) else ""
         while True:
-            if steps > MOST_STEPS and unseen and self.levels:
-                return False, f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
             if steps > MOST_STEPS:
-                return False, f"{MOST_STEPS} steps are not enough"
+                swings = f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
+                return False, swings if unseen and self.levels else f"{MOST_STEPS} steps are not enough"
             if p.spent > self.time_budget:
                 return False, f"{self.time_budget:g} s of trial runs were not enough (time_budget)"
             now = p.run(settings, steps)
@@ -655,7 +647,6 @@ class _Search:
             if len(self.levels) > 1:
                 apart.append(self._distance(self.levels[-2], now))
             if len(apart) > 1:
-                self._see_order(apart)
                 error = max(self._remaining(apart), self._unresolved())
                 self.estimates.append((error, now))
                 if error <= 0.5 * self.error:
@@ -675,23 +666,21 @@ class _Search:
                 if self._is_rounding():
                     return False, (f"shorter steps than those of {min(self.estimates, key=lambda e: e[0])[1].settings} "
                                    f"make it worse, as rounding does in {p.model.dtype}")  # fmt: skip
-                if self._is_stuck(apart):
+                if len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:]):  # no closer over several levels
                     return False, self._why(apart[-1])
             steps *= 2
 
     def _remaining(self, apart: list[float]) -> float:
-        """The error of the last run."""
-        if self.clean:
-            return apart[-1] / (2**self.order - 1)
-        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
-
-    def _see_order(self, apart: list[float]) -> None:
-        """The order that the last runs show; with contact it is believed where two levels in a row agree on one."""
+        """The error of the last run, by the order that the last runs show; with contact that is believed where two
+        levels in a row agree on one."""
         low, high = ORDERS
         last = [max(a, 1e-300) for a in apart[-3:]]
         shown = [math.log2(a / b) for a, b in zip(last, last[1:], strict=False)]
         self.order = min(max(shown[-1] if self.smooth else min(shown), low), high)
         self.clean = self.smooth or (len(shown) > 1 and min(shown) >= CLEAN)
+        if self.clean:
+            return apart[-1] / (2**self.order - 1)
+        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
 
     def _unresolved(self) -> float:
         """Motion that is lost with energy, and that runs which agree may therefore both lack. Vibrations swing within a
@@ -720,11 +709,6 @@ class _Search:
         errors = [error for error, _ in self.estimates]
         single = self.trials.model.dtype == torch.float32
         return single and self.smooth and len(errors) > 2 and min(errors[-2:]) > 2 * min(errors[:-2])
-
-    @staticmethod
-    def _is_stuck(apart: list[float]) -> bool:
-        """Whether runs have come no closer to one another over several levels."""
-        return len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:])
 
     def _why(self, apart: float) -> str:
         cause = "it holds vibrations down to the shortest that the mesh can carry"
@@ -764,8 +748,9 @@ class _Search:
                 self.proven.append(Candidate(run.settings, error, run.seconds, True))
         self.uncertain, self.truth = uncertain, reference
         self.climbed = p.spent
-        # with as many steps as the refinement takes for an error as wanted
-        level, near = self._level_near(reference)
+        # with as many steps as the refinement takes for an error nearest to the wanted one, before its last run
+        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.levels[:-1]]
+        level, near = min(levels, key=lambda entry: abs(math.log(entry[0] / self.error)))
         # a quarter says what a candidate's error is over that of the refinement, which then must be no rounding
         compares = self.smooth and level > ROUNDING * self.error
         predict = self._by_quarter(level, near) if compares else self._by_whole
@@ -784,12 +769,17 @@ class _Search:
         """The error of settings, and the time of a step, by the quarter of the duration in which steps matter most."""
         p, last, before = self.trials, self.levels[-1], self.levels[-2]
         quarter = p.hardest(before.x, last.x)
-        target = last.x[quarter + 1]
-        scale = self._of_quarter(p.run(near.settings, near.steps, quarter, last), target)
+
+        def measured(settings: VBD, steps: int) -> tuple[float, float]:
+            run = p.run(settings, steps, quarter, last)
+            off = math.inf if run.failure else float((run.x[-1] - last.x[quarter + 1]).square().mean().sqrt())
+            return off, run.seconds / steps
+
+        scale, _ = measured(near.settings, near.steps)
 
         def predict(settings: VBD, steps: int) -> tuple[float, float]:
-            run = p.run(settings, steps, quarter, last)
-            return level * self._of_quarter(run, target) / max(scale, 1e-300), run.seconds / steps
+            off, per_step = measured(settings, steps)
+            return level * off / max(scale, 1e-300), per_step
 
         return predict
 
@@ -801,14 +791,6 @@ class _Search:
         error = self._distance(run, self.truth)
         self.proven.append(Candidate(run.settings, error + self.uncertain, run.seconds, True))
         return error, run.seconds / steps
-
-    def _level_near(self, reference: TrialRun) -> tuple[float, TrialRun]:
-        """The error nearest to the wanted one of a run of the refinement before its last, and that run."""
-        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.levels[:-1]]
-        return min(levels, key=lambda level: abs(math.log(level[0] / self.error)))
-
-    def _of_quarter(self, run: TrialRun, target: Tensor) -> float:
-        return math.inf if run.failure else float((run.x[-1] - target).square().mean().sqrt())
 
     def _plan(self, settings: VBD, steps: int, error: float, per_step: float) -> None:
         order = self._order_of(settings)
@@ -1032,8 +1014,7 @@ def error_budget(
     h, duration = check_time_step(solver.time_step, model.dtype), check_positive("duration", duration, "s")
     if not h <= (1 + SAME_TIME_STEP) * duration:
         fail("solver", f"a time step of at most the duration, {duration:g} s", f"{h:g} s")
-    if not isinstance(mesh, bool):
-        raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
+    check_bool("mesh", mesh)
     fraction = check_number("fraction", fraction)
     if not 0 < fraction <= 1:
         fail("fraction", "a number in (0, 1]", repr(fraction))
@@ -1186,13 +1167,6 @@ class _Budget:
         self.shares.append(self._share("mesh", replace(converged, gradient=()), cut, self._counted(finer), note))
 
 
-def _of_parts(value: Any, tets: int) -> Any:
-    """A value of each tet, or a function of time that returns one, for its parts."""
-    if isinstance(value, StepAverage):
-        return value.then(lambda found: of_parts(found, tets))
-    return (lambda t: of_parts(value(t), tets)) if of_time(value) else of_parts(value, tets)
-
-
 def finer_mesh(p: TrialRuns) -> TrialRuns:
     """TrialRun runs on the subdivided mesh, whose first vertices are those of the mesh."""
     given = dict(p.given)
@@ -1201,5 +1175,5 @@ def finer_mesh(p: TrialRuns) -> TrialRuns:
             fail(name, "None with mesh=True, which has other vertices", type(given[name]).__name__)
     fine = halved(p.model)
     for name in (*MODULI, "density"):
-        given[name] = _of_parts(given.get(name), p.model.num_tets)
+        given[name] = mapped(given.get(name), lambda value: of_parts(value, p.model.num_tets))
     return replace(p, model=fine.model, x=fine.between(p.x), v=fine.between(p.v), given=given, quantity=None, wrt=None)
