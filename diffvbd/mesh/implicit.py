@@ -117,9 +117,8 @@ def _cut(function: ImplicitFunction, inner: FloatArray, outer: FloatArray) -> tu
     return fraction, inner + fraction[:, None] * (outer - inner)
 
 
-def _snap(
-    points: FloatArray, ends: IntArray, fraction: FloatArray, cuts: FloatArray, step: float
-) -> tuple[FloatArray, IntArray]:
+def _snap(points: FloatArray, ends: IntArray, fraction: FloatArray, cuts: FloatArray, step: float
+          ) -> tuple[FloatArray, IntArray]:  # fmt: skip
     """Lattice points moved onto the nearest cut that comes too close, and the ids of those that moved."""
     edge_length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
     limit = np.where(edge_length > 0.93 * step, _SNAP_LONG, _SNAP_SHORT)

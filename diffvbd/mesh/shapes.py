@@ -301,9 +301,8 @@ def bunny(resolution: int = 9, height: float = 0.3) -> TetMesh:
     return fill(body, scale * low, scale * high, scale * 1.15 / cells)
 
 
-def _ellipsoid(
-    points: FloatArray, centre: tuple[float, float, float], radii: tuple[float, float, float], tilt: float = 0.0
-) -> FloatArray:
+def _ellipsoid(points: FloatArray, centre: tuple[float, float, float], radii: tuple[float, float, float],
+               tilt: float = 0.0) -> FloatArray:  # fmt: skip
     """Implicit ellipsoid, turned about z by `tilt` [rad]; near its surface about a distance."""
     cos, sin = np.cos(tilt), np.sin(tilt)
     local = (points - np.array(centre)) @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

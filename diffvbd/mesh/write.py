@@ -151,9 +151,8 @@ def vtu_names(fields: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {escape(name, {'"': "&quot;"}): values for name, values in fields.items()}
 
 
-def checked_fields(
-    kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...], widths: tuple[int, ...] | None = None
-) -> dict[str, NDArray[Any]]:
+def checked_fields(kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...],
+                   widths: tuple[int, ...] | None = None) -> dict[str, NDArray[Any]]:  # fmt: skip
     """Copies of values by name, each of shape [*leading] or [*leading, C], finite; `widths` limits C."""
     if fields is not None and not isinstance(fields, Mapping):
         raise TypeError(f"{kind}: expected values by name, as in a dict, got {type(fields).__name__}")

@@ -423,17 +423,13 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     index = torch.from_numpy(np.concatenate([a.reshape(-1) for a in arrays.values()]).astype(np.int32))
     weights = torch.from_numpy(np.concatenate((by_position[2], g.weight[rows])))
     lanes = rest[np.maximum(tet, 0)].swapaxes(1, 2)  # of any tet at padding, whose corners do not move apart
-    as_tensor = torch.from_numpy
-    return CoarsePlan(
-        sizes=sizes,
-        plan=index,
-        weights=weights,
-        rest=as_tensor(lanes[None].copy()),
-        tet=as_tensor(np.maximum(tet, 0)),
-        moments=as_tensor(moment[2]),
-        volume=as_tensor(np.bincount(g.tet_group[g.tet_group >= 0], volume[g.tet_group >= 0], len(g.group_body))),
-        mass=ops.raw.coarse_mass(as_tensor(mass)[None], index, weights, sizes),
+    listed_tets = g.tet_group >= 0
+    of_group = np.bincount(g.tet_group[listed_tets], volume[listed_tets], len(g.group_body))
+    rest_of, tet_of, moments, of_group = map(
+        torch.from_numpy, (lanes[None].copy(), np.maximum(tet, 0), moment[2], of_group)
     )
+    coarse_mass = ops.raw.coarse_mass(torch.from_numpy(mass)[None], index, weights, sizes)
+    return CoarsePlan(sizes, index, weights, rest_of, tet_of, moments, of_group, coarse_mass)
 
 
 def _starts(sorted_values: np.ndarray, count: int) -> np.ndarray:

@@ -192,14 +192,9 @@ class Segment(NamedTuple):
 Run = Callable[..., Segment]  # of the first step, the one after the last, and a State's tensors
 
 
-def choose_schedule(
-    checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None,
-    adjoint: Adjoint,
-    model: System,
-    scenes: int,
-    steps: int,
-    sweeps: int,
-) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
+def choose_schedule(checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None, adjoint: Adjoint,
+                    model: System, scenes: int, steps: int, sweeps: int
+                    ) -> tuple[int | BinomialCheckpoints | None, Adjoint]:  # fmt: skip
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
     if isinstance(checkpoint_every, str) and checkpoint_every != "auto":
         fail(

@@ -81,13 +81,12 @@ class Refinement:
     @property
     def tested(self) -> str:
         """A sentence on the tests and their outcome, such as ``K, h: stable; gradient, mesh: not tested``."""
-        tests = ["K", "h"] + ["mesh"] * (self.mesh is not None) + ["gradient"] * bool(self.gradients)
-        unstable = self._unstable
-        found = {
-            "stable": [name for name in tests if name not in unstable],
-            "not stable": unstable,
-            "not tested": [name for name in ("mesh", "gradient") if name not in tests],
-        }
+        tests, unstable = (
+            {"K": True, "h": True, "mesh": self.mesh is not None, "gradient": self.gradients},
+            self._unstable,
+        )
+        found = {"stable": [name for name, run in tests.items() if run and name not in unstable],
+                 "not stable": unstable, "not tested": [name for name, run in tests.items() if not run]}  # fmt: skip
         return "; ".join(f"{', '.join(names)}: {what}" for what, names in found.items() if names)
 
     @property
@@ -98,9 +97,7 @@ class Refinement:
             out = list(finer)
         if self.mesh is not None and not self._keeps(self.mesh, self.both):
             out.append("mesh")
-        worst = max(
-            (max((*check.finer.values(), *check.differences.values())) for check in self.gradients), default=0.0
-        )
+        worst = max((max(*c.finer.values(), *c.differences.values(), 0.0) for c in self.gradients), default=0.0)
         return out if worst <= self.tolerance else [*out, "gradient"]
 
     def _keeps(self, finer: float, coarser: float) -> bool:
@@ -131,15 +128,10 @@ class Refinement:
             return f"{text}: the loss itself is not finite"
         needed = [what for what in dict.fromkeys(HELPS.values()) if what in self._helps]
         if not is_balanced(self.left):
-            text += (
-                f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces unbalanced"
-            )
-            needed = needed or [HELPS["K"]]
-        return (
-            f"{text}: optimise on with {' and '.join(needed)}"
-            if needed
-            else f"{text}: the loss has kinks or jumps here"
-        )
+            text += f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces"
+            text, needed = f"{text} unbalanced", needed or [HELPS["K"]]
+        advice = f"optimise on with {' and '.join(needed)}" if needed else "the loss has kinks or jumps here"
+        return f"{text}: {advice}"
 
     @property
     def _helps(self) -> set[str]:

@@ -31,14 +31,8 @@ class Exact(NamedTuple):
     sensitivity: dict[str, float]
 
 
-def exact_step(
-    model: Any,
-    inputs: dict[str, Any],
-    sweeps: int,
-    weights: Sequence[Tensor],
-    names: Sequence[str] = ("x", "v", "mu", "lam"),
-    block: str = "exact",
-) -> Exact:
+def exact_step(model: Any, inputs: dict[str, Any], sweeps: int, weights: Sequence[Tensor],
+               names: Sequence[str] = ("x", "v", "mu", "lam"), block: str = "exact") -> Exact:  # fmt: skip
     """The step of one scene and the gradient of weights[0] . x' + h weights[1] . v'.
 
     inputs: x, v [V, 3], mu, lam [T] or scalars, time_step, gravity [3], and those of a floor. names: the inputs
@@ -103,9 +97,8 @@ _log = np.frompyfunc(lambda a: a.ln(), 1, 1)
 _root = np.frompyfunc(lambda a: a.sqrt(), 1, 1)
 
 
-def _step(
-    model: Any, inputs: dict[str, np.ndarray], h: Decimal, sweeps: int, weights: list[np.ndarray], block: str
-) -> tuple[np.ndarray, np.ndarray]:
+def _step(model: Any, inputs: dict[str, np.ndarray], h: Decimal, sweeps: int, weights: list[np.ndarray], block: str
+          ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Positions after the step and the loss, each with the variants as its last axis."""
     points, x = inputs["rest_points"], inputs["x"]  # [V, 3, variants]
     tets, pinned = model.tets.tolist(), model.pinned.tolist()
