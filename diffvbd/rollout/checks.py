@@ -207,10 +207,8 @@ class EndLook:
         of = f", worst in body {worst.body}" if int(self.model.body.max()) else ""
         of += f" of scene {worst.scene}" if worst.scene else ""
         faster = "" if self.model.coarse is not None else ', subspace="coarse"'
-        warn(
-            f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
-            f"take more sweeps{faster} or a smaller time_step, and compare; " + page("numerics.md")
-        )
+        warn(f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
+             f"take more sweeps{faster} or a smaller time_step, and compare; {page('numerics.md')}")  # fmt: skip
 
 
 def look_at_end(asked: bool | None, model: System, integrator: Integrator, x: Tensor, v: Tensor, steps: int,
@@ -325,10 +323,8 @@ class EnergyLook:
         pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
         pressed += "farther apart, or take a smaller dhat"
         pressed = pressed if bool(self.pressed[scene]) else ""
-        warn(
-            f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
-            f"{pressed}; take more sweeps{faster} or a smaller time_step; " + page("numerics.md"),
-        )
+        warn(f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
+             f"{pressed}; take more sweeps{faster} or a smaller time_step; {page('numerics.md')}")  # fmt: skip
 
 
 def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
@@ -358,16 +354,13 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
             planes = energy_data(model, prepared, None)[:, : model.floor.count()]
             gap, _, _, dhat = model.floor.gaps(start.reshape(-1, *start.shape[-2:]), planes, None)
             pressed = pressed | (gap < dhat).flatten(1).any(-1)
-        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps), elastic, pressed)
-
-
-def _looked_at(asked: bool | None, model: System, steps: int) -> frozenset[int]:
-    """Steps that are looked at: all where one asks; where bodies may hit something, whose gain may be over in a step,
-    as many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
-    meets = model.touches or model.floor is not None
-    looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
-    count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
-    return frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
+        # all steps where one asks; where bodies may hit something, whose gain may be over in a step, as many as cost
+        # little beside such steps; else most of them early, when what a start has too much of comes out
+        meets = model.touches or model.floor is not None
+        looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
+        count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
+        at = frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
+        return EnergyLook(model, prepared, pull, start, had, at, elastic, pressed)
 
 
 def _free_mass(model: System, prepared: Prepared) -> Tensor:
@@ -464,19 +457,15 @@ def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Ten
     cut = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
     if cut > CUT:
-        warn(
-            f"contact: pairs truncated {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
-            f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
-            f"{percent(CUT)}); " + what_helps(model),
-        )
+        many = f"{sum(s > CUT for s in shares)} of {len(shares)} steps more than {percent(CUT)}"
+        warn(f"contact: pairs truncated {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
+             f"velocity and momentum (in {many}); {what_helps(model)}")  # fmt: skip
     if not left > UNBALANCED_FRICTION:
         return
     # does what is left over move a body, beside what forces do in a step?
     found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
     if found is not None and found.error > UNBALANCED_FRICTION * found.forced:
         faster = ' subspace="coarse",' if model.coarse is None else ""
-        warn(
-            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
-            f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
-            "smaller time_step or a larger Friction(velocity=); " + page("contact.md"),
-        )
+        warn(f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
+             f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
+             f"smaller time_step or a larger Friction(velocity=); {page('contact.md')}")  # fmt: skip

@@ -221,18 +221,16 @@ class _Runs:
             found = _scalar("loss", value)
             if not sum(steps for steps, _ in finer.ran):
                 fail("loss", "a function that runs dv.rollout, which is what is refined", "one that ran no step of one")
-            if differentiates:
-                self.gradients[name] = self._differentiated(value)
-        return found
-
-    def _differentiated(self, value: Any) -> tuple[Tensor, ...]:
-        if not isinstance(value, Tensor) or not value.requires_grad:
-            fail("loss", "a scalar with a graph where gradient is given", "one without")
-        found = torch.autograd.grad(value.sum(), self.parameters, allow_unused=True)
-        for number, gradient in enumerate(found):
+            if not differentiates:
+                return found
+            if not isinstance(value, Tensor) or not value.requires_grad:
+                fail("loss", "a scalar with a graph where gradient is given", "one without")
+            gradients = torch.autograd.grad(value.sum(), self.parameters, allow_unused=True)
+        for number, gradient in enumerate(gradients):
             if gradient is None:
                 fail(f"gradient[{number}]", "a parameter of the loss", "one on which it does not depend")
-        return found  # type: ignore[return-value]
+        self.gradients[name] = gradients  # type: ignore[assignment]
+        return found
 
     def balanced(self, name: str, mesh: bool) -> float:
         """The loss with half the step and with sweeps until the forces of its steps balance."""
@@ -340,8 +338,9 @@ def rollout_finer(rollout: Callable[..., Trajectory], finer: Finer, model: Model
         options["save"] = save if save == "last" else parts * (1 if save == "all" else save)
         inputs, steps = _of_smaller_steps(inputs, parts, model), parts * steps
     solver = replace(solver, sweeps=finer.sweeps * solver.sweeps)
-    if finer.others:
-        solver = with_other_sweeps(model, solver)
+    if finer.others and (solver.coarse is not None or takes_corrections(model, solver) and not model.touches):
+        # plain sweeps in place of coarse corrections, or corrections, where they are cheap, in place of plain ones
+        solver = replace(solver, subspace="coarse" if solver.coarse is None else "rigid")
     observe, observed = options["observe"], []
 
     def observe_some(step: int, x: Tensor, v: Tensor) -> None:
@@ -388,25 +387,24 @@ def _kept(value: Callable[[int, Tensor, Tensor], Any], parts: int) -> Callable[[
 def _held(value: Any, parts: int) -> Any:
     if isinstance(value, PerStep):
         return PerStep(value.values.repeat_interleave(parts, 0))
-    if isinstance(value, StepAverage):  # over the smaller steps
-        return value
-    return _kept(value, parts) if callable(value) and not isinstance(value, Tensor) else value
+    asked = callable(value) and not isinstance(value, (Tensor, StepAverage))  # an average is over the smaller steps
+    return _kept(value, parts) if asked else value
 
 
 def _moving(value: Any, parts: int, model: Model) -> Any:
     """Positions of pinned vertices at the end of each smaller step."""
     if value is None:
         return None
-    ends = _kept(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
-    begun = _kept(lambda step, x, v: x, parts)
+    ends = (
+        value
+        if callable(value) and not isinstance(value, Tensor)
+        else lambda step, x, v: value.values[step] if isinstance(value, PerStep) else value
+    )
+    begun, ends = _kept(lambda step, x, v: x, parts), _kept(ends, parts)
     pinned = model.pinned[:, None]
 
     def now(step: int, x: Tensor, v: Tensor) -> Tensor:
-        begin = begun(step, x, v)
-        if ends is not None:
-            end = ends(step, x, v)
-        else:
-            end = value.values[step // parts] if isinstance(value, PerStep) else value
+        begin, end = begun(step, x, v), ends(step, x, v)
         if not isinstance(end, Tensor):
             raise NotImplementedError(NO_STAGES)
         way = begin + (end - begin) * ((step % parts + 1) / parts)
@@ -530,13 +528,6 @@ def is_balanced(left: float) -> bool:
 def takes_corrections(model: Model, solver: VBD) -> bool:
     """Whether coarse corrections are defined."""
     return bool(model.energy_mask & ELASTIC) and solver.block == "exact" and solver.saturation is None
-
-
-def with_other_sweeps(model: Model, solver: VBD) -> VBD:
-    """Plain sweeps in place of coarse corrections, or corrections, where they are cheap, in place of plain ones."""
-    if solver.coarse is None and (model.touches or not takes_corrections(model, solver)):
-        return solver
-    return replace(solver, subspace="coarse" if solver.coarse is None else "rigid")
 
 
 def with_more_sweeps(settings: VBD, left: float, before: float) -> VBD:

@@ -228,10 +228,9 @@ class TrialRuns:
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
             if of_time(value) and not _takes(value, 1):
-                raise TypeError(
-                    f"{name}: expected a function of the time [s] alone, since time steps vary, got one of other "
-                    "arguments, such as a rollout takes: lambda t: ... can replace one of the step, not of the state"
-                )
+                got = "one of other arguments, such as a rollout takes"
+                raise TypeError(f"{name}: expected a function of the time [s] alone, since time steps vary, got {got}: "
+                                "lambda t: ... can replace one of the step, not of the state")  # fmt: skip
 
     # --- running ------------------------------------------------------------------------------------------------------
 
@@ -383,22 +382,15 @@ class TrialRuns:
             out.append(relative(u, w, least))
         return out
 
-    def hardest(self, a: Tensor, b: Tensor) -> int:
-        """The quarter of the duration in which two runs part most."""
-        distance = (a - b).square().sum(-1).flatten(1).mean(1).sqrt()
-        return int(distance.diff().argmax())
-
     # --- energy -------------------------------------------------------------------------------------------------------
 
     @cached_property
     def conserves(self) -> bool:
         """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
-        changing = changes(self.given)
         other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
-        damped = self.model.friction is not None or any(
-            bool((torch.as_tensor(getattr(e, "damping", 0.0)) > 0).any()) for e in self.model.energies
-        )
-        return not (changing or other or damped)
+        dampings = (torch.as_tensor(getattr(energy, "damping", 0.0)) for energy in self.model.energies)
+        damped = self.model.friction is not None or any(bool((damping > 0).any()) for damping in dampings)
+        return not (changes(self.given) or other or damped)
 
     def prepared_at(self, time: float) -> Prepared:
         """The material of the scene at a time [s]."""
@@ -587,7 +579,12 @@ class _Search:
             self._prove()
             self.proven.sort(key=lambda c: c.seconds)
             best = next(c for c in self.proven if c.error <= self.most)
-            why = self._reason()
+            before, last = (run.settings for run in self.levels[-2:])
+            limit = f"the limit of {before} and {last}" if self.clean else f"{last}"
+            why = (f"the fastest of the runs below that stay within the error; their errors are distances to {limit}, "
+                   f"and {self.uncertain:.1g} by which that may be off")  # fmt: skip
+            if self.trials.spent > 0.9 * self.time_budget:
+                why += f"; {self.time_budget:g} s of trial runs (time_budget) ended the search for faster ones"
         else:
             least = (math.inf, self.levels[-1] if self.levels else None)
             error, now = min(self.estimates, key=lambda e: e[0], default=least)
@@ -599,22 +596,9 @@ class _Search:
         tried = {str(best.solver), *once}
         rest = [*once.values(), *(c for c in self.predicted if str(c.solver) not in tried)]
         others = tuple(sorted(rest, key=lambda c: c.seconds))
-        p = self.trials
-        told = Prediction(
-            self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, self.of
-        )
+        told = Prediction(self.error, best.error, best.seconds, self.trials.duration, reached, why, others,
+                          self.trials.spent, self.trials.runs, self.of)  # fmt: skip
         return replace(best.solver, prediction=told)
-
-    def _reason(self) -> str:
-        last, before = (run.settings for run in self.levels[:-3:-1])
-        limit = f"the limit of {before} and {last}" if self.clean else f"{last}"
-        why = (
-            f"the fastest of the runs below that stay within the error; their errors are distances to {limit}, "
-            f"and {self.uncertain:.1g} by which that may be off"
-        )
-        if self.trials.spent > 0.9 * self.time_budget:
-            why += f"; {self.time_budget:g} s of trial runs (time_budget) ended the search for faster ones"
-        return why
 
     # --- the refinement -----------------------------------------------------------------------------------------------
 
@@ -667,7 +651,11 @@ class _Search:
                     return False, (f"shorter steps than those of {min(self.estimates, key=lambda e: e[0])[1].settings} "
                                    f"make it worse, as rounding does in {p.model.dtype}")  # fmt: skip
                 if len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:]):  # no closer over several levels
-                    return False, self._why(apart[-1])
+                    cause = "it holds vibrations down to the shortest that the mesh can carry"
+                    if not self.smooth:
+                        cause = "what touches when, and what sticks, depends on ever smaller differences"
+                    return False, (f"runs of h and h/2 stay {apart[-1]:.2g} {self.of} apart however small h is: "
+                                   f"{cause}")  # fmt: skip
             steps *= 2
 
     def _remaining(self, apart: list[float]) -> float:
@@ -709,12 +697,6 @@ class _Search:
         errors = [error for error, _ in self.estimates]
         single = self.trials.model.dtype == torch.float32
         return single and self.smooth and len(errors) > 2 and min(errors[-2:]) > 2 * min(errors[:-2])
-
-    def _why(self, apart: float) -> str:
-        cause = "it holds vibrations down to the shortest that the mesh can carry"
-        if not self.smooth:
-            cause = "what touches when, and what sticks, depends on ever smaller differences"
-        return f"runs of h and h/2 stay {apart:.2g} {self.of} apart however small h is: {cause}"
 
     def _distance(self, a: TrialRun, b: TrialRun) -> float:
         """Of motion, quantity and gradient, the largest."""
@@ -768,7 +750,8 @@ class _Search:
     def _by_quarter(self, level: float, near: TrialRun) -> Callable[[VBD, int], tuple[float, float]]:
         """The error of settings, and the time of a step, by the quarter of the duration in which steps matter most."""
         p, last, before = self.trials, self.levels[-1], self.levels[-2]
-        quarter = p.hardest(before.x, last.x)
+        apart = (before.x - last.x).square().sum(-1).flatten(1).mean(1).sqrt()
+        quarter = int(apart.diff().argmax())
 
         def measured(settings: VBD, steps: int) -> tuple[float, float]:
             run = p.run(settings, steps, quarter, last)
