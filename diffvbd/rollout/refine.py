@@ -395,12 +395,13 @@ def _moving(value: Any, parts: int, model: Model) -> Any:
     """Positions of pinned vertices at the end of each smaller step."""
     if value is None:
         return None
-    ends = (
-        value
-        if callable(value) and not isinstance(value, Tensor)
-        else lambda step, x, v: value.values[step] if isinstance(value, PerStep) else value
-    )
-    begun, ends = _kept(lambda step, x, v: x, parts), _kept(ends, parts)
+
+    def given(step: int, x: Tensor, v: Tensor) -> Any:
+        if isinstance(value, PerStep):
+            return value.values[step]
+        return value(step, x, v) if callable(value) and not isinstance(value, Tensor) else value
+
+    begun, ends = _kept(lambda step, x, v: x, parts), _kept(given, parts)
     pinned = model.pinned[:, None]
 
     def now(step: int, x: Tensor, v: Tensor) -> Tensor:
