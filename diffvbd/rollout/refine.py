@@ -387,8 +387,9 @@ def _kept(value: Callable[[int, Tensor, Tensor], Any], parts: int) -> Callable[[
 def _held(value: Any, parts: int) -> Any:
     if isinstance(value, PerStep):
         return PerStep(value.values.repeat_interleave(parts, 0))
-    asked = callable(value) and not isinstance(value, (Tensor, StepAverage))  # an average is over the smaller steps
-    return _kept(value, parts) if asked else value
+    if isinstance(value, (Tensor, StepAverage)) or not callable(value):  # an average is over the smaller steps
+        return value
+    return _kept(value, parts)
 
 
 def _moving(value: Any, parts: int, model: Model) -> Any:

@@ -127,8 +127,8 @@ def _step(model: Any, inputs: dict[str, np.ndarray], h: Decimal, sweeps: int, we
     y = np.where(np.array(pinned)[:, None, None], x, x + h * inputs["v"] + h * h * inputs["gravity"])
     floor = _Floor(inputs, h) if "floor_height" in inputs else None
     now = y.copy()
-    for i in range(len(x) if floor is not None else 0):
-        now[i] = y[i] if pinned[i] else floor.started(x[i], y[i] - x[i])
+    if floor is not None:
+        now = np.stack([y[i] if pinned[i] else floor.started(x[i], y[i] - x[i]) for i in range(len(x))])
     tau, omega = Decimal(float(model.regularization)), Decimal(float(model.relaxation))
     for _ in range(sweeps):
         for i in model.color_vertices.tolist():  # vertices of one color do not see each other
