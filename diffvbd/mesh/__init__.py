@@ -8,28 +8,6 @@ from diffvbd.mesh.surfaces import Repair, repair, tetrahedralize
 from diffvbd.mesh.tet_mesh import TetMesh, join, replicate, subdivide
 from diffvbd.mesh.write import save
 
-__all__ = [
-    "Fields",
-    "Repair",
-    "TetMesh",
-    "beam",
-    "blob",
-    "box",
-    "bunny",
-    "capsule",
-    "cube",
-    "disk",
-    "dress",
-    "fill",
-    "join",
-    "load",
-    "load_fields",
-    "repair",
-    "replicate",
-    "save",
-    "sheet",
-    "shell",
-    "subdivide",
-    "tetrahedralize",
-    "write_series",
-]
+__all__ = ["Fields", "Repair", "TetMesh", "beam", "blob", "box", "bunny", "capsule", "cube", "disk", "dress", "fill",
+           "join", "load", "load_fields", "repair", "replicate", "save", "sheet", "shell", "subdivide",
+           "tetrahedralize", "write_series"]  # fmt: skip

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from diffvbd.mesh.arrays import FloatArray, IntArray, connected, float_array, positive
-from diffvbd.mesh.tet_mesh import TET_FACES, TetMesh, oriented
+from diffvbd.mesh.tet_mesh import EDGES, TET_FACES, TetMesh, oriented
 
 ImplicitFunction = Callable[[FloatArray], FloatArray]
 
 # A vertex moves onto a cut that is closer than this fraction of a long or short lattice edge (the paper's "safe" pair).
 _SNAP_LONG, _SNAP_SHORT = 0.24999, 0.41189
 
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 # In a lattice tet the edges 0-1 and 2-3 are long, the other four short.
 _LONG_PARTNER = np.array([1, 0, 3, 2])
 _BISECTIONS = 48
@@ -51,9 +50,8 @@ def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> Tet
     with np.errstate(over="ignore"):
         size = np.ceil((top - bottom) / step) + 2
     if size.prod() > _MOST_CELLS:
-        raise ValueError(
-            f"spacing: expected one with at most {_MOST_CELLS:g} cells in the box, got {step:.6g}: try a larger one"
-        )
+        wanted = f"one with at most {_MOST_CELLS:g} cells in the box"
+        raise ValueError(f"spacing: expected {wanted}, got {step:.6g}: try a larger one")
     cells = size.astype(int)
     points, lattice, outermost = _lattice((bottom + top) / 2 - step * cells / 2, cells, step)
     inside = -_evaluate(function, points)
@@ -63,7 +61,7 @@ def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> Tet
     if len(lattice) == 0:
         raise ValueError(f"function: expected a body inside the box, found no point of it at spacing {step:.6g}")
 
-    edges = np.unique(np.sort(lattice[:, _EDGES].reshape(-1, 2), axis=1) @ [len(points), 1])
+    edges = np.unique(np.sort(lattice[:, EDGES].reshape(-1, 2), axis=1) @ [len(points), 1])
     ends = np.stack(np.divmod(edges, len(points)), axis=1)
     crossed = np.sign(inside[ends]).prod(axis=1) < 0
     edges, ends = edges[crossed], ends[crossed]
@@ -80,7 +78,9 @@ def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> Tet
     tets = _largest_piece(oriented(undeformed, tets))
     used, compact = np.unique(tets, return_inverse=True)
     mesh = TetMesh(np.concatenate([moved, cuts])[used], compact.reshape(-1, 4))
-    _check_surface(mesh, step)
+    ends = np.sort(mesh.surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    if (np.unique(ends, axis=0, return_counts=True)[1] != 2).any():
+        raise ValueError(f"spacing: the surface touches itself at spacing {step:.6g}; try a smaller one")
     return mesh
 
 
@@ -117,9 +117,8 @@ def _cut(function: ImplicitFunction, inner: FloatArray, outer: FloatArray) -> tu
     return fraction, inner + fraction[:, None] * (outer - inner)
 
 
-def _snap(
-    points: FloatArray, ends: IntArray, fraction: FloatArray, cuts: FloatArray, step: float
-) -> tuple[FloatArray, IntArray]:
+def _snap(points: FloatArray, ends: IntArray, fraction: FloatArray, cuts: FloatArray, step: float
+          ) -> tuple[FloatArray, IntArray]:  # fmt: skip
     """Lattice points moved onto the nearest cut that comes too close, and the ids of those that moved."""
     edge_length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
     limit = np.where(edge_length > 0.93 * step, _SNAP_LONG, _SNAP_SHORT)
@@ -197,10 +196,3 @@ def _largest_piece(tets: IntArray) -> IntArray:
     left, right = order[same] // 4, order[same + 1] // 4
     label = connected(np.stack([left, right], axis=1), len(tets))
     return tets[label == np.bincount(label).argmax()]
-
-
-def _check_surface(mesh: TetMesh, step: float) -> None:
-    edges = np.sort(mesh.surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, shared = np.unique(edges, axis=0, return_counts=True)
-    if (shared != 2).any():
-        raise ValueError(f"spacing: the surface touches itself at spacing {step:.6g}; try a smaller one")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from diffvbd.mesh.arrays import FloatArray, IntArray, check_flag, connected, float_array, listed, positive, warn
 from diffvbd.mesh.read import SURFACES, Tets, kind_of, listed_kinds, read_cells, tets_of, triangles_of
-from diffvbd.mesh.tet_mesh import TetMesh, oriented, signed_volume
+from diffvbd.mesh.tet_mesh import EDGES, TetMesh, oriented, signed_volume
 
 Source = str | PathLike[str] | Any  # a path, or a mesh of trimesh, pyvista or meshio
 # Cell data that may hold body labels: ours, and the integer labels of Gmsh and Medit files.
@@ -209,10 +209,7 @@ def _mesh_of(content: meshio.Mesh, found: Tets, orient: bool, weld: float | None
 
 
 def _shortest_edge(points: FloatArray, tets: IntArray) -> float:
-    lengths = [
-        np.linalg.norm(points[tets[:, i]] - points[tets[:, j]], axis=1).min() for i in range(4) for j in range(i)
-    ]
-    return float(min(lengths))
+    return float(min(np.linalg.norm(points[tets[:, i]] - points[tets[:, j]], axis=1).min() for i, j in EDGES))
 
 
 def _used(tets: IntArray) -> tuple[IntArray, IntArray]:

@@ -106,30 +106,19 @@ def check_extension(path: Path, name: str = "path") -> str:
     return extension
 
 
-def _write_pvd(
-    path: Path,
-    mesh: TetMesh,
-    positions: FloatArray,
-    times: NDArray[Any],
-    point_data: Mapping[str, NDArray[Any]],
-    cell_data: Mapping[str, NDArray[Any]],
-) -> None:
+def _write_pvd(path: Path, mesh: TetMesh, positions: FloatArray, times: NDArray[Any],
+               point_data: Mapping[str, NDArray[Any]], cell_data: Mapping[str, NDArray[Any]]) -> None:  # fmt: skip
     digits = max(4, len(str(len(positions) - 1)))
     entries = []
     for k, (time, points) in enumerate(zip(times, positions, strict=True)):
         name = f"{path.stem}_{k:0{digits}d}.vtu"
-        of_vertices, of_tets = (
-            vtu_names({key: all[k] for key, all in data.items()}) for data in (point_data, cell_data)
-        )
-        content = content_of(mesh, points, of_vertices, of_tets)
+        fields = (vtu_names({key: rows[k] for key, rows in data.items()}) for data in (point_data, cell_data))
+        content = content_of(mesh, points, *fields)
         target = path.with_name(name)
         quiet(lambda content=content, target=target: replace(target, content.write), f"write {target}")
         entries.append(f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>\n')
-    collection = (
-        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
-        + "".join(entries)
-        + "  </Collection>\n</VTKFile>\n"
-    )
+    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
+    collection = "".join([head, *entries, "  </Collection>\n</VTKFile>\n"])
     replace(path, lambda new: new.write_text(collection, encoding="utf-8"))
 
 
@@ -236,10 +225,11 @@ def _mesh(buffer: _Buffer, part: Part, frames: FloatArray) -> dict[str, Any]:
     view = buffer.view(shapes, byteStride=12, target=ARRAY_BUFFER)
     at = [buffer.accessor(view, shape, k * shape.nbytes, bounds=True) for k, shape in enumerate(shapes)]
     primitive: dict[str, Any] = {"attributes": {"POSITION": at[0]}, "indices": indices, "mode": TRIANGLES}
-    if len(at) == 1:
-        return {"name": part.name, "primitives": [primitive]}
-    primitive["targets"] = [{"POSITION": accessor} for accessor in at[1:]]
-    return {"name": part.name, "primitives": [primitive], "weights": [0.0] * (len(at) - 1)}
+    mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive]}
+    if len(at) > 1:
+        primitive["targets"] = [{"POSITION": accessor} for accessor in at[1:]]
+        mesh["weights"] = [0.0] * (len(at) - 1)
+    return mesh
 
 
 def _animation(buffer: _Buffer, parts: int, times: NDArray[np.float32]) -> dict[str, Any]:
@@ -284,7 +274,8 @@ def write_usd(
     if velocities is not None and velocities.shape != frames.shape:
         shape = list(frames.shape)
         raise ValueError(f"point_data['velocities']: expected shape {shape}, got {list(velocities.shape)}")
-    rate, codes = time_codes(times)
+    rate = (len(times) - 1) / float(times[-1] - times[0]) if len(times) > 1 else RATE
+    codes = np.round(times * rate, 6).tolist()  # whole numbers where frames are even
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -335,12 +326,6 @@ def require_usd(extension: str) -> None:
         raise ImportError(f"writing {extension} needs usd-core: pip install 'diffvbd[exchange]'") from None
 
 
-def time_codes(times: NDArray[Any]) -> tuple[float, list[float]]:
-    """Frames per second, and the time codes of frames at these times [s]: whole numbers where frames are even."""
-    rate = (len(times) - 1) / float(times[-1] - times[0]) if len(times) > 1 else RATE
-    return rate, np.round(times * rate, 6).tolist()
-
-
 def _primvar(surface: Any, sdf: Any, usd_geom: Any, name: str, values: NDArray[Any]) -> Any:
     """An attribute of vertices: floats, vectors where C = 3, or arrays of C floats each."""
     columns = values.shape[2] if values.ndim == 3 else 1
@@ -386,8 +371,7 @@ def read_frames(path: Path) -> Frames:
     for _, file in listed[1:]:
         frame = read_points(file)
         if vertices.max() >= len(frame):
-            raise ValueError(
-                f"series {path}: expected frames of {mesh.num_vertices} vertices, got {len(frame)} in {file}"
-            )
+            wanted = f"frames of {mesh.num_vertices} vertices"
+            raise ValueError(f"series {path}: expected {wanted}, got {len(frame)} in {file}")
         points.append(frame[vertices])
     return Frames(mesh, np.stack(points), np.array([moment for moment, _ in listed]))

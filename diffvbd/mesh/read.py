@@ -10,7 +10,7 @@ import io
 import re
 import struct
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,6 @@ from diffvbd.mesh.write import PREFERRED_FORMAT, quiet
 SURFACES = (".obj", ".off", ".ply", ".stl")  # of these meshio loses or refuses too much; they hold no tets
 # What meshio reads from an open file; some of these readers wait for a word that a truncated file does not have.
 _TEXT = ("abaqus", "avsucd", "medit", "nastran", "netgen", "permas", "su2", "tecplot")
-_BYTES = ("mdpa",)
 
 
 # VTK's numbers of cells, as meshio names them: those whose corners come first.
@@ -95,9 +94,8 @@ def _read_surface(path: Path) -> meshio.Mesh:
         found = trimesh.load_mesh(io.BytesIO(data), file_type=kind, process=False)
         triangles = np.asarray(found.faces, dtype=np.int64).reshape(-1, 3)
         if named is not None and len(triangles) < named:
-            raise meshio.ReadError(
-                f"it has {named} faces, and the reader found {len(triangles)}: truncated, or not written as usual"
-            )
+            got = f"it has {named} faces, and the reader found {len(triangles)}"
+            raise ReadError(f"{got}: truncated, or not written as usual")
         return meshio.Mesh(np.asarray(found.vertices), [("triangle", triangles)])
 
     return quiet(action, f"read {path}")
@@ -105,9 +103,7 @@ def _read_surface(path: Path) -> meshio.Mesh:
 
 def _check_is_file(path: Path) -> None:
     if not path.is_file():
-        raise FileNotFoundError(
-            f"mesh file {path} is not a file" if path.exists() else f"mesh file {path} does not exist"
-        )
+        raise FileNotFoundError(f"mesh file {path} {'is not a file' if path.exists() else 'does not exist'}")
 
 
 def _read_cells(path: Path) -> tuple[meshio.Mesh, list[str]]:
@@ -118,7 +114,7 @@ def _read_cells(path: Path) -> tuple[meshio.Mesh, list[str]]:
     content, notes = _read_msh(path) if kind == "gmsh" else (_read_as(kind, path), [])
     nodes, cells = len(content.points), sum(len(block.data) for block in content.cells)
     if named.nodes is not None and nodes != named.nodes:
-        raise meshio.ReadError(f"it names {named.nodes} nodes, and the reader found {nodes}")
+        raise ReadError(f"it names {named.nodes} nodes, and the reader found {nodes}")
     if named.cells is not None and cells < named.cells:
         notes.append(f"{named.cells - cells} of its {named.cells} cells are of kinds that the reader does not know")
     return content, notes
@@ -135,7 +131,7 @@ def _kind(path: Path) -> str:
     known = meshio.extension_to_filetypes.get("".join(path.suffixes[-2:]).lower())
     known = known or meshio.extension_to_filetypes.get(suffix)
     if not known:
-        raise meshio.ReadError(f"no reader knows files that end in {suffix or 'nothing'}")
+        raise ReadError(f"no reader knows files that end in {suffix or 'nothing'}")
     return known[0]
 
 
@@ -148,7 +144,7 @@ def _read_as(kind: str, path: Path) -> meshio.Mesh:
     if kind in _TEXT and path.suffix.lower() not in (".gz", ".meshb"):
         with _Text(path.open("rb"), encoding="utf-8", errors="replace") as file:
             return meshio.read(file, kind)
-    if kind in _BYTES:
+    if kind == "mdpa":
         with _Bytes(path.open("rb", buffering=0)) as file:
             return meshio.read(file, kind)
     return meshio.read(path, kind)
@@ -308,33 +304,28 @@ def _msh(data: bytes) -> Counts:
         return Counts(nodes, cells)
     if not binary and found[0]:
         start = data.index(b"\n", data.index(b"$Nodes")) + 1
-        _check_numbers(data[start : data.find(b"$EndNodes", start)])
+        lines = data[start : data.find(b"$EndNodes", start)].split(b"\n")[1:]
+        numbers = np.array([line.split(None, 1)[0] for line in lines if line.strip()])
+        if len(np.unique(numbers)) < len(numbers):
+            raise ReadError("some of its nodes have the same number, so that they cannot be told apart")
     return Counts(*(head[0] if head else None for head in found))
 
 
-def _check_numbers(section: bytes) -> None:
-    """Raises where two nodes of format 2 have one number."""
-    lines = section.split(b"\n")[1:]
-    numbers = np.array([line.split(None, 1)[0] for line in lines if line.strip()])
-    if len(np.unique(numbers)) < len(numbers):
-        raise ReadError("some of its nodes have the same number, so that they cannot be told apart")
-
-
 def _vtk(data: bytes) -> Counts:
-    points = re.search(rb"^\s*POINTS\s+(\d+)", data, re.M | re.I)
-    cells = re.search(rb"^\s*CELL_TYPES\s+(\d+)", data, re.M | re.I)
-    return Counts(*(int(head.group(1)) if head else None for head in (points, cells)))
+    return _counts(data, rb"(?i)^\s*POINTS\s+(\d+)", rb"(?i)^\s*CELL_TYPES\s+(\d+)")
+
+
+def _counts(data: bytes, *patterns: bytes) -> Counts:
+    heads = (re.search(pattern, data, re.M) for pattern in patterns)
+    return Counts(*(int(head.group(1)) if head else None for head in heads))
 
 
 def _vtu(data: bytes) -> Counts:
     pieces = re.findall(rb"<Piece\b[^>]*>", data)
     if len(pieces) > 1:
         raise ReadError(f"it has {len(pieces)} pieces, of which meshio keeps the last: write it as one piece")
-    heads = (re.search(rb"%s\s*=\s*[\"']\s*(\d+)" % name, b"".join(pieces)) for name in _OF_PIECE)
-    return Counts(*(int(head.group(1)) if head else None for head in heads))
-
-
-_OF_PIECE = (b"NumberOfPoints", b"NumberOfCells")
+    names = (b"NumberOfPoints", b"NumberOfCells")
+    return _counts(b"".join(pieces), *(rb"%s\s*=\s*[\"']\s*(\d+)" % name for name in names))
 
 
 def _medit(data: bytes) -> Counts:
@@ -362,39 +353,33 @@ def abaqus_text(text: str) -> str:
     """
     if len(re.findall(r"^\*instance\b", text, re.M | re.I)) > 1:
         raise ReadError("it places parts (*INSTANCE), which the reader does not: write it flat, without parts")
-    blocks = list(_abaqus_blocks(text))
+    # parts that begin with a keyword each, whatever comes before the first one apart
+    blocks = [block for block in re.split(r"^(?=\*[^*])", text, flags=re.M) if block]
     nodes = [block for block in blocks if re.match(r"\*node\s*(,|$)", block.split("\n", 1)[0], re.I)]
     if len(nodes) < 2:
         return text
     rows = [row for block in nodes for row in block.split("\n")[1:] if row.strip() and not row.startswith("**")]
     numbers = [int(row.split(",", 1)[0]) for row in rows]
     if len(set(numbers)) < len(numbers):
-        raise ReadError(
-            f"its {len(nodes)} blocks *NODE use the same numbers, so that they cannot be told apart: write it flat, "
-            "without parts"
-        )
+        shared = f"its {len(nodes)} blocks *NODE use the same numbers, so that they cannot be told apart"
+        raise ReadError(f"{shared}: write it flat, without parts")
     merged = "\n".join([nodes[0].split("\n", 1)[0], *rows, ""])
     at = blocks.index(nodes[0])
     return "".join([*blocks[:at], merged, *(b for b in blocks[at:] if not any(b is n for n in nodes))])
-
-
-def _abaqus_blocks(text: str) -> Iterator[str]:
-    """A text in parts that begin with a keyword each, whatever comes before the first one apart."""
-    return (block for block in re.split(r"^(?=\*[^*])", text, flags=re.M) if block)
 
 
 def read_tetgen(path: Path) -> meshio.Mesh:
     """The two files of one name. Names of values are those that meshio gives them."""
     (_, dimension, *more), nodes = _table(path.with_suffix(".node"))
     if dimension != 3:
-        raise meshio.ReadError(f"expected nodes in 3 dimensions, got {dimension}")
+        raise ReadError(f"expected nodes in 3 dimensions, got {dimension}")
     (_, corners, *_), cells = _table(path.with_suffix(".ele"))
     if corners not in (4, 10) or nodes.shape[1] < 4 or cells.shape[1] < 1 + corners:
         got = f"{corners} nodes a tet, rows of {nodes.shape[1]} and {cells.shape[1]} numbers"
-        raise meshio.ReadError(f"expected 4 or 10 nodes a tet, and rows with all of their numbers, got {got}")
+        raise ReadError(f"expected 4 or 10 nodes a tet, and rows with all of their numbers, got {got}")
     first = int(nodes[0, 0]) if len(nodes) else 0
     if not np.array_equal(nodes[:, 0], np.arange(first, first + len(nodes))):
-        raise meshio.ReadError("expected nodes that are numbered one after another")
+        raise ReadError("expected nodes that are numbered one after another")
     attributes = more[0] if more else 0
     values = {f"tetgen:attr{k + 1}": nodes[:, 4 + k] for k in range(attributes)}
     values |= _marks(nodes[:, 4 + attributes :])
@@ -415,11 +400,11 @@ def _table(path: Path) -> tuple[list[int], NDArray[Any]]:
     lines = (line.partition("#")[0].split() for line in path.read_text(errors="replace").splitlines())
     lines = [line for line in lines if line]
     if not lines:
-        raise meshio.ReadError(f"{path.name} is empty")
+        raise ReadError(f"{path.name} is empty")
     head = [int(word) for word in lines[0]]
     rows = lines[1 : 1 + head[0]]
     if len(rows) < head[0]:
-        raise meshio.ReadError(f"truncated: {path.name} names {head[0]} rows and has {len(rows)}")
+        raise ReadError(f"truncated: {path.name} names {head[0]} rows and has {len(rows)}")
     return head, np.array(rows, dtype=np.float64).reshape(len(rows), -1)
 
 

@@ -66,9 +66,8 @@ def box(n: int | Sequence[int] = 2, size: float | Sequence[float] = 1.0, split: 
     return TetMesh(points, tets.reshape(-1, 4), orient=True)
 
 
-def beam(
-    nx: int = 21, ny: int = 7, nz: int = 7, size: Sequence[float] = (0.5, 0.2, 0.2), split: Split = "five"
-) -> TetMesh:
+def beam(nx: int = 21, ny: int = 7, nz: int = 7, size: Sequence[float] = (0.5, 0.2, 0.2), split: Split = "five"
+         ) -> TetMesh:  # fmt: skip
     """Beam along x: a box of nx, ny, nz vertices per axis. Arguments and errors as for `box`."""
     counts = [count(name, n, 2, "vertices") for name, n in (("nx", nx), ("ny", ny), ("nz", nz))]
     return box(counts, size, split)
@@ -96,9 +95,8 @@ def shell(points: Any, triangles: Any, thickness: float) -> TetMesh:
     faces = int_array("triangles", triangles, (None, 3))
     half = positive("thickness", thickness) / 2
     if len(faces) and (faces.min() < 0 or faces.max() >= len(middle)):
-        raise ValueError(
-            f"triangles: expected vertex indices from 0 to {len(middle) - 1}, got {faces.min()}..{faces.max()}"
-        )
+        got = f"{faces.min()}..{faces.max()}"
+        raise ValueError(f"triangles: expected vertex indices from 0 to {len(middle) - 1}, got {got}")
     a, b, c = (middle[faces[:, k]] for k in range(3))
     normals = np.zeros_like(middle)
     face_normals = np.cross(b - a, c - a)
@@ -303,9 +301,8 @@ def bunny(resolution: int = 9, height: float = 0.3) -> TetMesh:
     return fill(body, scale * low, scale * high, scale * 1.15 / cells)
 
 
-def _ellipsoid(
-    points: FloatArray, centre: tuple[float, float, float], radii: tuple[float, float, float], tilt: float = 0.0
-) -> FloatArray:
+def _ellipsoid(points: FloatArray, centre: tuple[float, float, float], radii: tuple[float, float, float],
+               tilt: float = 0.0) -> FloatArray:  # fmt: skip
     """Implicit ellipsoid, turned about z by `tilt` [rad]; near its surface about a distance."""
     cos, sin = np.cos(tilt), np.sin(tilt)
     local = (points - np.array(centre)) @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -131,18 +131,10 @@ def repair(
     content.remove_unreferenced_vertices()
     uses = np.unique(np.sort(content.edges, axis=1), axis=0, return_counts=True)[1]
     turn = factor * np.array(_TO_Y[up], dtype=np.float64)
-    return Repair(
-        (np.asarray(content.vertices) * diagonal + low) @ turn.T,
-        np.asarray(content.faces, dtype=np.int64),
-        factor,
-        welded,
-        dropped,
-        turned,
-        int((uses == 1).sum()),
-        int((uses > 2).sum()),
-        pieces,
-        _volume(np.asarray(content.vertices)[content.faces[bounding]]) * (diagonal * factor) ** 3,
-    )
+    volume = _volume(np.asarray(content.vertices)[content.faces[bounding]]) * (diagonal * factor) ** 3
+    points = (np.asarray(content.vertices) * diagonal + low) @ turn.T
+    return Repair(points, np.asarray(content.faces, dtype=np.int64), factor, welded, dropped, turned,
+                  int((uses == 1).sum()), int((uses > 2).sum()), pieces, volume)  # fmt: skip
 
 
 def _even(triangles: IntArray) -> NDArray[np.bool_]:
@@ -329,18 +321,15 @@ def surface_arrays(surface: Source | tuple[Any, Any]) -> tuple[FloatArray, IntAr
             points, triangles = read_triangles(surface)
         except TypeError:
             hint = ": give its .surface" if hasattr(surface, "surface") else ""
-            raise TypeError(
-                "surface: expected a path, (points, triangles), or a mesh of trimesh, pyvista or meshio, got "
-                f"{type(surface).__name__}{hint}"
-            ) from None
+            wanted = "a path, (points, triangles), or a mesh of trimesh, pyvista or meshio"
+            raise TypeError(f"surface: expected {wanted}, got {type(surface).__name__}{hint}") from None
     points = float_array("points", points, (None, 3))
     triangles = int_array("triangles", triangles, (None, 3))
     if len(triangles) == 0:
         raise ValueError("surface: expected triangles, got none")
     if triangles.min() < 0 or triangles.max() >= len(points):
-        raise ValueError(
-            f"triangles: expected vertex indices from 0 to {len(points) - 1}, got {triangles.min()}..{triangles.max()}"
-        )
+        got = f"{triangles.min()}..{triangles.max()}"
+        raise ValueError(f"triangles: expected vertex indices from 0 to {len(points) - 1}, got {got}")
     if np.ptp(points[triangles].reshape(-1, 3), axis=0).max() == 0:
         raise ValueError("surface: expected an extended body, got a single point")
     return points, triangles
@@ -350,9 +339,8 @@ def _decimated(points: FloatArray, triangles: IntArray, limit: int) -> tuple[Flo
     try:
         import pyvista
     except ImportError:
-        raise ImportError(
-            f"decimating {len(triangles)} triangles to max_triangles = {limit} needs pyvista: pip install diffvbd[mesh]"
-        ) from None
+        purpose = f"decimating {len(triangles)} triangles to max_triangles = {limit}"
+        raise ImportError(f"{purpose} needs pyvista: pip install diffvbd[mesh]") from None
     # Welding first: STL-like input without shared vertices cannot be decimated.
     surface = pyvista.PolyData.from_regular_faces(points, triangles).clean()
     reduced = surface.decimate(1 - limit / surface.n_cells)

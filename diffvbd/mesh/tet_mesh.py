@@ -13,6 +13,7 @@ from diffvbd.mesh.write import save
 
 # Faces of a positively oriented tet, wound so that their normals point out of it.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 # Below this fraction of the product of three edge lengths the sign of a volume is rounding noise.
 FLAT = 16 * np.finfo(np.float64).eps
@@ -60,10 +61,8 @@ def boundary_faces(tets: IntArray, num_vertices: int) -> tuple[IntArray, IntArra
     span = max(1, (2**63 - 1) // num_vertices**2)
     key = ((low % span) * num_vertices + middle) * num_vertices + high
     block = low // span
-    last = int(block.max())
-    if last == 0:
-        groups = [np.arange(len(faces))]
-    else:
+    last, groups = int(block.max()), [np.arange(len(faces))]
+    if last > 0:
         by_block = np.argsort(block.astype(np.uint16) if last < 2**16 else block, kind="stable")
         sizes = np.bincount(block)
         groups = np.split(by_block, np.cumsum(sizes[sizes > 0])[:-1])
@@ -121,19 +120,15 @@ class TetMesh:
         tets, count = self._tets, self.num_vertices
         if len(tets) and (tets.min() < 0 or tets.max() >= count):
             bad = np.nonzero(((tets < 0) | (tets >= count)).any(axis=1))[0]
-            raise ValueError(
-                f"tets: expected vertex indices from 0 to {count - 1}, got {tets[bad[0]].tolist()} "
-                f"(out of range in {listed(bad, 'tet')})"
-            )
+            got = f"{tets[bad[0]].tolist()} (out of range in {listed(bad, 'tet')})"
+            raise ValueError(f"tets: expected vertex indices from 0 to {count - 1}, got {got}")
         repeats = np.zeros(len(tets), dtype=bool)
-        for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
+        for i, j in EDGES:
             repeats |= tets[:, i] == tets[:, j]
         if repeats.any():
             bad = np.nonzero(repeats)[0]
-            raise ValueError(
-                f"tets: expected four different vertices, got {tets[bad[0]].tolist()} "
-                f"(repeated vertices in {listed(bad, 'tet')})"
-            )
+            got = f"{tets[bad[0]].tolist()} (repeated vertices in {listed(bad, 'tet')})"
+            raise ValueError(f"tets: expected four different vertices, got {got}")
 
     def _check_repeats(self) -> None:
         """Raises where two tets have the same vertices: their mass would count twice, and no face would be outside."""
@@ -158,24 +153,19 @@ class TetMesh:
         volume, product = signed_volume(self._points, self._tets)
         flat = np.abs(volume) <= FLAT * product
         if flat.any():
-            raise ValueError(
-                f"tets: expected positive volumes, got zero volume in {listed(np.nonzero(flat)[0], 'tet')}"
-            )
+            bad = listed(np.nonzero(flat)[0], "tet")
+            raise ValueError(f"tets: expected positive volumes, got zero volume in {bad}")
         if (volume < 0).any() and not orient:
-            bad = np.nonzero(volume < 0)[0]
-            raise ValueError(
-                f"tets: expected positive volumes, got inverted {listed(bad, 'tet')} of {self.num_tets} "
-                "(orient=True flips them)"
-            )
+            bad = f"{listed(np.nonzero(volume < 0)[0], 'tet')} of {self.num_tets}"
+            raise ValueError(f"tets: expected positive volumes, got inverted {bad} (orient=True flips them)")
         return volume
 
     def _check_body(self) -> None:
         of_tets = self._body[self._tets]
         bad = np.nonzero((of_tets != of_tets[:, :1]).any(axis=1))[0]
         if len(bad):
-            raise ValueError(
-                f"body: expected one label per tet, got {of_tets[bad[0]].tolist()} (mixed in {listed(bad, 'tet')})"
-            )
+            got = f"{of_tets[bad[0]].tolist()} (mixed in {listed(bad, 'tet')})"
+            raise ValueError(f"body: expected one label per tet, got {got}")
 
     @property
     def points(self) -> FloatArray:
@@ -212,7 +202,7 @@ class TetMesh:
         Source: Liu and Joe, "Relationship between tetrahedron shape measures", BIT 34, 1994.
         """
         squares = np.zeros(self.num_tets)
-        for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
+        for i, j in EDGES:
             edge = self._points[self._tets[:, i]] - self._points[self._tets[:, j]]
             squares += np.einsum("ni,ni->n", edge, edge)
         return 12 * np.cbrt(3 * self._volume) ** 2 / squares
@@ -251,29 +241,22 @@ class TetMesh:
 
     def __repr__(self) -> str:
         extent = np.ptp(self._points, axis=0) if self.num_vertices else np.zeros(3)
-        return (
-            f"TetMesh({self.num_vertices} vertices, {self.num_tets} tets, bodies: {self.num_bodies}, "
-            f"extent {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} m)"
-        )
+        counts = f"{self.num_vertices} vertices, {self.num_tets} tets, bodies: {self.num_bodies}"
+        return f"TetMesh({counts}, extent {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} m)"
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Rebuilding restores the write protection, which copies of bare arrays would lose.
         return TetMesh, (self._points, self._tets, self._body)
 
 
-# Edges of a tet; edge k has its midpoint at slot 4 + k of the ten-node tet below.
 MOST_TETS = 10**9  # of a mesh that is refined
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+# The midpoint of edge k stands at slot 4 + k of a ten-node tet.
 _CORNER_TETS = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
 # The inner octahedron has three diagonals, between midpoints of opposite edges. Each row: the four tets around one.
 _DIAGONALS = np.array([[4, 9], [5, 8], [6, 7]])
-_INNER_TETS = np.array(
-    [
-        [[4, 9, 5, 6], [4, 9, 6, 8], [4, 9, 8, 7], [4, 9, 7, 5]],
-        [[5, 8, 6, 4], [5, 8, 9, 6], [5, 8, 7, 9], [5, 8, 4, 7]],
-        [[6, 7, 4, 5], [6, 7, 5, 9], [6, 7, 9, 8], [6, 7, 8, 4]],
-    ]
-)
+_INNER_TETS = np.array([[[4, 9, 5, 6], [4, 9, 6, 8], [4, 9, 8, 7], [4, 9, 7, 5]],
+                        [[5, 8, 6, 4], [5, 8, 9, 6], [5, 8, 7, 9], [5, 8, 4, 7]],
+                        [[6, 7, 4, 5], [6, 7, 5, 9], [6, 7, 9, 8], [6, 7, 8, 4]]])  # fmt: skip
 
 
 def subdivide(mesh: TetMesh, levels: int = 1) -> TetMesh:
@@ -303,7 +286,7 @@ def subdivide(mesh: TetMesh, levels: int = 1) -> TetMesh:
 
 
 def _refined(mesh: TetMesh) -> TetMesh:
-    ends = np.sort(mesh.tets[:, _EDGES].reshape(-1, 2), axis=1)
+    ends = np.sort(mesh.tets[:, EDGES].reshape(-1, 2), axis=1)
     edges, edge_of = np.unique(ends[:, 0] * max(mesh.num_vertices, 1) + ends[:, 1], return_inverse=True)
     low, high = np.divmod(edges, max(mesh.num_vertices, 1))
     points = np.concatenate([mesh.points, (mesh.points[low] + mesh.points[high]) / 2])

@@ -32,12 +32,6 @@ class Mesh(Protocol):
     def body(self) -> IntArray: ...
     @property
     def surface(self) -> IntArray: ...
-    @property
-    def num_vertices(self) -> int: ...
-    @property
-    def num_tets(self) -> int: ...
-    @property
-    def num_bodies(self) -> int: ...
 
 
 # meshio would take the extension .msh for a Fluent file first.
@@ -92,11 +86,10 @@ def save(
     positions = mesh.points if points is None else float_array("points", to_numpy("points", points), mesh.points.shape)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"directory {path.parent} does not exist")
-    given = {"point_data": (point_data, mesh.num_vertices), "cell_data": (cell_data, mesh.num_tets)}
-    fields = {
-        kind: checked_fields(kind, values, (rows,), _COLUMNS.get(extension)) for kind, (values, rows) in given.items()
-    }
-    for kind, values in fields.items():
+    given = {"point_data": (point_data, len(mesh.points)), "cell_data": (cell_data, len(mesh.tets))}
+    fields: dict[str, Any] = {}
+    for kind, (named, rows) in given.items():
+        fields[kind] = values = checked_fields(kind, named, (rows,), _COLUMNS.get(extension))
         if values and extension not in _WITH_FIELDS:
             raise ValueError(f"{kind}: expected none, because {extension} files hold no values; use .vtu, .msh, ...")
         if extension == ".vtk" and (spaced := [name for name in values if name.split() != [name]]):
@@ -140,21 +133,17 @@ def replace(path: Path, write: Callable[[Path], object]) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def content_of(
-    mesh: Mesh,
-    points: FloatArray,
-    point_data: Mapping[str, NDArray[Any]] | None = None,
-    cell_data: Mapping[str, NDArray[Any]] | None = None,
-) -> meshio.Mesh:
+def content_of(mesh: Mesh, points: FloatArray, point_data: Mapping[str, NDArray[Any]],
+               cell_data: Mapping[str, NDArray[Any]]) -> meshio.Mesh:  # fmt: skip
     """Content for meshio: a mesh whose vertices are at `points`, with values that `checked_fields` has seen."""
-    if mesh.num_tets == 0:
+    if len(mesh.tets) == 0:
         raise ValueError("mesh: expected at least one tet to write, got none")
-    of_tets: dict[str, Any] = {name: [values] for name, values in (cell_data or {}).items()}
-    if mesh.num_bodies > 1:
+    of_tets: dict[str, Any] = {name: [values] for name, values in cell_data.items()}
+    if len(np.unique(mesh.body)) > 1:
         if "body" in of_tets:
             raise ValueError("cell_data: expected another name than 'body', which has the labels of this mesh's bodies")
         of_tets["body"] = [mesh.body[mesh.tets[:, 0]]]
-    return meshio.Mesh(points, [("tetra", mesh.tets)], point_data=dict(point_data or {}), cell_data=of_tets)
+    return meshio.Mesh(points, [("tetra", mesh.tets)], point_data=dict(point_data), cell_data=of_tets)
 
 
 def vtu_names(fields: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -162,9 +151,8 @@ def vtu_names(fields: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {escape(name, {'"': "&quot;"}): values for name, values in fields.items()}
 
 
-def checked_fields(
-    kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...], widths: tuple[int, ...] | None = None
-) -> dict[str, NDArray[Any]]:
+def checked_fields(kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...],
+                   widths: tuple[int, ...] | None = None) -> dict[str, NDArray[Any]]:  # fmt: skip
     """Copies of values by name, each of shape [*leading] or [*leading, C], finite; `widths` limits C."""
     if fields is not None and not isinstance(fields, Mapping):
         raise TypeError(f"{kind}: expected values by name, as in a dict, got {type(fields).__name__}")

@@ -120,7 +120,8 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
             entries.append((vertices[part[at], row], which[part[at]], own[at, column], weights[at, row, column]))
 
     # those of the smallest matrix first
-    size = _sizes(counts)
+    small = np.array((0, 1, 2, 4, 4))[np.minimum(counts, 4)]
+    size = np.where(counts <= 4, small, -(-counts // PACK) * PACK)
     listed = np.argsort(size, kind="stable")
     listed = listed[counts[listed] > 0]
     rank = np.full(len(roots), -1)
@@ -171,11 +172,6 @@ def _alike(lists: _Lists, bodies: np.ndarray, limit: int, other: np.ndarray | No
                 yield part, lists.order[lists.start[part][:, None] + np.arange(entries)]
 
 
-def _sizes(counts: np.ndarray) -> np.ndarray:
-    small = np.array((0, 1, 2, 4, 4))[np.minimum(counts, 4)]
-    return np.where(counts <= 4, small, -(-counts // PACK) * PACK)
-
-
 def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace
                ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:  # fmt: skip
     """Of bodies [n, V, 3] those with the same splines: which they are [m], functions at their vertices [m, V, f], zero
@@ -211,9 +207,9 @@ def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace
             scaled = (at - at.mean(1, keepdims=True)) / np.where(span > 0, span, 1.0)
             out = np.concatenate((np.ones((*at.shape[:2], 1)), scaled), 2)[..., :affine]
         else:
-            axes = [_splines(at[..., a], rest[3 + a], rest[a]) for a in range(3)]
-            out = axes[0][..., :, None] * axes[1][..., None, :]
-            out = (out[..., None] * axes[2][..., None, None, :]).reshape(*at.shape[:2], -1)
+            one, two, three = (_splines(at[..., a], rest[3 + a], rest[a]) for a in range(3))
+            out = one[..., :, None, None] * two[..., None, :, None] * three[..., None, None, :]
+            out = out.reshape(*at.shape[:2], -1)
         out *= free[part][..., None]
         yield part, out, _independent(out)
 
@@ -256,9 +252,7 @@ def _splines(at: np.ndarray, cells: int, degree: int) -> np.ndarray:
     inside = np.clip(np.floor(unit), 0, cells - 1)
     out = (knots[:-1] == inside).astype(np.float64)
     for d in range(1, degree + 1):
-        left = (unit - knots[: -d - 1]) / d * out[..., :-1]
-        right = (knots[d + 1 :] - unit) / d * out[..., 1:]
-        out = left + right
+        out = (unit - knots[: -d - 1]) / d * out[..., :-1] + (knots[d + 1 :] - unit) / d * out[..., 1:]
     return out
 
 
@@ -423,17 +417,13 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     index = torch.from_numpy(np.concatenate([a.reshape(-1) for a in arrays.values()]).astype(np.int32))
     weights = torch.from_numpy(np.concatenate((by_position[2], g.weight[rows])))
     lanes = rest[np.maximum(tet, 0)].swapaxes(1, 2)  # of any tet at padding, whose corners do not move apart
-    as_tensor = torch.from_numpy
-    return CoarsePlan(
-        sizes=sizes,
-        plan=index,
-        weights=weights,
-        rest=as_tensor(lanes[None].copy()),
-        tet=as_tensor(np.maximum(tet, 0)),
-        moments=as_tensor(moment[2]),
-        volume=as_tensor(np.bincount(g.tet_group[g.tet_group >= 0], volume[g.tet_group >= 0], len(g.group_body))),
-        mass=ops.raw.coarse_mass(as_tensor(mass)[None], index, weights, sizes),
+    listed_tets = g.tet_group >= 0
+    of_group = np.bincount(g.tet_group[listed_tets], volume[listed_tets], len(g.group_body))
+    rest_of, tet_of, moments, of_group = map(
+        torch.from_numpy, (lanes[None].copy(), np.maximum(tet, 0), moment[2], of_group)
     )
+    coarse_mass = ops.raw.coarse_mass(torch.from_numpy(mass)[None], index, weights, sizes)
+    return CoarsePlan(sizes, index, weights, rest_of, tet_of, moments, of_group, coarse_mass)
 
 
 def _starts(sorted_values: np.ndarray, count: int) -> np.ndarray:
@@ -489,15 +479,9 @@ def _moments(g: CoarseGeometry, points: np.ndarray, tets: np.ndarray) -> tuple[n
     row[sort] = np.cumsum(new) - 1
     key = key[sort[new]]
     # V times the gradients of the shape functions: normals of the opposite faces, which sum to 0
-    x = [axis[corners] for axis in points.T.copy()]
-    e = [x[c][1:] - x[c][0] for c in range(3)]
-    out = np.empty((len(key), 3))
-    for c in range(3):
-        a, b = e[(c + 1) % 3], e[(c + 2) % 3]
-        normal = np.empty((4, len(listed)))
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            normal[k + 1] = a[i] * b[j] - b[i] * a[j]
-        normal[0] = -(normal[1] + normal[2] + normal[3])
-        out[:, c] = np.bincount(row, normal.reshape(-1), len(key)) / 6
+    x = points.T.copy()[:, corners]  # [3, 4, tets]
+    e = x[:, 1:] - x[:, :1]
+    normals = [np.cross(e[:, (k + 1) % 3], e[:, (k + 2) % 3], axis=0) for k in range(3)]
+    normals = np.stack([-(normals[0] + normals[1] + normals[2]), *normals], 1)
+    out = np.stack([np.bincount(row, along.reshape(-1), len(key)) for along in normals], 1) / 6
     return _starts(key // vertices, len(g.group_body)), key % vertices, out

@@ -100,6 +100,7 @@ MADE_GOOD = 2.5  # with coarse corrections the next steps make good most of an e
 UNSEEN = 1e-6  # of the Model's size: by less nothing is wrong
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: a look costs as much as some steps
 EVERY, MOST = 75, 4  # steps between two looks, and looks at most, beside that at the hardest step
+SMALLER = "take a smaller time_step, more sweeps, or float64"
 ENDED = "ended"  # of a Model's _derived, on CUDA: how its latest rollouts ended, on the way to the host
 
 
@@ -139,9 +140,9 @@ class EndLook:
         if not harder and step not in self.at:
             return
         given = {k: t.detach() if isinstance(t, Tensor) else t for k, t in solve.given.items()}
-        if harder and self.hardest[0] not in self.at:
-            self.kept.pop(self.hardest[0], None)
         if harder:
+            if self.hardest[0] not in self.at:
+                self.kept.pop(self.hardest[0], None)
             self.hardest = (step, change)
         self.kept[step] = (replaced(solve, x=solve.x.detach(), v=solve.v.detach(), given=given), x.detach())
 
@@ -170,7 +171,7 @@ class EndLook:
     def fault(self) -> str:
         """Cause of a lost state after the latest step."""
         if self.last is None or not looks_at(self.last[1]):
-            return "take a smaller time_step, more sweeps, or float64"
+            return SMALLER
         return fault_of(self.model, self.last[0], self.integrator, *self.last[1:])
 
     def explain(self, error: Exception, x: Tensor, v: Tensor) -> str:
@@ -198,19 +199,16 @@ class EndLook:
         acceleration = math.sqrt(self.forced / self.steps) / self.time_step
         error = share * max(1.0, 0.5 * duration * math.sqrt(acceleration / way) if way > 0 else 1.0)
         error /= 1.0 if self.model.coarse is None else MADE_GOOD
-        distance = max(
-            self.steps * math.sqrt(left / len(found)), error * way / math.sqrt(self.start[0][..., 0].numel())
-        )
+        share_of_way = error * way / math.sqrt(self.start[0][..., 0].numel())
+        distance = max(self.steps * math.sqrt(left / len(found)), share_of_way)
         if not (error > WRONG and distance > UNSEEN * size_of(self.model)):
             return
         worst = max(found, key=lambda u: u.error)
         of = f", worst in body {worst.body}" if int(self.model.body.max()) else ""
         of += f" of scene {worst.scene}" if worst.scene else ""
         faster = "" if self.model.coarse is not None else ', subspace="coarse"'
-        warn(
-            f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
-            f"take more sweeps{faster} or a smaller time_step, and compare; " + page("numerics.md")
-        )
+        warn(f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
+             f"take more sweeps{faster} or a smaller time_step, and compare; {page('numerics.md')}")  # fmt: skip
 
 
 def look_at_end(asked: bool | None, model: System, integrator: Integrator, x: Tensor, v: Tensor, steps: int,
@@ -245,11 +243,7 @@ def warn_of_last_end(model: System, x: Tensor) -> None:
     model._derived[ENDED] = [end for end, (_, there) in zip(model._derived[ENDED], ends, strict=True) if not there]
     for said, there in ends:
         if there and not bool(said.all()):
-            _warn_of_loss(
-                "a rollout of this Model before this one",
-                bool(said[0]),
-                "take a smaller time_step, more sweeps, or float64",
-            )
+            _warn_of_loss("a rollout of this Model before this one", bool(said[0]), SMALLER)
             return
 
 
@@ -314,25 +308,23 @@ class EnergyLook:
         """Warns (UserWarning) of a gain."""
         energy, fallen = torch.stack(list(self.found.values())).unbind(1)  # [looks, B]
         begun, room = self.had[:2]
-        gain = (energy - begun - fallen) / (begun + room + fallen.abs().amax(0)).clamp(min=math.ulp(0.0))
+        given = begun + room + fallen.abs().amax(0)
+        gain = (energy - begun - fallen) / given.clamp(min=math.ulp(0.0))
         past = gain - torch.where(self.pressed, GAIN_PRESSED, GAIN)
         if not float(past.max()) > 0:
             return
         look, scene = divmod(int(past.argmax()), gain.shape[-1])
-        most, all_of = float(gain[look, scene]), float((begun + room + fallen.abs().amax(0))[scene])
+        most, all_of = float(gain[look, scene]), float(given[scene])
         size = f"{percent(most)} of the energy that it had and that gravity gave it"
         if most > MANY:
             size = f"{most * all_of:.3g} J, where it had and gravity gave it {all_of:.3g} J"
         of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
         faster = "" if self.model.coarse is not None else ', subspace="coarse"'
-        pressed = ""
-        if bool(self.pressed[scene]):
-            pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
-            pressed += "farther apart, or take a smaller dhat"
-        warn(
-            f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
-            f"{pressed}; take more sweeps{faster} or a smaller time_step; " + page("numerics.md"),
-        )
+        pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
+        pressed += "farther apart, or take a smaller dhat"
+        pressed = pressed if bool(self.pressed[scene]) else ""
+        warn(f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
+             f"{pressed}; take more sweeps{faster} or a smaller time_step; {page('numerics.md')}")  # fmt: skip
 
 
 def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
@@ -341,21 +333,12 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
 
     prepared: Arguments that all steps share; None: there are none, and nothing is looked at.
     """
-    if (
-        asked is False
-        or is_silent()
-        or steps == 0
-        or x.numel() == 0
-        or prepared is None
-        or not model.energy_mask & ELASTIC
-    ):
+    if asked is False or is_silent() or steps == 0 or x.numel() == 0 or prepared is None:
         return None
-    if any(e is not model.floor for e in model.vertex_energies):  # springs, and what a user adds, store energy, too
+    # springs, and what a user adds, store energy, too
+    if not model.energy_mask & ELASTIC or any(e is not model.floor for e in model.vertex_energies):
         return None
-    if asked is None:
-        if x.is_cuda or not looks_at(x) or steps < LEAST_STEPS:
-            return None
-    if not looks_at(x) and not may_copy(x):
+    if asked is None and (x.is_cuda or not looks_at(x) or steps < LEAST_STEPS) or not (looks_at(x) or may_copy(x)):
         return None
     given = (x, v, prepared.mu, prepared.lam, prepared.mass)
     taped = torch.is_grad_enabled() and any(t.requires_grad for t in given)
@@ -371,16 +354,13 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
             planes = energy_data(model, prepared, None)[:, : model.floor.count()]
             gap, _, _, dhat = model.floor.gaps(start.reshape(-1, *start.shape[-2:]), planes, None)
             pressed = pressed | (gap < dhat).flatten(1).any(-1)
-        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps), elastic, pressed)
-
-
-def _looked_at(asked: bool | None, model: System, steps: int) -> frozenset[int]:
-    """Steps that are looked at: all where one asks; where bodies may hit something, whose gain may be over in a step,
-    as many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
-    meets = model.touches or model.floor is not None
-    looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
-    count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
-    return frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
+        # all steps where one asks; where bodies may hit something, whose gain may be over in a step, as many as cost
+        # little beside such steps; else most of them early, when what a start has too much of comes out
+        meets = model.touches or model.floor is not None
+        looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
+        count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
+        at = frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
+        return EnergyLook(model, prepared, pull, start, had, at, elastic, pressed)
 
 
 def _free_mass(model: System, prepared: Prepared) -> Tensor:
@@ -477,23 +457,15 @@ def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Ten
     truncated = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
     if truncated > TRUNCATED:
-        warn(
-            f"contact: pairs truncated {percent(truncated)} of the vertices in step {shares.index(truncated)}, which "
-            f"lost velocity and momentum (in {sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than "
-            f"{percent(TRUNCATED)}); " + what_helps(model),
-        )
-    if left > UNBALANCED_FRICTION and _matters(model, before, x, prepared, given):
-        faster = ' subspace="coarse",' if model.coarse is None else ""
-        warn(
-            f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
-            f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
-            "smaller time_step or a larger Friction(velocity=); " + page("contact.md"),
-        )
-
-
-def _matters(
-    model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]
-) -> bool:
-    """Whether what a step has left unbalanced would have moved a body, beside what forces do in a step."""
+        many = f"{sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than {percent(TRUNCATED)}"
+        warn(f"contact: pairs truncated {percent(truncated)} of the vertices in step {shares.index(cut)}, which lost "
+             f"velocity and momentum (in {many}); {what_helps(model)}")  # fmt: skip
+    if not left > UNBALANCED_FRICTION:
+        return
+    # does what is left over move a body, beside what forces do in a step?
     found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
-    return found is not None and found.error > UNBALANCED_FRICTION * found.forced
+    if found is not None and found.error > UNBALANCED_FRICTION * found.forced:
+        faster = ' subspace="coarse",' if model.coarse is None else ""
+        warn(f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
+             f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
+             f"smaller time_step or a larger Friction(velocity=); {page('contact.md')}")  # fmt: skip

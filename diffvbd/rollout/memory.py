@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
-from .._common.checks import check_bool, check_count, check_save, fail, is_word, names_checked
+from .._common.checks import check_bool, check_count, check_save, fail, names_checked
 from .._common.constants import KEEPS_POSITIONS
 from .._common.context import MorePairs, Scope, in_segment, segment, transformed
 from ..adjoint.routes import Adjoint, TapedSweep, Unrolled
@@ -65,9 +65,8 @@ def memory(
     for name, asked in (("material", material), ("rest", rest)):
         check_bool(name, asked)
     solves = solves_of(scheme)
-    schedule, adjoint = choose_schedule(
-        checkpoint_every, TapedSweep(solver.tape), model, scenes, steps, solves * sweeps
-    )
+    schedule, adjoint = choose_schedule(checkpoint_every, TapedSweep(solver.tape), model, scenes, steps,
+                                        solves * sweeps)  # fmt: skip
     assert isinstance(adjoint, TapedSweep)
     scalars = scenes * sweeps * model.num_active
     policy = adjoint.policy(scalars, item, model.energy_mask, model.device)
@@ -82,10 +81,7 @@ def memory(
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
     save = check_save(save)
-    if isinstance(save, str):
-        frames = steps + 1 if save == "all" else 1
-    else:
-        frames = steps // save + 2
+    frames = {"all": steps + 1, "last": 1}[save] if isinstance(save, str) else steps // save + 2
     generator = torch.get_rng_state().numel()
     if schedule is None:
         kept = steps * per_step + max(0, steps - 1) * between
@@ -105,13 +101,12 @@ def memory(
         kept += (37 * model.num_tets + model.num_vertices) * item
 
     # what the transposed sweeps return, and what the correction before them has
-    outputs = (19 if model.corrects else 12) * model.num_vertices + model.num_tets * (
-        (2 if material else 0) + (7 if rest else 0)
-    )
+    outputs = (19 if model.corrects else 12) * model.num_vertices + (2 * material + 7 * rest) * model.num_tets
+    scratch = outputs * scenes * item
     if model.device.type == "cuda":
-        scratch = cuda_scratch(model, scenes, reverse=True, material=material, rest=rest) + outputs * scenes * item
+        scratch += cuda_scratch(model, scenes, reverse=True, material=material, rest=rest)
     else:
-        scratch = _cpu_scratch(model, scenes, material, rest) + outputs * scenes * item
+        scratch += _cpu_scratch(model, scenes, material, rest)
     if model.coarse is not None:
         plan = model._coarse_plan
         stiffness = plan.sizes.groups * (3 * plan.sizes.width) ** 2
@@ -123,14 +118,8 @@ def memory(
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
     parts += () if model.coarse is None else (model._coarse_plan,)
     tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
-    return {
-        "model": sum(t.numel() * t.element_size() for t in tensors),
-        "tape": tape_bytes,
-        "step": per_step,
-        "kept": kept,
-        "scratch": scratch,
-        "total": kept + scratch,
-    }
+    return {"model": sum(t.numel() * t.element_size() for t in tensors), "tape": tape_bytes, "step": per_step,
+            "kept": kept, "scratch": scratch, "total": kept + scratch}  # fmt: skip
 
 
 def coarse_scalars(model: System, sweeps: int) -> int:
@@ -140,16 +129,13 @@ def coarse_scalars(model: System, sweeps: int) -> int:
         return 0
     geometry, plan = model.coarse_geometry, model._coarse_plan
     if model.touches:  # all bodies together: the factor of each correction, its forces and ways
-        count = sum(-(-max(0, n - 1) // model.coarse.every) for n in _parts(model, sweeps))
+        # one part for each detection of pairs: more parts have fewer cycles, and need less
+        parts = sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections or 1)
+        count = sum(-(-max(0, n - 1) // model.coarse.every) for n in parts)
         return 9 * plan.mass.numel() + count * (9 * geometry.functions**2 + 12 * model.num_vertices)
     positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0
     of_one = 3 * geometry.functions + geometry.bodies + positions
     return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
-
-
-def _parts(model: System, sweeps: int) -> list[int]:
-    """Sweeps of each part of a step: one for each detection of pairs. More parts have fewer cycles, and need less."""
-    return sweeps_of_substeps(sweeps, 1 if model.contact is None else model.contact.detections or 1)
 
 
 def _cpu_scratch(model: System, scenes: int, material: bool, rest: bool) -> int:
@@ -206,25 +192,16 @@ class Segment(NamedTuple):
 Run = Callable[..., Segment]  # of the first step, the one after the last, and a State's tensors
 
 
-def checked_schedule(given: Any) -> Any:
-    """A schedule whose kind and numbers are right."""
-    if given is None or is_word(given, "auto") or isinstance(given, BinomialCheckpoints):
-        return given
-    if isinstance(given, str):
-        fail("checkpoint_every", '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)', repr(given))
-    return check_count("checkpoint_every", given, 1)
-
-
-def choose_schedule(
-    checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None,
-    adjoint: Adjoint,
-    model: System,
-    scenes: int,
-    steps: int,
-    sweeps: int,
-) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
+def choose_schedule(checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None, adjoint: Adjoint,
+                    model: System, scenes: int, steps: int, sweeps: int
+                    ) -> tuple[int | BinomialCheckpoints | None, Adjoint]:  # fmt: skip
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
-    checkpoint_every = checked_schedule(checkpoint_every)
+    if isinstance(checkpoint_every, str) and checkpoint_every != "auto":
+        fail(
+            "checkpoint_every", '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)', repr(checkpoint_every)
+        )
+    if not (checkpoint_every is None or isinstance(checkpoint_every, (str, BinomialCheckpoints))):
+        checkpoint_every = check_count("checkpoint_every", checkpoint_every, 1)
     inside = transformed()  # torch's checkpoints cannot hold tensors of a transform
     if inside and torch.is_grad_enabled() and checkpoint_every not in (None, "auto"):
         raise NotImplementedError(f'checkpoint_every: expected None or "auto", which both keep all tapes inside '
@@ -234,11 +211,8 @@ def choose_schedule(
         while _repeats(steps, snapshots) > MAX_REPEATS:
             snapshots += 1
         if snapshots > checkpoint_every.snapshots:
-            fail(
-                "checkpoint_every",
-                f"BinomialCheckpoints of at least {snapshots} snapshots for {steps} steps",
-                checkpoint_every,
-            )
+            wanted = f"BinomialCheckpoints of at least {snapshots} snapshots for {steps} steps"
+            fail("checkpoint_every", wanted, checkpoint_every)
     if checkpoint_every != "auto":
         return checkpoint_every, adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
@@ -272,29 +246,24 @@ def run_segments(run: Run, steps: int, state: State, every: int | BinomialCheckp
 
 def _again(run: Callable[..., Segment], *args: Any) -> Segment:
     # The non-reentrant form: gradients reach what a callable closes over, and checkpoints nest.
-    # A graph's capture admits no look at the state of the random number generator; what is replayed draws none.
-    capturing = (
-        not torch.compiler.is_compiling() and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
-    )
     if torch.compiler.is_compiling():
-        return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+        return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=True)  # type: ignore[return-value]
+    # A graph's capture admits no look at the state of the random number generator; what is replayed draws none.
+    capturing = torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
     scope, outermost = Scope(), not in_segment()
-    # A run that stops once the last tensor is saved does not reach the end of its last step, which records it.
-    with set_checkpoint_early_stop(not scope.recorders), segment():
-        while True:
-            try:
-                return checkpoint(_resuming(run, scope), *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
-            except MorePairs:
-                if not outermost:
-                    raise
 
-
-def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segment]:
     def resumed(*args: Any) -> Segment:
         with scope.resumed():
             return run(*args)
 
-    return resumed
+    # A run that stops once the last tensor is saved does not reach the end of its last step, which records it.
+    with set_checkpoint_early_stop(not scope.recorders), segment():
+        while True:
+            try:
+                return checkpoint(resumed, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+            except MorePairs:
+                if not outermost:
+                    raise
 
 
 def _binomial(run: Run, first: int, end: int, snapshots: int, *state: Tensor) -> Segment:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .._common.checks import check_positive, fail, to_float
+from .._common.checks import check_bool, check_positive, fail, to_float
 from .._common.constants import ELASTIC
 from .._common.context import Finer, record_to, refined
 from .._common.messages import percent
@@ -22,7 +22,7 @@ from ..model.solver import VBD
 from ..step.integrators import History, is_step_of
 from ..step.residual import UNBALANCED, left_of_solve, share
 from .checks import check_checks
-from .trajectory import PerStep, StepAverage, Trajectory, stacked
+from .trajectory import PerStep, StepAverage, Trajectory, mapped, stacked
 
 MOST = 16  # times the sweeps, until the forces of the finest run balance
 STEPS = (0.01, 0.1)  # of a parameter, of central differences
@@ -81,13 +81,12 @@ class Refinement:
     @property
     def tested(self) -> str:
         """A sentence on the tests and their outcome, such as ``K, h: stable; gradient, mesh: not tested``."""
-        tests = ["K", "h"] + ["mesh"] * (self.mesh is not None) + ["gradient"] * bool(self.gradients)
-        unstable = self._unstable
-        found = {
-            "stable": [name for name in tests if name not in unstable],
-            "not stable": unstable,
-            "not tested": [name for name in ("mesh", "gradient") if name not in tests],
-        }
+        tests, unstable = (
+            {"K": True, "h": True, "mesh": self.mesh is not None, "gradient": self.gradients},
+            self._unstable,
+        )
+        found = {"stable": [name for name, run in tests.items() if run and name not in unstable],
+                 "not stable": unstable, "not tested": [name for name, run in tests.items() if not run]}  # fmt: skip
         return "; ".join(f"{', '.join(names)}: {what}" for what, names in found.items() if names)
 
     @property
@@ -98,9 +97,7 @@ class Refinement:
             out = list(finer)
         if self.mesh is not None and not self._keeps(self.mesh, self.both):
             out.append("mesh")
-        worst = max(
-            (max((*check.finer.values(), *check.differences.values())) for check in self.gradients), default=0.0
-        )
+        worst = max((max(*c.finer.values(), *c.differences.values(), 0.0) for c in self.gradients), default=0.0)
         return out if worst <= self.tolerance else [*out, "gradient"]
 
     def _keeps(self, finer: float, coarser: float) -> bool:
@@ -131,15 +128,10 @@ class Refinement:
             return f"{text}: the loss itself is not finite"
         needed = [what for what in dict.fromkeys(HELPS.values()) if what in self._helps]
         if not is_balanced(self.left):
-            text += (
-                f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces unbalanced"
-            )
-            needed = needed or [HELPS["K"]]
-        return (
-            f"{text}: optimise on with {' and '.join(needed)}"
-            if needed
-            else f"{text}: the loss has kinks or jumps here"
-        )
+            text += f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces"
+            text, needed = f"{text} unbalanced", needed or [HELPS["K"]]
+        advice = f"optimise on with {' and '.join(needed)}" if needed else "the loss has kinks or jumps here"
+        return f"{text}: {advice}"
 
     @property
     def _helps(self) -> set[str]:
@@ -200,8 +192,7 @@ def refine(
     began = None if before is None else _scalar("before", before)
     if began is not None and not math.isfinite(began):
         fail("before", "a finite loss", began)
-    if not isinstance(mesh, bool):
-        raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
+    check_bool("mesh", mesh)
     runs = _Runs(loss, _parameters(gradient))
     once = runs.run("own", Finer(1, 1, []))
     if began is not None and not began > once:
@@ -230,18 +221,16 @@ class _Runs:
             found = _scalar("loss", value)
             if not sum(steps for steps, _ in finer.ran):
                 fail("loss", "a function that runs dv.rollout, which is what is refined", "one that ran no step of one")
-            if differentiates:
-                self.gradients[name] = self._differentiated(value)
-        return found
-
-    def _differentiated(self, value: Any) -> tuple[Tensor, ...]:
-        if not isinstance(value, Tensor) or not value.requires_grad:
-            fail("loss", "a scalar with a graph where gradient is given", "one without")
-        found = torch.autograd.grad(value.sum(), self.parameters, allow_unused=True)
-        for number, gradient in enumerate(found):
+            if not differentiates:
+                return found
+            if not isinstance(value, Tensor) or not value.requires_grad:
+                fail("loss", "a scalar with a graph where gradient is given", "one without")
+            gradients = torch.autograd.grad(value.sum(), self.parameters, allow_unused=True)
+        for number, gradient in enumerate(gradients):
             if gradient is None:
                 fail(f"gradient[{number}]", "a parameter of the loss", "one on which it does not depend")
-        return found  # type: ignore[return-value]
+        self.gradients[name] = gradients  # type: ignore[assignment]
+        return found
 
     def balanced(self, name: str, mesh: bool) -> float:
         """The loss with half the step and with sweeps until the forces of its steps balance."""
@@ -318,6 +307,7 @@ def _scalar(name: str, value: Tensor | float) -> float:
 
 # --- a rollout over the same time with smaller steps, more sweeps or smaller tets, as dv.refine -----------------------
 
+NO_STAGES = "refine: expected prescribed positions without those of stages"
 _MOVING = ("prescribed", "colliders", "colliders_before")  # other inputs are held over the smaller steps
 
 
@@ -348,8 +338,9 @@ def rollout_finer(rollout: Callable[..., Trajectory], finer: Finer, model: Model
         options["save"] = save if save == "last" else parts * (1 if save == "all" else save)
         inputs, steps = _of_smaller_steps(inputs, parts, model), parts * steps
     solver = replace(solver, sweeps=finer.sweeps * solver.sweeps)
-    if finer.others:
-        solver = with_other_sweeps(model, solver)
+    if finer.others and (solver.coarse is not None or takes_corrections(model, solver) and not model.touches):
+        # plain sweeps in place of coarse corrections, or corrections, where they are cheap, in place of plain ones
+        solver = replace(solver, subspace="coarse" if solver.coarse is None else "rigid")
     observe, observed = options["observe"], []
 
     def observe_some(step: int, x: Tensor, v: Tensor) -> None:
@@ -396,27 +387,28 @@ def _kept(value: Callable[[int, Tensor, Tensor], Any], parts: int) -> Callable[[
 def _held(value: Any, parts: int) -> Any:
     if isinstance(value, PerStep):
         return PerStep(value.values.repeat_interleave(parts, 0))
-    if isinstance(value, StepAverage):  # over the smaller steps
+    if isinstance(value, (Tensor, StepAverage)) or not callable(value):  # an average is over the smaller steps
         return value
-    return _kept(value, parts) if callable(value) and not isinstance(value, Tensor) else value
+    return _kept(value, parts)
 
 
 def _moving(value: Any, parts: int, model: Model) -> Any:
     """Positions of pinned vertices at the end of each smaller step."""
     if value is None:
         return None
-    ends = _kept(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
-    begun = _kept(lambda step, x, v: x, parts)
+
+    def given(step: int, x: Tensor, v: Tensor) -> Any:
+        if isinstance(value, PerStep):
+            return value.values[step]
+        return value(step, x, v) if callable(value) and not isinstance(value, Tensor) else value
+
+    begun, ends = _kept(lambda step, x, v: x, parts), _kept(given, parts)
     pinned = model.pinned[:, None]
 
     def now(step: int, x: Tensor, v: Tensor) -> Tensor:
-        begin = begun(step, x, v)
-        if ends is not None:
-            end = ends(step, x, v)
-        else:
-            end = value.values[step // parts] if isinstance(value, PerStep) else value
+        begin, end = begun(step, x, v), ends(step, x, v)
         if not isinstance(end, Tensor):
-            raise NotImplementedError("refine: expected prescribed positions without those of stages")
+            raise NotImplementedError(NO_STAGES)
         way = begin + (end - begin) * ((step % parts + 1) / parts)
         # a policy has given elsewhere where vertices were: that is checked in the first smaller step, and old in others
         return torch.where(pinned, way, end if step % parts == 0 else x)
@@ -480,15 +472,12 @@ def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, An
     count = fine.vertices
     tets, pinned = model.num_tets, fine.model.pinned[:, None]
 
-    def mapped(name: str, change: Callable[[Any], Any]) -> Any:
-        value = given[name]
-        if isinstance(value, PerStep):  # [steps] is a number for each
-            return value if value.values.dim() == 1 else PerStep(change(value.values))
-        if isinstance(value, StepAverage):
-            return value.then(change)
-        if callable(value) and not isinstance(value, Tensor):
-            return lambda k, x, v: change(value(k, x[..., :count, :], v[..., :count, :]))
-        return change(value)
+    def changed(value: Any, change: Callable[[Any], Any]) -> Any:
+        if isinstance(value, PerStep) and value.values.dim() == 1:  # [steps] is a number for each
+            return value
+        if isinstance(value, (Tensor, StepAverage)) or not callable(value):
+            return mapped(value, change)
+        return lambda k, x, v: change(value(k, x[..., :count, :], v[..., :count, :]))
 
     def pushed(force: Any) -> Any:
         if force is None:
@@ -501,21 +490,16 @@ def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, An
         return fine.between(gravity) if each else gravity
 
     def moved(ends: Any) -> Any:
-        if ends is None:
-            return None
-        if not isinstance(ends, Tensor):
-            raise NotImplementedError("refine: expected prescribed positions without those of stages")
-        return torch.where(pinned, fine.between(ends), torch.nan)
+        if isinstance(ends, Tensor):
+            return torch.where(pinned, fine.between(ends), torch.nan)
+        if ends is not None:
+            raise NotImplementedError(NO_STAGES)
+        return None
 
-    def shaped(points: Any) -> Any:
-        return None if points is None else fine.between(points)
-
-    def of_each(value: Any) -> Any:
-        return of_parts(value, tets)
-
-    changes = {"force": pushed, "gravity": accelerated, "prescribed": moved, "rest_points": shaped}
-    changes |= dict.fromkeys((*MODULI, "density"), of_each)
-    return {name: mapped(name, changes[name]) if name in changes else value for name, value in given.items()}
+    changes = {"force": pushed, "gravity": accelerated, "prescribed": moved,
+               "rest_points": lambda points: None if points is None else fine.between(points)}  # fmt: skip
+    changes |= dict.fromkeys((*MODULI, "density"), lambda value: of_parts(value, tets))
+    return {name: changed(value, changes[name]) if name in changes else value for name, value in given.items()}
 
 
 # --- when a run may be called a reference -----------------------------------------------------------------------------
@@ -546,13 +530,6 @@ def is_balanced(left: float) -> bool:
 def takes_corrections(model: Model, solver: VBD) -> bool:
     """Whether coarse corrections are defined."""
     return bool(model.energy_mask & ELASTIC) and solver.block == "exact" and solver.saturation is None
-
-
-def with_other_sweeps(model: Model, solver: VBD) -> VBD:
-    """Plain sweeps in place of coarse corrections, or corrections, where they are cheap, in place of plain ones."""
-    if solver.coarse is None and (model.touches or not takes_corrections(model, solver)):
-        return solver
-    return replace(solver, subspace="coarse" if solver.coarse is None else "rigid")
 
 
 def with_more_sweeps(settings: VBD, left: float, before: float) -> VBD:

@@ -93,23 +93,19 @@ def rollout(
     """
     check_kind("model", model, Model)
     check_kind("solver", solver, VBD)
-    steps, solver = _resolved(steps, duration, solver)
+    if (steps is None) == (duration is None):
+        raise TypeError(f"steps: expected either steps or duration, got {'neither' if steps is None else 'both'}")
+    if duration is None:
+        steps = check_count("steps", steps, maximum=MAX_SWEEPS)
+    else:
+        steps = solver.steps(duration)
+        solver = replace(solver, time_step=check_positive("duration", duration, "s") / steps)
     options = {"save": save, "observe": observe, "checkpoint_every": checkpoint_every, "adjoint": adjoint,
                "history": history, "checks": checks, "progress": progress}  # fmt: skip
     if (finer := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, finer, model, x, v, solver, steps, inputs, options)
     with proven() if solver.prediction is not None and solver.prediction.reached else nullcontext():
         return _rollout(model, x, v, solver, steps, given_of(model, inputs), **options)
-
-
-def _resolved(steps: Any, duration: Any, solver: VBD) -> tuple[int, VBD]:
-    """The number of steps, and the solver with their length."""
-    if (steps is None) == (duration is None):
-        raise TypeError(f"steps: expected either steps or duration, got {'neither' if steps is None else 'both'}")
-    if duration is None:
-        return check_count("steps", steps, maximum=MAX_SWEEPS), solver
-    steps = solver.steps(duration)
-    return steps, replace(solver, time_step=check_positive("duration", duration, "s") / steps)
 
 
 def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs: Given, *, save: Any, observe: Any,
@@ -167,7 +163,9 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
     outer = x
 
     def segment(first: int, end: int, x: Tensor, v: Tensor, *before: Tensor) -> Segment:
-        _check_versions(versions)
+        for name, tensor, version in versions:
+            if tensor._version != version:
+                raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
         frames, observed = [], []
         past = History(before[0], before[1], before[2], h) if before else None
         for k in range(first, end):
@@ -276,12 +274,6 @@ def _versions(inputs: dict[str, Any]) -> list[tuple[str, Tensor, int]]:
     """(name, tensor, version) of all tensors whose changes in place can be seen."""
     found = [(name, t) for name, value in inputs.items() for t in _tensors(value)]
     return [(name, t, t._version) for name, t in found if not t.is_inference()]
-
-
-def _check_versions(versions: list[tuple[str, Tensor, int]]) -> None:
-    for name, tensor, version in versions:
-        if tensor._version != version:
-            raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
 
 
 class _Steps(tuple):

@@ -192,16 +192,8 @@ class _Sweeping:
         residual, converged: As in :class:`diffvbd.results.Solution`.
     """
 
-    def __init__(
-        self,
-        model: System,
-        begun: Begun,
-        prepared: Prepared,
-        given: dict[str, Any],
-        where: tuple[Tensor, Tensor] | None,
-        tolerance: float,
-        progress: bool,
-    ) -> None:
+    def __init__(self, model: System, begun: Begun, prepared: Prepared, given: dict[str, Any],
+                 where: tuple[Tensor, Tensor] | None, tolerance: float, progress: bool) -> None:  # fmt: skip
         """where: collider points at the start and at the end of the step, None without contact."""
         self.model, self.begun, self.prepared, self.given = model, begun, prepared, given
         self.where = None if where is None else (where[0].detach(), where[1].detach())
@@ -232,9 +224,11 @@ class _Sweeping:
 
     def run(self, max_sweeps: int, check_every: int) -> None:
         """Sweeps until the step has converged, or is lost, or max_sweeps are done."""
-        if self.where is not None:
-            self._run_anew(max_sweeps, check_every)
-            return
+        while self.where is not None:  # from the beginning, with half as many sweeps more each time
+            self.count = min(self.count + max(check_every, self.count // 2), max_sweeps)
+            self._end_at(self._swept(replaced(self.prepared.settings, sweeps=self.count)))
+            if self.converged or self.count >= max_sweeps or not math.isfinite(self.residual):
+                return
         while not self.converged and self.count < max_sweeps and math.isfinite(self.residual):
             # a look costs many sweeps: at first after check_every, later after a quarter of what there were
             some = min(max(check_every, self.count // 4), max_sweeps - self.count)
@@ -242,14 +236,6 @@ class _Sweeping:
             self.before = self._swept(replaced(self.over, sweeps=some - (self.count == 0)))
             self.count += some
             self._end_at(self._swept(replaced(self.prepared.settings, sweeps=1)))
-
-    def _run_anew(self, max_sweeps: int, check_every: int) -> None:
-        """The same for steps with contact, each from the beginning: half as many sweeps more each time."""
-        self.count = min(check_every, max_sweeps)
-        self._end_at(self._swept(replaced(self.prepared.settings, sweeps=self.count)))
-        while not self.converged and self.count < max_sweeps and math.isfinite(self.residual):
-            self.count = min(self.count + max(check_every, self.count // 2), max_sweeps)
-            self._end_at(self._swept(replaced(self.prepared.settings, sweeps=self.count)))
 
     def _swept(self, settings: SweepSettings) -> Tensor:
         part = replaced(self.prepared, settings=settings)

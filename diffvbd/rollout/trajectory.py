@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -58,10 +59,6 @@ class StepAverage:
 
         return mean
 
-    def then(self, change: Callable[[Any], Any]) -> StepAverage:
-        """That of ``change`` of what the function returns."""
-        return StepAverage(lambda time: change(self.function(time)), self.samples)
-
 
 def step_average(function: Callable[[float], Any], samples: int = 32) -> StepAverage:
     """A function of the time [s] since the start of the rollout, whose mean over each step is the value of that step:
@@ -83,6 +80,22 @@ def step_average(function: Callable[[float], Any], samples: int = 32) -> StepAve
     if not callable(function) or isinstance(function, Tensor):
         raise TypeError(f"function: expected a function of the time [s], got {type(function).__name__}")
     return StepAverage(function, check_count("samples", samples, minimum=1))
+
+
+def mapped(value: Any, change: Callable[[Any], Any]) -> Any:
+    """An input of a rollout after ``change``, also where it is given per step or by a function."""
+    if isinstance(value, PerStep):
+        return PerStep(change(value.values))
+    if isinstance(value, StepAverage):
+        return StepAverage(mapped(value.function, change), value.samples)
+    if isinstance(value, Tensor) or not callable(value):
+        return change(value)
+
+    @functools.wraps(value)  # with its arguments, by which policies are told from functions of time
+    def changed(*at: Any) -> Any:
+        return change(value(*at))
+
+    return changed
 
 
 def refuse_average(name: str, value: Any) -> None:

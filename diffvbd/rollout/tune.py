@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import math
 import time
@@ -38,7 +37,7 @@ from .refine import (
     with_more_sweeps,
 )
 from .rollout import rollout
-from .trajectory import PerStep, StepAverage, Trajectory, refuse_average
+from .trajectory import PerStep, StepAverage, Trajectory, mapped, refuse_average
 
 
 @dataclass(frozen=True)
@@ -103,13 +102,12 @@ class Prediction:
         verdict = f"error {self.error:.2g} {self.of}"
         if not self.reached:
             verdict += ", not confirmed" if self.error <= self.asked else f": {self.asked:g} cannot be reached"
-        rows = [(line, f"{self.error:.1e}", f"{self.seconds / self.duration:.3g}", "measured")]
-        rows += [(str(c.solver), f"{c.error:.1e}", f"{c.seconds / self.duration:.3g}", self._status(c))
-                 for c in self.others]  # fmt: skip
-        header = ("solver", "error", "s per s of motion", "")
+        rows = [("solver", "error", "s per s of motion", "")]
+        runs = [(line, self, "measured"), *((str(c.solver), c, self._status(c)) for c in self.others)]
+        rows += [(text, f"{run.error:.1e}", f"{run.seconds / self.duration:.3g}", note) for text, run, note in runs]
         cost = f"{self.runs} trial runs took {self.spent:.2g} s, {self.cost:.1f} rollouts of this solver"
         first = f"{verdict}, {self.seconds_per_second:.3g} s per second of motion"
-        lines = [first, self.why, cost, "", *aligned([header, *rows])]
+        lines = [first, self.why, cost, "", *aligned(rows)]
         if self.reached and any(not c.proven and c.seconds < self.seconds for c in self.others):
             lines.append("What is predicted has not been run to the end, and may miss the error.")
         return "\n".join(lines)
@@ -179,6 +177,8 @@ STILL = 1e-4  # of the size of the scene: a motion below it counts as one of thi
 NO_PART = 1e-8  # of quantity over modulus: a gradient below it counts as one of this size
 LOADS = ("force", "gravity")
 MOVING = ("prescribed", "colliders")
+NO_FRAMES = torch.empty(0)
+PLAIN = VBD(1.0, 1)
 Quantity = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -188,12 +188,12 @@ class TrialRun:
 
     settings: VBD
     steps: int
-    x: Tensor | None  # [FRAMES + 1, ..., V, 3], the first is the start; None: it failed
-    v: Tensor | None
-    seconds: float
+    x: Tensor = NO_FRAMES  # [FRAMES + 1, ..., V, 3], the first is the start
+    v: Tensor = NO_FRAMES
+    seconds: float = math.inf
     quantity: Tensor | None = None
     gradient: tuple[Tensor, ...] = ()
-    failure: str = ""
+    failure: str = ""  # why there are no frames
 
 
 @dataclass
@@ -228,10 +228,9 @@ class TrialRuns:
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
             if of_time(value) and not _takes(value, 1):
-                raise TypeError(
-                    f"{name}: expected a function of the time [s] alone, since time steps vary, got one of other "
-                    "arguments, such as a rollout takes: lambda t: ... can replace one of the step, not of the state"
-                )
+                got = "one of other arguments, such as a rollout takes"
+                raise TypeError(f"{name}: expected a function of the time [s] alone, since time steps vary, got {got}: "
+                                "lambda t: ... can replace one of the step, not of the state")  # fmt: skip
 
     # --- running ------------------------------------------------------------------------------------------------------
 
@@ -268,29 +267,30 @@ class TrialRuns:
         """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
         settings = on(settings, steps, self.duration)
         part, first = (steps, 0) if quarter is None else (steps // FRAMES, quarter)
-        x, v = (self.x, self.v) if start is None or quarter is None else (start.x[quarter], start.v[quarter])  # type: ignore[index]
+        x, v = (self.x, self.v) if start is None or quarter is None else (start.x[quarter], start.v[quarter])
         began = first * self.duration / FRAMES
         differentiate = self.wrt is not None and quarter is None
         with silence():
             try:
                 self._warm(settings, x, v, began)
                 clock = time.perf_counter()
-                out = self._rollout(settings, x, v, part, began, FRAMES if quarter is None else 1, differentiate)
+                traj, value, gradient = self._rollout(settings, x, v, part, began, FRAMES if quarter is None else 1,
+                                                      differentiate)  # fmt: skip
                 self._wait()
             except (RuntimeError, ValueError, torch.OutOfMemoryError) as error:
-                return TrialRun(settings, steps, None, None, math.inf, failure=f"{settings}: {error}")
+                return TrialRun(settings, steps, failure=f"{settings}: {error}")
         seconds = time.perf_counter() - clock
         self.spent += seconds
         self.runs += 1
         if self.progress:
             log_progress("trial run %d: %s, %.2g s", self.runs, settings, seconds)
-        traj, value, gradient = out
-        x, v = traj.x.detach(), traj.v.detach()
+        x, v, failure = traj.x.detach(), traj.v.detach(), ""
         if not bool(torch.isfinite(x[-1]).all()):
-            return TrialRun(settings, steps, None, None, seconds, failure=f"{settings}: positions that are not finite")
-        if value is not None and not bool(torch.isfinite(value)):
-            failure = f"{settings}: quantity is {float(value)} after {part} steps"
-            return TrialRun(settings, steps, None, None, seconds, failure=failure)
+            failure = "positions that are not finite"
+        elif value is not None and not bool(torch.isfinite(value)):
+            failure = f"quantity is {float(value)} after {part} steps"
+        if failure:
+            return TrialRun(settings, steps, seconds=seconds, failure=f"{settings}: {failure}")
         return TrialRun(settings, steps, x, v, seconds * steps / part, value, gradient)
 
     def _rollout(self, settings: VBD, x: Tensor, v: Tensor, steps: int, began: float, frames: int, differentiate: bool
@@ -336,24 +336,18 @@ class TrialRuns:
 
         out = {name: value for name, value in given.items() if value is not None}
         for name, value in given.items():
-            if not of_time(value):
-                continue
-            function: Callable[[float], Any] = value
-            if name == "colliders":
-                out[name] = PerStep(torch.stack([function(began + (k + 1) * h) for k in range(steps)]))
-                out["colliders_before"] = function(began)
-            else:
-                out[name] = timed(function, 0.5 if name in LOADS else 1.0)
+            if of_time(value) and name == "colliders":
+                out[name] = PerStep(torch.stack([value(began + (k + 1) * h) for k in range(steps)]))
+                out["colliders_before"] = value(began)
+            elif of_time(value):
+                out[name] = timed(value, share_of(name))
         return out
 
     def swinging(self, steps: int) -> str:
         """The name of what swings within steps, so that they do not see it; "" if nothing does."""
-        for name, value in self.given.items():
-            share = 0.5 if name in LOADS else 1.0
-            if not of_time(value):
-                continue
+        for name in filter(lambda name: of_time(self.given[name]), self.given):
             clock = time.perf_counter()
-            apart = unseen(value, share, steps, self.duration, name in MOVING)
+            apart = unseen(self.given[name], share_of(name), steps, self.duration, name in MOVING)
             self.spent += time.perf_counter() - clock
             if apart > SWINGS:
                 return name
@@ -365,16 +359,10 @@ class TrialRuns:
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
-    @cached_property
-    def size(self) -> float:
-        """Extent of the scene at its start [m]."""
-        flat = self.x.detach().reshape(-1, 3)
-        return float((flat.amax(0) - flat.amin(0)).norm())
-
     def motion(self, frames: Tensor) -> Tensor:
         """Root mean square way from the start of each scene [...] [m], over vertices and frames."""
-        way = (frames[1:] - self.x.detach()).square().sum(-1).mean((0, -1)).sqrt()
-        return way.clamp(min=STILL * self.size)
+        way, flat = (frames[1:] - self.x).square().sum(-1).mean((0, -1)).sqrt(), self.x.reshape(-1, 3)
+        return way.clamp(min=STILL * float((flat.amax(0) - flat.amin(0)).norm()))
 
     def apart(self, a: Tensor, b: Tensor) -> float:
         """Root mean square distance of two runs over the motion of the second, in the worst scene."""
@@ -394,55 +382,38 @@ class TrialRuns:
             out.append(relative(u, w, least))
         return out
 
-    def hardest(self, a: Tensor, b: Tensor) -> int:
-        """The quarter of the duration in which two runs part most."""
-        distance = (a - b).square().sum(-1).flatten(1).mean(1).sqrt()
-        return int(distance.diff().argmax())
-
-    @property
-    def gravity(self) -> Any:
-        return GRAVITY if self.given.get("gravity") is None else self.given["gravity"]
-
     # --- energy -------------------------------------------------------------------------------------------------------
 
     @cached_property
     def conserves(self) -> bool:
         """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
-        changing = changes(self.given)
         other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
-        damped = self.model.friction is not None or any(
-            bool((torch.as_tensor(getattr(e, "damping", 0.0)) > 0).any()) for e in self.model.energies
-        )
-        return not (changing or other or damped)
-
-    @property
-    def material_changes(self) -> bool:
-        return any(of_time(self.given.get(name)) for name in MODULI)
-
-    @cached_property
-    def prepared(self) -> Prepared:
-        """The material of the scene, at the start where it changes."""
-        return self.prepared_at(0.0)
+        dampings = (torch.as_tensor(getattr(energy, "damping", 0.0)) for energy in self.model.energies)
+        damped = self.model.friction is not None or any(bool((damping > 0).any()) for damping in dampings)
+        return not (changes(self.given) or other or damped)
 
     def prepared_at(self, time: float) -> Prepared:
         """The material of the scene at a time [s]."""
         given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, time)
         values = {name: value(0, self.x, self.v) if of_time(value) else value for name, value in given.items()}
-        system = system_of(self.model, VBD(1.0, 1))
-        return prepare(system, tuple(self.x.shape[:-2]), material_of(**values), time_step=1.0, sweeps=1)
+        return prepare(
+            system_of(self.model, PLAIN), tuple(self.x.shape[:-2]), material_of(**values), time_step=1.0, sweeps=1
+        )
 
     def energy(self, x: Tensor, v: Tensor) -> Tensor:
         """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
-        load = self.model.mass.double()[:, None] * torch.as_tensor(self.gravity, device=x.device).double()
-        if self.given.get("force") is not None:
-            load = load + torch.as_tensor(self.given["force"]).to(load)
-        stored = mechanical_energy(system_of(self.model, VBD(1.0, 1)), self.prepared, x, v).reshape(x.shape[:-2])
+        gravity, force = self.given.get("gravity"), self.given.get("force")
+        gravity = torch.as_tensor(GRAVITY if gravity is None else gravity, device=x.device)
+        load = self.model.mass.double()[:, None] * gravity.double()
+        if force is not None:
+            load = load + torch.as_tensor(force).to(load)
+        stored = mechanical_energy(system_of(self.model, PLAIN), self.prepared_at(0.0), x, v).reshape(x.shape[:-2])
         return stored - (load * x.double()).sum((-1, -2))
 
     def lost(self, run: TrialRun, seconds: float) -> float:
         """Distance that the energy E which a run has lost would carry the scene in some seconds, sqrt(2 E / m) t, over
         its motion. Zero where energy says nothing."""
-        if not self.conserves or run.x is None or run.v is None:
+        if not self.conserves:
             return 0.0
         lost = (self.energy(run.x[0], run.v[0]) - self.energy(run.x[-1], run.v[-1])).clamp(min=0)
         mass = float(self.model.mass[~self.model.pinned].sum())
@@ -468,8 +439,8 @@ def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
     if x.numel() == 0:
         fail("x", "a scene with a vertex, whose motion can be judged", f"shape {list(x.shape)}")
     x, v = x.detach(), v.detach()
-    if gradient and quantity is None:
-        quantity = _mean_squared_way(x)
+    if gradient and quantity is None:  # the mean squared way
+        quantity = lambda end, _: (end - x).square().sum(-1).mean()  # noqa: E731
     material = [name for name in MODULI if given.get(name) is not None]
     wrt = [name for name in material if not of_time(given[name])]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
@@ -480,6 +451,11 @@ def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
 
 def of_time(value: Any) -> bool:
     return callable(value) and not isinstance(value, Tensor)
+
+
+def share_of(name: str) -> float:
+    """Of a step at which an input that is a function of time is asked for."""
+    return 0.5 if name in LOADS else 1.0
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
@@ -498,27 +474,17 @@ def changes(given: dict[str, Any]) -> bool:
     return any(map(of_time, given.values()))
 
 
-def _mean_squared_way(start: Tensor) -> Quantity:
-    return lambda x, v: (x - start).square().sum(-1).mean()
-
-
 def converted(value: Any, **to: Any) -> Any:
-    """Tensors, those in a dict and what functions of time return, on another device or of another floating dtype."""
-    if isinstance(value, Tensor):
-        floats = value.is_floating_point()
-        return value.to(**{name: kind for name, kind in to.items() if floats or name != "dtype"})
-    if isinstance(value, dict):
-        return {name: converted(part, **to) for name, part in value.items()}
-    if isinstance(value, StepAverage):
-        return value.then(lambda found: converted(found, **to))
-    if not callable(value):
-        return value
+    """Tensors, those in a dict and what functions return, on another device or of another floating dtype."""
 
-    @functools.wraps(value)  # with its arguments, by which policies are told from functions of time
-    def made(*at: Any) -> Any:
-        return converted(value(*at), **to)
+    def change(found: Any) -> Any:
+        if isinstance(found, dict):
+            return {name: converted(part, **to) for name, part in found.items()}
+        floats = isinstance(found, Tensor) and found.is_floating_point()
+        kinds = {name: kind for name, kind in to.items() if floats or name != "dtype"}
+        return found.to(**kinds) if isinstance(found, Tensor) else found
 
-    return made
+    return mapped(value, change)
 
 
 def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:
@@ -547,13 +513,7 @@ SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it 
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
 WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
 ERROR, TIME_BUDGET = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
-PLAIN = VBD(1.0, 1)
 STUCK = 6  # levels of the refinement that do not come closer: there is no limit to find
-
-
-def found(trials: TrialRuns, error: float, time_budget: float) -> VBD:
-    """The settings that take the least time and stay within the error, with their Prediction."""
-    return _Search(trials, error, time_budget).run()
 
 
 def start_of(trials: TrialRuns) -> VBD:
@@ -592,7 +552,8 @@ def _may_over_relax(trials: TrialRuns) -> bool:
     """Whether no tet comes near incompressible, at any of some times where moduli change."""
     if trials.model.mesh.num_tets == 0:
         return True
-    times = [trials.duration * k / FRAMES for k in range(FRAMES + 1)] if trials.material_changes else [0.0]
+    changing = any(of_time(trials.given.get(name)) for name in MODULI)
+    times = [trials.duration * k / FRAMES for k in range(FRAMES + 1)] if changing else [0.0]
     return not any(is_nearly_incompressible(p.mu, p.lam) for p in map(trials.prepared_at, times))
 
 
@@ -618,7 +579,12 @@ class _Search:
             self._prove()
             self.proven.sort(key=lambda c: c.seconds)
             best = next(c for c in self.proven if c.error <= self.most)
-            why = self._reason()
+            before, last = (run.settings for run in self.levels[-2:])
+            limit = f"the limit of {before} and {last}" if self.clean else f"{last}"
+            why = (f"the fastest of the runs below that stay within the error; their errors are distances to {limit}, "
+                   f"and {self.uncertain:.1g} by which that may be off")  # fmt: skip
+            if self.trials.spent > 0.9 * self.time_budget:
+                why += f"; {self.time_budget:g} s of trial runs (time_budget) ended the search for faster ones"
         else:
             least = (math.inf, self.levels[-1] if self.levels else None)
             error, now = min(self.estimates, key=lambda e: e[0], default=least)
@@ -630,22 +596,9 @@ class _Search:
         tried = {str(best.solver), *once}
         rest = [*once.values(), *(c for c in self.predicted if str(c.solver) not in tried)]
         others = tuple(sorted(rest, key=lambda c: c.seconds))
-        p = self.trials
-        told = Prediction(
-            self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, self.of
-        )
+        told = Prediction(self.error, best.error, best.seconds, self.trials.duration, reached, why, others,
+                          self.trials.spent, self.trials.runs, self.of)  # fmt: skip
         return replace(best.solver, prediction=told)
-
-    def _reason(self) -> str:
-        last, before = (run.settings for run in self.levels[:-3:-1])
-        limit = f"the limit of {before} and {last}" if self.clean else f"{last}"
-        why = (
-            f"the fastest of the runs below that stay within the error; their errors are distances to {limit}, "
-            f"and {self.uncertain:.1g} by which that may be off"
-        )
-        if self.trials.spent > 0.9 * self.time_budget:
-            why += f"; {self.time_budget:g} s of trial runs (time_budget) ended the search for faster ones"
-        return why
 
     # --- the refinement -----------------------------------------------------------------------------------------------
 
@@ -657,17 +610,16 @@ class _Search:
         left = math.inf  # of forces, by the run that was last taken for the reference
         unseen = "what changes in time" if changes(p.given) else ""
         while True:
-            if steps > MOST_STEPS and unseen and self.levels:
-                return False, f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
             if steps > MOST_STEPS:
-                return False, f"{MOST_STEPS} steps are not enough"
+                swings = f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
+                return False, swings if unseen and self.levels else f"{MOST_STEPS} steps are not enough"
             if p.spent > self.time_budget:
                 return False, f"{self.time_budget:g} s of trial runs were not enough (time_budget)"
             now = p.run(settings, steps)
-            if now.x is None and not self.levels and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
+            if now.failure and not self.levels and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
                 steps *= 2
                 continue
-            if now.x is None:
+            if now.failure:
                 return False, f"a run failed: {now.failure}"
             if unseen:
                 unseen, apart = p.swinging(steps), []
@@ -679,7 +631,6 @@ class _Search:
             if len(self.levels) > 1:
                 apart.append(self._distance(self.levels[-2], now))
             if len(apart) > 1:
-                self._see_order(apart)
                 error = max(self._remaining(apart), self._unresolved())
                 self.estimates.append((error, now))
                 if error <= 0.5 * self.error:
@@ -689,7 +640,7 @@ class _Search:
                     more = self._with_more_sweeps(settings, left, before)
                     if more is None:
                         return True, ""
-                    if more.x is None:
+                    if more.failure:
                         return False, f"a run failed: {more.failure}"
                     settings = more.settings
                     self.estimates.pop()  # more sweeps moved it: it was none
@@ -699,23 +650,25 @@ class _Search:
                 if self._is_rounding():
                     return False, (f"shorter steps than those of {min(self.estimates, key=lambda e: e[0])[1].settings} "
                                    f"make it worse, as rounding does in {p.model.dtype}")  # fmt: skip
-                if self._is_stuck(apart):
-                    return False, self._why(apart[-1])
+                if len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:]):  # no closer over several levels
+                    cause = "it holds vibrations down to the shortest that the mesh can carry"
+                    if not self.smooth:
+                        cause = "what touches when, and what sticks, depends on ever smaller differences"
+                    return False, (f"runs of h and h/2 stay {apart[-1]:.2g} {self.of} apart however small h is: "
+                                   f"{cause}")  # fmt: skip
             steps *= 2
 
     def _remaining(self, apart: list[float]) -> float:
-        """The error of the last run."""
-        if self.clean:
-            return apart[-1] / (2**self.order - 1)
-        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
-
-    def _see_order(self, apart: list[float]) -> None:
-        """The order that the last runs show; with contact it is believed where two levels in a row agree on one."""
+        """The error of the last run, by the order that the last runs show; with contact that is believed where two
+        levels in a row agree on one."""
         low, high = ORDERS
         last = [max(a, 1e-300) for a in apart[-3:]]
         shown = [math.log2(a / b) for a, b in zip(last, last[1:], strict=False)]
         self.order = min(max(shown[-1] if self.smooth else min(shown), low), high)
         self.clean = self.smooth or (len(shown) > 1 and min(shown) >= CLEAN)
+        if self.clean:
+            return apart[-1] / (2**self.order - 1)
+        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
 
     def _unresolved(self) -> float:
         """Motion that is lost with energy, and that runs which agree may therefore both lack. Vibrations swing within a
@@ -735,7 +688,7 @@ class _Search:
         forces over; then with plain sweeps where more of them with corrections have left as much."""
         last = self.levels[-2]
         more = self.trials.run(with_more_sweeps(settings, left, before), last.steps)
-        if is_balanced(left) and (more.x is None or self._distance(last, more) <= 0.25 * self.error):
+        if is_balanced(left) and (more.failure or self._distance(last, more) <= 0.25 * self.error):
             return None
         return more
 
@@ -745,22 +698,9 @@ class _Search:
         single = self.trials.model.dtype == torch.float32
         return single and self.smooth and len(errors) > 2 and min(errors[-2:]) > 2 * min(errors[:-2])
 
-    @staticmethod
-    def _is_stuck(apart: list[float]) -> bool:
-        """Whether runs have come no closer to one another over several levels."""
-        return len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:])
-
-    def _why(self, apart: float) -> str:
-        cause = "it holds vibrations down to the shortest that the mesh can carry"
-        if not self.smooth:
-            cause = "what touches when, and what sticks, depends on ever smaller differences"
-        return f"runs of h and h/2 stay {apart:.2g} {self.of} apart however small h is: {cause}"
-
     def _distance(self, a: TrialRun, b: TrialRun) -> float:
         """Of motion, quantity and gradient, the largest."""
-        assert a.x is not None and b.x is not None
-        out = [self.trials.apart(a.x, b.x)]
-        out += self.trials.gradients_apart(a, b)
+        out = [self.trials.apart(a.x, b.x), *self.trials.gradients_apart(a, b)]
         if a.quantity is not None and b.quantity is not None:
             out.append(relative(a.quantity, b.quantity))
         return max(out)
@@ -768,8 +708,7 @@ class _Search:
     @property
     def reference(self) -> TrialRun:
         """The last run of the refinement; where the motion is smooth or resolved, extrapolated from the last two."""
-        a, b = self.levels[-2], self.levels[-1]
-        assert a.x is not None and b.x is not None
+        a, b = self.levels[-2:]
         share = 1 / (2**self.order - 1) if self.clean else 0.0
 
         def beyond(u: Any, w: Any) -> Any:
@@ -791,8 +730,9 @@ class _Search:
                 self.proven.append(Candidate(run.settings, error, run.seconds, True))
         self.uncertain, self.truth = uncertain, reference
         self.climbed = p.spent
-        # with as many steps as the refinement takes for an error as wanted
-        level, near = self._level_near(reference)
+        # with as many steps as the refinement takes for an error nearest to the wanted one, before its last run
+        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.levels[:-1]]
+        level, near = min(levels, key=lambda entry: abs(math.log(entry[0] / self.error)))
         # a quarter says what a candidate's error is over that of the refinement, which then must be no rounding
         compares = self.smooth and level > ROUNDING * self.error
         predict = self._by_quarter(level, near) if compares else self._by_whole
@@ -810,33 +750,30 @@ class _Search:
     def _by_quarter(self, level: float, near: TrialRun) -> Callable[[VBD, int], tuple[float, float]]:
         """The error of settings, and the time of a step, by the quarter of the duration in which steps matter most."""
         p, last, before = self.trials, self.levels[-1], self.levels[-2]
-        assert last.x is not None and before.x is not None
-        quarter = p.hardest(before.x, last.x)
-        target = last.x[quarter + 1]
-        scale = self._of_quarter(p.run(near.settings, near.steps, quarter, last), target)
+        apart = (before.x - last.x).square().sum(-1).flatten(1).mean(1).sqrt()
+        quarter = int(apart.diff().argmax())
+
+        def measured(settings: VBD, steps: int) -> tuple[float, float]:
+            run = p.run(settings, steps, quarter, last)
+            off = math.inf if run.failure else float((run.x[-1] - last.x[quarter + 1]).square().mean().sqrt())
+            return off, run.seconds / steps
+
+        scale, _ = measured(near.settings, near.steps)
 
         def predict(settings: VBD, steps: int) -> tuple[float, float]:
-            run = p.run(settings, steps, quarter, last)
-            return level * self._of_quarter(run, target) / max(scale, 1e-300), run.seconds / steps
+            off, per_step = measured(settings, steps)
+            return level * off / max(scale, 1e-300), per_step
 
         return predict
 
     def _by_whole(self, settings: VBD, steps: int) -> tuple[float, float]:
         """The same by the whole duration: after an impact that no step resolves a quarter says nothing of the rest."""
         run = self.trials.run(settings, steps)
-        if run.x is None:
+        if run.failure:
             return math.inf, 0.0
         error = self._distance(run, self.truth)
         self.proven.append(Candidate(run.settings, error + self.uncertain, run.seconds, True))
         return error, run.seconds / steps
-
-    def _level_near(self, reference: TrialRun) -> tuple[float, TrialRun]:
-        """The error nearest to the wanted one of a run of the refinement before its last, and that run."""
-        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.levels[:-1]]
-        return min(levels, key=lambda level: abs(math.log(level[0] / self.error)))
-
-    def _of_quarter(self, run: TrialRun, target: Tensor) -> float:
-        return math.inf if run.x is None else float((run.x[-1] - target).square().mean().sqrt())
 
     def _plan(self, settings: VBD, steps: int, error: float, per_step: float) -> None:
         order = self._order_of(settings)
@@ -871,7 +808,7 @@ class _Search:
                 if seconds > 0.9 * least or p.spent + seconds > allowed:
                     break
                 run = p.run(settings, steps)
-                if run.x is None:
+                if run.failure:
                     break
                 error = self._distance(run, self.truth) + self.uncertain
                 self.proven.append(Candidate(run.settings, error, run.seconds, True))
@@ -945,7 +882,7 @@ def advise(
     if device is not None:
         model = model.to(device)
         x, v, inputs = (converted(value, device=model.device) for value in (x, v, inputs))
-    return found(trials_of(model, x, v, duration, quantity, gradient, inputs, progress), error, time_budget)
+    return _Search(trials_of(model, x, v, duration, quantity, gradient, inputs, progress), error, time_budget).run()
 
 
 # --- where the error of a rollout comes from --------------------------------------------------------------------------
@@ -1060,8 +997,7 @@ def error_budget(
     h, duration = check_time_step(solver.time_step, model.dtype), check_positive("duration", duration, "s")
     if not h <= (1 + SAME_TIME_STEP) * duration:
         fail("solver", f"a time step of at most the duration, {duration:g} s", f"{h:g} s")
-    if not isinstance(mesh, bool):
-        raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
+    check_bool("mesh", mesh)
     fraction = check_number("fraction", fraction)
     if not 0 < fraction <= 1:
         fail("fraction", "a number in (0, 1]", repr(fraction))
@@ -1093,7 +1029,7 @@ class _Budget:
     @staticmethod
     def _run(trials: TrialRuns, settings: VBD, steps: int) -> TrialRun:
         done = trials.run(settings, steps)
-        if done.x is None:
+        if done.failure:
             raise RuntimeError(f"error_budget: expected a rollout that runs to its end; {done.failure}")
         return done
 
@@ -1112,7 +1048,6 @@ class _Budget:
             settings = with_more_sweeps(settings, left, before)
 
     def _share(self, cause: str, a: TrialRun, b: TrialRun, seconds: float, note: str) -> Share:
-        assert a.x is not None and b.x is not None
         quantity = None if a.quantity is None or b.quantity is None else relative(a.quantity, b.quantity)
         gradients = self.trials.gradients_apart(a, b)
         motion = self.trials.apart(a.x, b.x)
@@ -1135,7 +1070,6 @@ class _Budget:
                          quantity=quantity)  # fmt: skip
         done = self._run(double, self.own, self.steps)
         seconds = self._counted(double)
-        assert run.x is not None
         single = replace(run, x=run.x.double(), gradient=tuple(g.double() for g in run.gradient),
                          quantity=None if run.quantity is None else run.quantity.double())  # fmt: skip
         self.shares.append(self._share("precision", single, done, seconds, "the same in float64"))
@@ -1185,7 +1119,6 @@ class _Budget:
         while True:
             settings = replace(now.settings, sweeps=2 * now.settings.sweeps + 1)
             before, (now, note) = now, self._settled(self.trials, settings, self.steps, "sweeps")
-            assert before.x is not None and now.x is not None and run.x is not None
             left = self.trials.apart(before.x, now.x)
             moves = left > max(ENOUGH * self.trials.apart(run.x, now.x), 1e-9)
             if not moves or now.settings.sweeps > MOST_SWEEPS:
@@ -1201,7 +1134,6 @@ class _Budget:
         fine, note = self._settled(self.trials, settings, FINER * self.steps, "time step")
         share = self._share("time step", converged, fine, 0.0, "")
         half = self._run(self.trials, fine.settings, FINER // 2 * self.steps)
-        assert half.x is not None and fine.x is not None
         left = self.trials.apart(half.x, fine.x)
         note += f", itself off by some {left:.0e}" if left > 0.3 * share.motion else ""
         if unseen := self.trials.swinging(FINER * self.steps):
@@ -1213,17 +1145,9 @@ class _Budget:
         p, vertices = self.trials, self.trials.model.num_vertices
         finer = finer_mesh(p)
         fine, note = self._settled(finer, converged.settings, self.steps, "mesh")
-        assert fine.x is not None
         truncated = replace(fine, x=fine.x[..., :vertices, :], gradient=(), quantity=None)
         note = f"{finer.model.num_tets} tets, {note}"
         self.shares.append(self._share("mesh", replace(converged, gradient=()), truncated, self._counted(finer), note))
-
-
-def _of_parts(value: Any, tets: int) -> Any:
-    """A value of each tet, or a function of time that returns one, for its parts."""
-    if isinstance(value, StepAverage):
-        return value.then(lambda found: of_parts(found, tets))
-    return (lambda t: of_parts(value(t), tets)) if of_time(value) else of_parts(value, tets)
 
 
 def finer_mesh(p: TrialRuns) -> TrialRuns:
@@ -1234,5 +1158,5 @@ def finer_mesh(p: TrialRuns) -> TrialRuns:
             fail(name, "None with mesh=True, which has other vertices", type(given[name]).__name__)
     fine = halved(p.model)
     for name in (*MODULI, "density"):
-        given[name] = _of_parts(given.get(name), p.model.num_tets)
+        given[name] = mapped(given.get(name), lambda value: of_parts(value, p.model.num_tets))
     return replace(p, model=fine.model, x=fine.between(p.x), v=fine.between(p.v), given=given, quantity=None, wrt=None)

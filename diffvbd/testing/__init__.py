@@ -25,27 +25,6 @@ from .scenes import (
 )
 from .tolerances import tolerance
 
-__all__ = [
-    "CASES",
-    "KINDS",
-    "SIZES",
-    "Case",
-    "Scene",
-    "bar",
-    "build_mesh",
-    "build_scene",
-    "delaunay",
-    "evaluate",
-    "generator",
-    "on_device",
-    "reference_result",
-    "regime",
-    "relative_error",
-    "scenes",
-    "sensitivity",
-    "shuffled",
-    "spread",
-    "structured",
-    "tolerance",
-    "volumes",
-]
+__all__ = ["CASES", "KINDS", "SIZES", "Case", "Scene", "bar", "build_mesh", "build_scene", "delaunay", "evaluate",
+           "generator", "on_device", "reference_result", "regime", "relative_error", "scenes", "sensitivity",
+           "shuffled", "spread", "structured", "tolerance", "volumes"]  # fmt: skip

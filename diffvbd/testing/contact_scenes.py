@@ -55,11 +55,9 @@ def boxes(*offsets: tuple[float, float, float], points: Any = 3, size: Any = 0.2
     return mesh.join([mesh.box(points, size, split="kuhn").translate(offset) for offset in offsets])
 
 
-def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float = 0.1, **options: Any) -> Scene:
+def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float = 0.1, batch: tuple[int, ...] = (),
+          jitter: float = 2e-3, time_step: float = 1 / 100, **options: Any) -> Scene:  # fmt: skip
     """Bodies slightly out of shape, moving a little, of soft material that differs from tet to tet."""
-    batch = options.pop("batch", ())
-    scene_options = {k: options.pop(k) for k in ("time_step",) if k in options}
-    jitter = options.pop("jitter", 2e-3)
     model = Model(tets, energies=(StableNeoHookean(), *energies), **options)
     shape = (*batch, model.num_vertices, 3)
     x = torch.from_numpy(tets.points.copy()) + noise(name, "x", shape=shape, size=jitter)
@@ -74,7 +72,7 @@ def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float =
     constants = {input_name(e, k): v for e in model.parametric_energies for k, v in model.constants(e).items()}
     wanted = ("pair_kappa", "pair_damping", "friction", "floor_kappa", "floor_height")
     parameters = {k: v.clone() for k, v in constants.items() if k in wanted}
-    return Scene(model, x, v, inputs=inputs, parameters=parameters, **scene_options)
+    return Scene(model, x, v, time_step, inputs, parameters)
 
 
 def stacked() -> Scene:
@@ -101,10 +99,8 @@ def fast() -> Scene:
     """Two boxes at 12 m/s against each other, with spin: pairs hold most vertices up."""
     scene = build("fast", boxes((0, 0, 0), (0.05, 0.23, 0.03)), (PairBarrier(kappa=1e4, dhat=0.02, detections=3),
                                                                 Friction(0.2, 0.1)))  # fmt: skip
-    turning = torch.linalg.cross(
-        scene.x - scene.x.mean(0), torch.tensor([[3.0, 9.0, -5.0]], dtype=torch.float64), dim=-1
-    )
-    scene.v += turning
+    spin = torch.tensor([[3.0, 9.0, -5.0]], dtype=torch.float64)
+    scene.v += torch.linalg.cross(scene.x - scene.x.mean(0), spin, dim=-1)
     scene.v[27:, 1] -= 12.0
     scene.v[:27, 1] += 12.0
     return scene

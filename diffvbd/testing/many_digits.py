@@ -9,7 +9,7 @@ Not here: scenes in a batch, saturation, anchors, friction, prescribed positions
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ DIGITS = 120
 APART = Decimal("1e-45")  # of two variants, relative to an input's largest entry
 ETA = 0.9  # a filtered move closes at most this fraction of a gap
 ULP = 2.0**-52
-Vector = list  # of three arrays
+Vector = np.ndarray  # [3, variants]
 
 
 class Exact(NamedTuple):
@@ -31,21 +31,14 @@ class Exact(NamedTuple):
     sensitivity: dict[str, float]
 
 
-def exact_step(
-    model: Any,
-    inputs: dict[str, Any],
-    sweeps: int,
-    weights: Sequence[Tensor],
-    names: Sequence[str] = ("x", "v", "mu", "lam"),
-    block: str = "exact",
-) -> Exact:
+def exact_step(model: Any, inputs: dict[str, Any], sweeps: int, weights: Sequence[Tensor],
+               names: Sequence[str] = ("x", "v", "mu", "lam"), block: str = "exact") -> Exact:  # fmt: skip
     """The step of one scene and the gradient of weights[0] . x' + h weights[1] . v'.
 
-    inputs: x, v [V, 3], mu, lam [T] or scalars, time_step, gravity [3], and "parameters" of a floor. names: the inputs
-    to differentiate, those of the floor by their full names. A scene that starts below its floor gives nonsense.
+    inputs: x, v [V, 3], mu, lam [T] or scalars, time_step, gravity [3], and those of a floor. names: the inputs
+    to differentiate. A scene that starts below its floor gives nonsense.
     """
     flat = {k: np.asarray(v, dtype=np.float64) for k, v in inputs.items() if isinstance(v, Tensor)}
-    flat |= {k: np.asarray(v, dtype=np.float64) for k, v in inputs.get("parameters", {}).items()}
     flat.setdefault("gravity", np.array([0.0, -9.81, 0.0]))
     flat["rest_points"] = np.asarray(model.rest_points, dtype=np.float64)
     rng = np.random.default_rng(0)
@@ -68,7 +61,7 @@ def exact_step(
         results = []
         for s, scene in enumerate(scenes):
             at = s * each
-            result = {"x": np.array([[float(c[at]) for c in p] for p in x])}
+            result = {"x": x[..., at].astype(np.float64)}
             exact_gradient: dict[str, list] = {name: [] for name in names}
             for j, (name, _) in enumerate(entries):
                 change = loss[at + 1 + j] - loss[at]
@@ -92,47 +85,33 @@ def _scale(value: np.ndarray) -> Decimal:
     return Decimal(float(np.abs(value).max()) or 1.0)
 
 
-def _sub(a: Vector, b: Vector) -> Vector:
-    return [p - q for p, q in zip(a, b, strict=True)]
-
-
-def _add(a: Vector, b: Vector) -> Vector:
-    return [p + q for p, q in zip(a, b, strict=True)]
-
-
-def _times(s: Any, a: Vector) -> Vector:
-    return [s * p for p in a]
-
-
-def _dot(a: Vector, b: Vector) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _cross(a: Vector, b: Vector) -> Vector:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return np.cross(a, b, axis=0)
+
+
+def _dot(a: Vector, b: Vector) -> np.ndarray:
+    return (a * b).sum(0)
 
 
 _log = np.frompyfunc(lambda a: a.ln(), 1, 1)
 _root = np.frompyfunc(lambda a: a.sqrt(), 1, 1)
 
 
-def _step(
-    model: Any, inputs: dict[str, np.ndarray], h: Decimal, sweeps: int, weights: list[np.ndarray], block: str
-) -> tuple[list[Vector], np.ndarray]:
+def _step(model: Any, inputs: dict[str, np.ndarray], h: Decimal, sweeps: int, weights: list[np.ndarray], block: str
+          ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Positions after the step and the loss, each with the variants as its last axis."""
-    points = [list(p) for p in inputs["rest_points"]]
+    points, x = inputs["rest_points"], inputs["x"]  # [V, 3, variants]
     tets, pinned = model.tets.tolist(), model.pinned.tolist()
     density = np.broadcast_to(np.asarray(model.density, dtype=np.float64), (len(tets),))
-    zero = points[0][0] * 0
+    zero, diagonal = points[0, 0] * 0, np.eye(3, dtype=object)[..., None]
     mass = [zero for _ in points]
     rest = []
     for t, corners in enumerate(tets):
-        e = [_sub(points[c], points[corners[0]]) for c in corners[1:]]
+        e = points[corners[1:]] - points[corners[0]]
         areas = [_cross(e[1], e[2]), _cross(e[2], e[0]), _cross(e[0], e[1])]
         six_volumes = _dot(e[0], areas[0])
-        own = [_times(-1, _add(_add(areas[0], areas[1]), areas[2])), *areas]
         # V grad N_a . grad N_b = area_a . area_b / (36 V)
-        rest.append((own, six_volumes))
+        rest.append(([-(areas[0] + areas[1] + areas[2]), *areas], six_volumes))
         for c in corners:
             mass[c] = mass[c] + Decimal(float(density[t])) * six_volumes / 24
     stars: list[list[tuple[int, list[int]]]] = [[] for _ in points]
@@ -145,56 +124,41 @@ def _step(
         value = inputs[name]
         return value if value.ndim == 1 else value[t if value.shape[0] > 1 else 0]
 
-    x = [list(p) for p in inputs["x"]]
-    y = [
-        x[i] if pinned[i] else [a + h * b + h * h * g for a, b, g in zip(x[i], v, inputs["gravity"], strict=True)]
-        for i, v in enumerate(inputs["v"])
-    ]
+    y = np.where(np.array(pinned)[:, None, None], x, x + h * inputs["v"] + h * h * inputs["gravity"])
     floor = _Floor(inputs, h) if "floor_height" in inputs else None
-    now = [y[i] if pinned[i] or floor is None else floor.started(x[i], _sub(y[i], x[i])) for i in range(len(x))]
+    now = y.copy()
+    if floor is not None:
+        now = np.stack([y[i] if pinned[i] else floor.started(x[i], y[i] - x[i]) for i in range(len(x))])
     tau, omega = Decimal(float(model.regularization)), Decimal(float(model.relaxation))
     for _ in range(sweeps):
         for i in model.color_vertices.tolist():  # vertices of one color do not see each other
-            g = _times(mass[i], _sub(now[i], y[i]))
-            H = [[(mass[i] + tau if r == c else zero) for c in range(3)] for r in range(3)]
-
-            def outer(weight: Any, n: Vector, H: list = H) -> None:
-                for r in range(3):
-                    for c in range(3):
-                        H[r][c] = H[r][c] + weight * n[r] * n[c]
-
+            g, H = mass[i] * (now[i] - y[i]), diagonal * (mass[i] + tau)
             for t, (a, *others) in stars[i]:
                 mu, lam = material("mu", t), material("lam", t)
                 own, six_volumes = rest[t]
                 xj, xk, xl = (now[tets[t][b]] for b in others)
-                n, c6 = _cross(_sub(xk, xj), _sub(xl, xj)), 1 / six_volumes
-                strain = c6 * _dot(n, _sub(now[i], xj)) - 1
-                g = _add(g, _times(h * h * ((mu + lam) * strain - mu) / 6, n))
+                n, c6 = _cross(xk - xj, xl - xj), 1 / six_volumes
+                strain = c6 * _dot(n, now[i] - xj) - 1
+                g = g + h * h * ((mu + lam) * strain - mu) / 6 * n
                 for b in others:
                     k = _dot(own[a], own[b]) / (6 * six_volumes)
-                    g = _add(g, _times(h * h * mu * k, _sub(now[tets[t][b]], now[i])))
-                    for r in range(3):
-                        H[r][r] = H[r][r] - h * h * mu * k
-                outer(h * h * (mu + lam if block == "exact" else lam) * c6 / 6, n)
+                    g = g + h * h * mu * k * (now[tets[t][b]] - now[i])
+                    H = H - diagonal * (h * h * mu * k)
+                H = H + h * h * (mu + lam if block == "exact" else lam) * c6 / 6 * n[:, None] * n
             if floor is not None:
                 for n, slope, curvature in floor.terms(now[i], x[i]):
-                    g = _add(g, _times(slope, n))
-                    outer(curvature, n)
-            move = _times(-omega, _solve(H, g))
-            now[i] = _add(now[i], move) if floor is None else floor.filtered(now[i], move)
-    loss = zero
-    for i, p in enumerate(now):
-        for c in range(3):
-            loss = loss + weights[0][i, c] * p[c] + weights[1][i, c] * (p[c] - x[i][c])
-    return now, loss
+                    g, H = g + slope * n, H + curvature * n[:, None] * n
+            move = -omega * _solve(H, g)
+            now[i] = now[i] + move if floor is None else floor.filtered(now[i], move)
+    by_position, by_velocity = (w[..., None] for w in weights)
+    return now, (by_position * now + by_velocity * (now - x)).sum((0, 1))
 
 
-def _solve(H: list, g: Vector) -> Vector:
+def _solve(H: np.ndarray, g: Vector) -> Vector:
     """H^-1 g by the adjugate: digits are plentiful."""
     a, b, c = H
     bc, ca, ab = _cross(b, c), _cross(c, a), _cross(a, b)
-    det = _dot(a, bc)
-    return [(bc[r] * g[0] + ca[r] * g[1] + ab[r] * g[2]) / det for r in range(3)]
+    return (bc * g[0] + ca * g[1] + ab * g[2]) / _dot(a, bc)
 
 
 class _Floor:
@@ -209,14 +173,13 @@ class _Floor:
         self.damping = parameter("damping") if "floor_damping" in inputs else 0 * self.kappa
         self.planes = []
         for normal, height in zip(parameter("normal"), parameter("height"), strict=True):
-            length = _root(_dot(list(normal), list(normal)))
-            self.planes.append(([c / length for c in normal], height))
+            self.planes.append((normal / _root(_dot(normal, normal)), height))
 
     def terms(self, x: Vector, x_prev: Vector) -> list[tuple[Vector, np.ndarray, np.ndarray]]:
         """Of each plane: normal, h^2 b' and h^2 b'', damping included."""
         out = []
         for n, height in self.planes:
-            d, travel = _dot(n, x) - height, _dot(n, _sub(x, x_prev))
+            d, travel = _dot(n, x) - height, _dot(n, x - x_prev)
             active = d < self.dhat
             safe = np.where(active, d, self.dhat)
             log, past = _log(safe / self.dhat), safe - self.dhat
@@ -243,23 +206,20 @@ class _Floor:
             away = _dot(n, x) - height - self.dhat
             limits.append((n, Decimal(ETA) * np.where(away > 0, away, 0 * away)))
         if len(limits) == 2:
-            over = [-_dot(n, move) - room for n, room in limits]
-            swap = over[1] > over[0]
             (n, a), (m, b) = limits
-            first = ([np.where(swap, q, p) for p, q in zip(n, m, strict=True)], np.where(swap, b, a))
-            other = ([np.where(swap, p, q) for p, q in zip(n, m, strict=True)], np.where(swap, a, b))
-            limits = [first, other]
+            swap = -_dot(m, move) - b > -_dot(n, move) - a
+            limits = [(np.where(swap, m, n), np.where(swap, b, a)), (np.where(swap, n, m), np.where(swap, a, b))]
         taken: list[tuple[Vector, np.ndarray]] = []
         for n, room in limits:
             excess, w = -_dot(n, move) - room, n
             binds = excess > slack
             for other_w, square in taken:
-                w = _sub(w, _times(_dot(n, other_w) / square, other_w))
-            w = [np.where(binds, c, 0 * c) for c in w]
+                w = w - _dot(n, other_w) / square * other_w
+            w = np.where(binds, w, 0 * w)
             square = np.where(binds, _dot(w, w), 1 + 0 * excess)
-            move = _add(move, _times(np.where(binds, excess, 0 * excess) / square, w))
+            move = move + np.where(binds, excess, 0 * excess) / square * w
             taken.append((w, square))
-        return _add(x, move)
+        return x + move
 
     def filtered(self, x: Vector, move: Vector) -> Vector:
         alpha = 0 * x[0] + 1
@@ -268,13 +228,4 @@ class _Floor:
             closing = change < 0
             fraction = np.where(closing, Decimal(ETA) * d / np.where(closing, -change, 1 + 0 * d), alpha)
             alpha = np.where(fraction < alpha, fraction, alpha)
-        return _add(x, _times(alpha, move))
-
-
-def compare(run: Callable[..., tuple[Tensor, Tensor]], exact: Exact, inputs: dict[str, Any], time_step: float
-            ) -> dict[str, float]:  # fmt: skip
-    """Errors of `testing.evaluate(run, inputs, time_step)`, relative to the largest entry, by entry of `exact`."""
-    from diffvbd import testing
-
-    result = testing.on_device(testing.evaluate(run, inputs, time_step), "cpu")
-    return {k: testing.relative_error(result[k], v) for k, v in exact.values.items()}
+        return x + alpha * move

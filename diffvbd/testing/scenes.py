@@ -30,9 +30,8 @@ def generator(*key: Any) -> np.random.Generator:
     return np.random.default_rng(zlib.crc32(repr(key).encode()))
 
 
-def structured(
-    cells: Sequence[int] = (2, 2, 2), size: Sequence[float] = (1.0, 1.0, 1.0)
-) -> tuple[np.ndarray, np.ndarray]:
+def structured(cells: Sequence[int] = (2, 2, 2), size: Sequence[float] = (1.0, 1.0, 1.0)
+               ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Box from the origin cut into six Kuhn tets per cell: points [V, 3] in [m], tets [T, 4]."""
     shape = np.asarray(cells) + 1
     grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
@@ -123,12 +122,8 @@ class Case:
 
 
 _NEAR = {"height": -0.06, "kappa": 2e4, "dhat": 0.1}  # the lowest vertices start inside dhat
-_CORNER = {
-    "height": (-0.06, -0.7, -0.32),
-    "normal": ((0.0, 1.0, 0.0), (-0.6, 0.8, 0.0), (0.3, 0.9, -0.3)),
-    "kappa": 2e4,
-    "dhat": 0.15,
-}
+_CORNER = {"height": (-0.06, -0.7, -0.32), "normal": ((0.0, 1.0, 0.0), (-0.6, 0.8, 0.0), (0.3, 0.9, -0.3)),
+           "kappa": 2e4, "dhat": 0.15}  # fmt: skip
 
 CASES: dict[str, Case] = {
     "plain": Case(),
@@ -180,33 +175,24 @@ class Scene:
         """The case's energies as the package's dataclasses."""
         from diffvbd.energies import Anchor, FloorBarrier, StableNeoHookean
 
-        built: list[Any] = [StableNeoHookean()]
-        if self.case.floor is not None:
-            built.append(FloorBarrier(**self.case.floor))
-        if self.case.anchor is not None:
-            built.append(Anchor(self.case.anchor))
-        return tuple(built)
+        floor = () if self.case.floor is None else (FloorBarrier(**self.case.floor),)
+        return (StableNeoHookean(), *floor, *(() if self.case.anchor is None else (Anchor(self.case.anchor),)))
 
     def model(self, device: str = "cpu", **options: Any) -> Any:
         """A `diffvbd.Model` of the scene, float64; options of it in addition."""
         from diffvbd.mesh import TetMesh
         from diffvbd.model.model import Model
 
-        return Model(
-            TetMesh(self.points, self.tets),
-            density=torch.from_numpy(self.arrays["density"]),
-            pinned=torch.from_numpy(self.pinned) if self.pinned.any() else None,
-            energies=self.energies(),
-            device=device,
-            **options,
-        )
+        pinned = torch.from_numpy(self.pinned) if self.pinned.any() else None
+        return Model(TetMesh(self.points, self.tets), density=torch.from_numpy(self.arrays["density"]), pinned=pinned,
+                     energies=self.energies(), device=device, **options)  # fmt: skip
 
     def solver(self, sweeps: int, **options: Any) -> Any:
         """A `diffvbd.VBD` of the case; options of it in addition."""
         from ..model.solver import VBD
 
         names = ("saturation", "regularization", "relaxation", "block")
-        return VBD(self.case.time_step, sweeps, **{**{name: getattr(self.case, name) for name in names}, **options})
+        return VBD(self.case.time_step, sweeps, **{name: getattr(self.case, name) for name in names} | options)
 
     def inputs(self, dtype: torch.dtype = torch.float64, device: str = "cpu") -> dict[str, Any]:
         """Fresh tensors for x, v and every differentiable input of `step`."""
@@ -250,9 +236,8 @@ def build_scene(case: str, kind: str = "structured", size: str = "small") -> Sce
     return Scene(f"{case}-{kind}-{size}", c, points, tets, pinned, arrays)
 
 
-def scenes(
-    cases: Sequence[str] | None = None, kinds: Sequence[str] = KINDS, sizes: Sequence[str] = ("small",)
-) -> Iterator[Scene]:
+def scenes(cases: Sequence[str] | None = None, kinds: Sequence[str] = KINDS, sizes: Sequence[str] = ("small",)
+           ) -> Iterator[Scene]:  # fmt: skip
     """Scenes of the product of cases (default: all), mesh kinds and sizes; kind "delaunay" needs scipy."""
     for case, kind, size in itertools.product(cases or CASES, kinds, sizes):
         yield build_scene(case, kind, size)
@@ -298,20 +283,13 @@ def evaluate(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any], 
     return result
 
 
-def reference_result(
-    model: Any,
-    inputs: dict[str, Any],
-    solver: Any,
-    steps: int = 1,
-    tet_order: Tensor | None = None,
-    coarse_steps: Any = None,
-) -> dict[str, Tensor]:
+def reference_result(model: Any, inputs: dict[str, Any], solver: Any, steps: int = 1,
+                     tet_order: Tensor | None = None, coarse_steps: Any = None) -> dict[str, Tensor]:  # fmt: skip
     """`evaluate` of the reference rollout; coarse_steps: recorded lengths of coarse corrections, one entry a step."""
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        trajectory = reference.rollout(
-            model, solver=solver, steps=steps, tet_order=tet_order, coarse_steps=coarse_steps, **options
-        )
+        trajectory = reference.rollout(model, solver=solver, steps=steps, tet_order=tet_order,
+                                       coarse_steps=coarse_steps, **options)  # fmt: skip
         return trajectory.x[-1], trajectory.v[-1]
 
     return evaluate(run, inputs, solver.time_step)
@@ -319,21 +297,14 @@ def reference_result(
 
 def _turned(model: Any, solver: Any) -> Any:
     """Attributes of a model that the reference reads, each tet listed from another corner (an even permutation)."""
-    names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
-    names += ("saturation", "regularization", "relaxation", "block", "rigid", "starts_from")
-    names += ("coarse", "coarse_geometry")
+    names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation", "rigid",
+             "regularization", "relaxation", "block", "starts_from", "coarse", "coarse_geometry")  # fmt: skip
     model = system_of(model, solver)
     return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name, None) for name in names})
 
 
-def spread(
-    model: Any,
-    inputs: dict[str, Any],
-    solver: Any,
-    steps: int = 1,
-    expected: dict[str, Tensor] | None = None,
-    coarse_steps: Any = None,
-) -> dict[str, float]:
+def spread(model: Any, inputs: dict[str, Any], solver: Any, steps: int = 1,
+           expected: dict[str, Tensor] | None = None, coarse_steps: Any = None) -> dict[str, float]:  # fmt: skip
     """Disagreement of two references with permuted tets, per entry of `evaluate`: the effect of rounding alone.
 
     The order of the tets changes the sums over a star and over a body, that of a tet's corners the rounding inside it.
@@ -346,14 +317,8 @@ def spread(
     return {name: relative_error(permuted[name], expected[name]) for name in expected}
 
 
-def sensitivity(
-    model: Any,
-    inputs: dict[str, Any],
-    solver: Any,
-    steps: int = 1,
-    expected: dict[str, Tensor] | None = None,
-    coarse_steps: Any = None,
-) -> dict[str, float]:
+def sensitivity(model: Any, inputs: dict[str, Any], solver: Any, steps: int = 1,
+                expected: dict[str, Tensor] | None = None, coarse_steps: Any = None) -> dict[str, float]:  # fmt: skip
     """Change of the reference, per entry of `evaluate`, when every input moves by an ulp (the worst of three random
     moves): no algorithm can be asked for less. A barrier feels it in a small gap, which the order of the tets hides."""
     if expected is None:
@@ -361,13 +326,12 @@ def sensitivity(
     rng = generator("sensitivity")
 
     def nudged(a: Any) -> Any:
-        if isinstance(a, dict):
-            return {name: nudged(value) for name, value in a.items()}
         if not isinstance(a, Tensor):
             return a
         return a * torch.as_tensor(1 + rng.choice((-1, 1), tuple(a.shape)) * 2.0**-52, device=a.device)
 
-    moved = [reference_result(model, nudged(inputs), solver, steps, coarse_steps=coarse_steps) for _ in range(3)]
+    tries = [{name: nudged(value) for name, value in inputs.items()} for _ in range(3)]
+    moved = [reference_result(model, given, solver, steps, coarse_steps=coarse_steps) for given in tries]
     return {name: max(relative_error(m[name], expected[name]) for m in moved) for name in expected}
 
 
