@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import diffvbd as dv
 from bench.measure import Card
 from bench.tables import Table, count, median, most
-from diffvbd import mesh
+from diffvbd import mesh, results
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # of the sums of the gradient's parts
@@ -237,7 +237,7 @@ class Scene:
         rubs = (dv.Friction(b.friction, velocity=b.eps_v),) if b.friction else ()
         return (dv.StableNeoHookean(), dv.FloorBarrier(kappa=b.kappa, dhat=b.dhat), *rubs)
 
-    def executed(self, sweeps: int, **options: Any) -> tuple[dv.results.Trajectory, dv.Model, list[str]]:
+    def executed(self, sweeps: int, **options: Any) -> tuple[results.Trajectory, dv.Model, list[str]]:
         """Its rollout by a solver of these options, the Model, and what was said of either."""
         b = self.body
         with warnings.catch_warnings(record=True) as said, torch.no_grad():
@@ -347,7 +347,7 @@ def rollouts(numbers: Iterable[int]) -> list[dict[str, Any]]:
     return out
 
 
-def apart(scene: Scene, motion: dv.results.Trajectory, exact: tuple[Array, Array]) -> dict[str, float]:
+def apart(scene: Scene, motion: results.Trajectory, exact: tuple[Array, Array]) -> dict[str, float]:
     x, v = exact
     off = np.sqrt(((motion.x.numpy() - x) ** 2).sum(-1).mean(-1))
     moved = np.sqrt(((x - x[0]) ** 2).sum(-1).mean(-1)).max()

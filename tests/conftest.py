@@ -103,7 +103,7 @@ def one_regime(device: str) -> Iterator[None]:
 @pytest.fixture
 def value_checks(device: str) -> Iterator[None]:
     """CUDA looks at values only inside debug_checks(), the CPU always."""
-    import diffvbd as dv
+    from diffvbd.testing import debug_checks
 
-    with dv.debug_checks(device == "cuda"):
+    with debug_checks(device == "cuda"):
         yield

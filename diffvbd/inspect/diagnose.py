@@ -300,7 +300,7 @@ def _state_messages(model: System, result: Diagnosis) -> list[str]:
     if bool(result.nonfinite.any()):
         first = result.nonfinite.nonzero()[0].tolist()
         out.append(f"{int(result.nonfinite.sum())} positions are NaN or Inf, the first at {first}; run again inside "
-                   "diffvbd.debug_checks() to learn where they appear")  # fmt: skip
+                   "diffvbd.testing.debug_checks() to learn where they appear")  # fmt: skip
     if bool(result.collapsing.any()):
         first = result.collapsing.nonzero()[0].tolist()
         out.append(f"{int(result.collapsing.sum())} tets are inside the F = 0 well (|F| < sqrt(3) s*), the first at "

@@ -257,8 +257,8 @@ def _warn_of_loss(which: str, finite: bool, fault: str) -> None:
     how = f"vertices more than {FAR:g} body sizes from where motion and gravity would have taken them"
     if not finite:
         how = "positions or velocities that are not finite"
-    warn(f"x: {which} ended with {how}: {fault}; dv.debug_checks() says in which step what is not finite began; "
-         + page("numerics.md"))  # fmt: skip
+    warn(f"x: {which} ended with {how}: {fault}; diffvbd.testing.debug_checks() says in which step what is not finite "
+         "began; " + page("numerics.md"))  # fmt: skip
 
 
 # --- what a rollout says of its energy --------------------------------------------------------------------------------

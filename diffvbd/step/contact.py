@@ -44,7 +44,7 @@ FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
-        "time_step or softer materials, or look with diffvbd.debug_checks()")  # fmt: skip
+        "time_step or softer materials, or look with diffvbd.testing.debug_checks()")  # fmt: skip
 
 
 class ContactStep:

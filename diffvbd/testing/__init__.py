@@ -1,5 +1,6 @@
-"""Shared parts of tests and benchmarks: scenes, evaluation against the reference, and one table of tolerances."""
+"""Looking for a fault: values checked at every step, scenes, evaluation against the reference, and tolerances."""
 
+from ..inspect.record import debug_checks
 from ..ops.regimes import regime
 from .scenes import (
     CASES,
@@ -34,6 +35,7 @@ __all__ = [
     "bar",
     "build_mesh",
     "build_scene",
+    "debug_checks",
     "delaunay",
     "evaluate",
     "generator",

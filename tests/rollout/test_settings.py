@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd.testing import debug_checks
 
 MATERIAL = {"mu": 1e5, "lam": 1e5}
 
@@ -112,7 +113,7 @@ def test_a_name_that_a_call_does_not_have_raises_and_says_what_has_it(call: str,
         (lambda m, x: dv.advise(m, x, 0 * x, duration=0.1, progress=3, **MATERIAL), TypeError,
          "progress: expected a bool, got int"),
         (lambda m, x: dv.memory(m, dv.VBD(0.01, 5), save="first"), ValueError, 'save: expected "all", "last"'),
-        (lambda m, x: dv.debug_checks("no").__enter__(), TypeError, "enabled: expected a bool, got str"),
+        (lambda m, x: debug_checks("no").__enter__(), TypeError, "enabled: expected a bool, got str"),
         (lambda m, x: dv.VBD(0.01, 5, prediction=3), TypeError, "prediction: expected None, got int"),
         (lambda m, x: dv.Model(m.mesh, energies=(dv.StableNeoHookean,)), TypeError, "got the class StableNeoHookean"),
     ],
