@@ -1,4 +1,4 @@
-"""State inside a ``with``, for the thread or task that is in it: debug_checks(), record() and refine().
+"""State inside a ``with``, for the thread or task that is in it: debug_checks(), record(), refine() and silence().
 
 Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
 guards, and so sees what any thread is inside of.
@@ -10,6 +10,7 @@ import contextlib
 import copy
 import dataclasses
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import Any, NamedTuple, TypeVar
@@ -40,6 +41,7 @@ class Finer(NamedTuple):
 
 _in_segment: ContextVar[bool] = ContextVar("diffvbd.segment", default=False)
 _refining: ContextVar[Finer | None] = ContextVar("diffvbd.refine", default=None)
+_silent: ContextVar[bool] = ContextVar("diffvbd.silent", default=False)
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False
@@ -165,6 +167,23 @@ def unheard() -> Iterator[None]:
     finally:
         _recording.reset(recording)
         _checking.reset(checked)
+
+
+def is_silent() -> bool:
+    """Whether nobody would hear a warning, so that nothing need be looked at for one."""
+    return not torch.compiler.is_compiling() and _silent.get()
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Inside, nothing is warned of."""
+    token = _silent.set(True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            _silent.reset(token)
 
 
 def in_segment() -> bool:

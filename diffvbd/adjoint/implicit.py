@@ -24,9 +24,9 @@ from .._common.context import is_captured
 from .._common.messages import warn
 from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
+from ..ops.sweep import sweep
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
-from .sweep import sweep
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}

@@ -9,6 +9,7 @@ from . import shapes as _shapes  # noqa: F401  (registers what torch.compile ask
 from .autograd import (
     Differentiable,
     Linear,
+    direct,
     distinct,
     fold_scenes,
     folded,
@@ -48,9 +49,9 @@ from .fields import (
     tape_rows,
     tape_shape,
 )
-from .load import direct, has_cuda, raw, require_cuda
+from .load import has_cuda, raw, require_cuda
 from .sums import broadcast, star_sum, tet_gather
-from .sweep import build_plan, fused_step, fused_step_backward, pack_rest, plan_order, sweep, sweep_backward
+from .sweep import build_plan, fused_step, pack_rest, plan_order, run_sweep, sweep, sweep_backward
 
 __all__ = [
     "BeginFields",
@@ -85,7 +86,6 @@ __all__ = [
     "fold_scenes",
     "folded",
     "fused_step",
-    "fused_step_backward",
     "has_cuda",
     "is_batched",
     "no_second_derivative",
@@ -98,6 +98,7 @@ __all__ = [
     "plan_sizes",
     "raw",
     "require_cuda",
+    "run_sweep",
     "star_sum",
     "sum_to",
     "sweep",

@@ -18,8 +18,8 @@ from .._common.constants import FILTER_ETA
 from .._common.context import is_captured
 from ..energies import VERTEX_ENERGIES
 from .autograd import Bars, Differentiable, sum_to
+from .autograd import direct as raw
 from .fields import TouchingFields
-from .load import direct as raw
 from .sums import segment_sum
 
 # --- searches ---------------------------------------------------------------------------------------------------------

@@ -13,13 +13,12 @@ from torch import Tensor
 
 from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
-from .._common.context import is_captured, looks_at, may_copy, replaced
-from .._common.messages import is_silent, page, percent, warn
+from .._common.context import is_captured, is_silent, looks_at, may_copy, replaced
+from .._common.messages import page, percent, warn
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import Integrator
 from ..model.system import System
-from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.contact import CUT, outcomes
@@ -35,7 +34,7 @@ from ..step.residual import (
     unsolved,
     what_helps,
 )
-from ..step.stability import FAR, fault_of, reach_of, size_of
+from ..step.warnings import FAR, fault_of, reach_of, size_of, warn_of_bending
 
 
 @init_names_checked

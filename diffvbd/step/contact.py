@@ -25,16 +25,17 @@ from .._contact.start import PartStart, above_floor, start_between_planes
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
 from ..adjoint.contact import Pairs, no_pairs, rubbing, some_of
 from ..adjoint.potential import RiseParts, of_vertices, rise_parts
-from ..adjoint.sweep import no_transforms, sweep
 from ..model.inputs import parameter_of
+from ..model.material import inside_out
 from ..model.model import Model
 from ..model.system import System
-from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
+from ..ops.autograd import no_transforms
 from ..ops.contact import RoomsOfBodies, contact_rooms, lift_left, sweep_rooms
 from ..ops.fields import WAYS
+from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
 from .contact_corrections import Corrections, Scenes, Trials, bodies_of, corrected, corrected_after, is_cut, touching
