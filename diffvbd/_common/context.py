@@ -123,6 +123,16 @@ def refuse_refinement(name: str) -> None:
         )
 
 
+@contextlib.contextmanager
+def inside(variable: ContextVar[Any], value: Any) -> Iterator[None]:
+    """Inside, a context variable has a value."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
 def _count(change: int) -> None:
     global _checked_by, _any_checking
     with _lock:
@@ -134,39 +144,33 @@ def _count(change: int) -> None:
 def checks(enabled: bool) -> Iterator[None]:
     """Inside, checking() is ``enabled``."""
     change = int(enabled) - int(_checking.get())
-    token = _checking.set(enabled)
     _count(change)
     try:
-        yield
+        with inside(_checking, enabled):
+            yield
     finally:
         _count(-change)
-        _checking.reset(token)
 
 
 @contextlib.contextmanager
 def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
     """Inside, recorders(kind) has ``found``."""
     global _recorders
-    token = _recording.set((*_recording.get(), (kind, found)))
     with _lock:
         _recorders = (*_recorders, (kind, found))
     try:
-        yield
+        with inside(_recording, (*_recording.get(), (kind, found))):
+            yield
     finally:
         with _lock:
             _recorders = tuple(r for r in _recorders if r[1] is not found)
-        _recording.reset(token)
 
 
 @contextlib.contextmanager
 def unheard() -> Iterator[None]:
     """Inside, steps are recorded nowhere and not checked: they are none of the caller's."""
-    checked, recording = _checking.set(False), _recording.set(())
-    try:
+    with inside(_checking, False), inside(_recording, ()):
         yield
-    finally:
-        _recording.reset(recording)
-        _checking.reset(checked)
 
 
 def is_silent() -> bool:
@@ -177,13 +181,9 @@ def is_silent() -> bool:
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
     """Inside, nothing is warned of."""
-    token = _silent.set(True)
-    with warnings.catch_warnings():
+    with inside(_silent, True), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            yield
-        finally:
-            _silent.reset(token)
+        yield
 
 
 def in_segment() -> bool:
@@ -192,24 +192,14 @@ def in_segment() -> bool:
     return not torch.compiler.is_compiling() and _in_segment.get()
 
 
-@contextlib.contextmanager
-def segment() -> Iterator[None]:
+def segment() -> contextlib.AbstractContextManager[None]:
     """Inside, in_segment() is True."""
-    token = _in_segment.set(True)
-    try:
-        yield
-    finally:
-        _in_segment.reset(token)
+    return inside(_in_segment, True)
 
 
-@contextlib.contextmanager
-def refined(finer: Finer | None) -> Iterator[None]:
+def refined(finer: Finer | None) -> contextlib.AbstractContextManager[None]:
     """Inside, refinement() is ``finer``; None: a refined rollout runs as it stands."""
-    token = _refining.set(finer)
-    try:
-        yield
-    finally:
-        _refining.reset(token)
+    return inside(_refining, finer)
 
 
 class Scope:
@@ -223,12 +213,8 @@ class Scope:
     def resumed(self) -> Iterator[None]:
         known = _recording.get()
         more = tuple(r for r in self.recorders if all(r[1] is not k[1] for k in known))
-        checked, recording = _checking.set(_checking.get() or self.checking), _recording.set((*known, *more))
-        try:
+        with inside(_checking, _checking.get() or self.checking), inside(_recording, (*known, *more)):
             yield
-        finally:
-            _recording.reset(recording)
-            _checking.reset(checked)
 
 
 # --- constants --------------------------------------------------------------------------------------------------------

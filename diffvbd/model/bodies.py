@@ -29,8 +29,7 @@ class Bodies(NamedTuple):
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> Bodies:
-        order, ptr, spread, tets, tet_ptr = (t.to(device) for t in self[:5])
-        return Bodies(order, ptr, spread, tets, tet_ptr, self.groups)
+        return Bodies(*(t.to(device) for t in self[:5]), self.groups)
 
 
 class OtherBodies(NamedTuple):
@@ -48,8 +47,7 @@ class OtherBodies(NamedTuple):
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> OtherBodies:
-        of, order, ptr, tets, tet_ptr = (t.to(device) for t in self[:5])
-        return OtherBodies(of, order, ptr, tets, tet_ptr, self.groups)
+        return OtherBodies(*(t.to(device) for t in self[:5]), self.groups)
 
 
 class _Grouped(NamedTuple):
@@ -94,11 +92,7 @@ def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool, flo
 
     return (
         Bodies(
-            free.order.int(),
-            free.ptr.int(),
-            spread.double(),
-            *_tets_of(free, tets if floor else tets[:0]),
-            free.groups,
+            free.order.int(), free.ptr.int(), spread.double(), *_tets_of(free, tets if floor else tets[:0]), free.groups
         ),
         OtherBodies(
             torch.where(free.of >= 0, CORRECTED, other.of).int(),

@@ -10,15 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._common.checks import (
-    check_dtype,
-    check_held,
-    check_kind,
-    fail,
-    init_names_checked,
-    vertex_mask,
-    where_it_is,
-)
+from .._common.checks import check_dtype, check_held, check_kind, fail, init_names_checked, vertex_mask, where_it_is
 from .._common.constants import CONTACT, ELASTIC
 from .._common.context import is_captured, lasting, lasting_tensors
 from .._contact.barrier import Friction, PairBarrier

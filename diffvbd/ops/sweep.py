@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._common.context import replaced
-from .autograd import Differentiable, distinct, fold_scenes, no_transforms, sum_to
+from .autograd import Differentiable, distinct, fold_scenes, folded, no_transforms, sum_to
 from .autograd import direct as raw
 from .fields import (
     FULL_TAPE,
@@ -144,12 +144,9 @@ def _reverse(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, n
 def _vmap(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int | None, ...]]:
     fields = SweepFields(*args[:_FIELDS])
     _plain(fields)
-    scenes = _scenes(fields, in_dims)
-    folded: list[Any] = [_folded(t, d, info.batch_size, scenes) for t, d in zip(fields, in_dims, strict=False)]
-    full = (info.batch_size * scenes, *folded[0].shape[1:])
-    folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
+    tensors, scenes = folded(info.batch_size, tuple(fields), in_dims, 3)
     packed_rest, plan, settings, *others = args[_FIELDS:]
-    x, tape, cut, none = apply(*folded, packed_rest, plan, _scenes_first(settings), *others)
+    x, tape, cut, none = apply(*tensors, packed_rest, plan, _scenes_first(settings), *others)
     return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes)), cut, none), (0, 0, None, None)
 
 
@@ -160,7 +157,7 @@ def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tu
     fields = SweepFields(*saved[:_FIELDS])
     _plain(fields)
     scenes, size = _scenes((x_bar, *fields), in_dims), info.batch_size
-    folded: list[Any] = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
+    given = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
     packed_rest, plan, x, tape, corrections, cut = saved[_FIELDS:]
     x, tape = (
         t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
@@ -169,7 +166,7 @@ def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tu
     full = (size * scenes, *x_bar.shape[-2:])
     # shared inputs get a gradient for each member of the batch: give every differentiated one its own scenes
     spread: list[Any] = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
-              for t, need in zip(folded, needs, strict=True)]  # fmt: skip
+              for t, need in zip(given, needs, strict=True)]  # fmt: skip
     spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
     out = apply(_folded(x_bar, in_dims[0], size, scenes).expand(full), *spread, packed_rest, plan, x, tape, corrections,
                 cut, (settings, tape_policy, *others), needs)  # fmt: skip
@@ -242,30 +239,23 @@ def _run_fused(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
     return raw.fused_step(*given, plan, *settings, tape_policy)
 
 
-def _fused_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, tape: Tensor, fields: StepFields,
-                        packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
-                        wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
-    """As sweep_backward, of STEP_ADJOINTS."""
-    given = listed(fields, packed_rest, plan, settings)
-    if tape_policy == NO_TAPE:
-        tape_policy = FULL_TAPE
-        x, _, tape = raw.fused_step(*given, plan, *settings, tape_policy)
-    out = [fields.x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
-    flags = [wants[name] for name in ("x", "v", "acceleration", "prescribed")]
-    flags += [wants["mu"] or wants["lam"], wants["mass"], wants["rest"]]
-    bars = raw.fused_step_backward(*given, *out, x, tape, plan, *settings, tape_policy, flags)
-    return dict(zip(STEP_ADJOINTS, bars, strict=True))
-
-
 def _reverse_fused(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
                    ) -> list[Any]:  # fmt: skip
-    fields, (packed_rest, plan, x_end, tape) = StepFields(*saved[:_STEP_FIELDS]), saved[_STEP_FIELDS:]
+    """As _reverse(), of STEP_ADJOINTS."""
+    fields, (packed_rest, plan, x, tape) = StepFields(*saved[:_STEP_FIELDS]), saved[_STEP_FIELDS:]
     settings, tape_policy = rest
     wants = _wants(STEP_ADJOINTS, fields._fields, needs)
+    flags = [wants[name] for name in ("x", "v", "acceleration", "prescribed")]
+    flags += [wants["mu"] or wants["lam"], wants["mass"], wants["rest"]]
     with backward_memory(fields.x, settings, tape_policy):
-        out = _fused_backward(bars[0], bars[1], x_end, tape, fields, packed_rest, plan, settings, tape_policy,
-                                      wants)  # fmt: skip
-    return [out[name] for name in fields._fields]
+        given = listed(fields, packed_rest, plan, settings)
+        if tape_policy == NO_TAPE:
+            tape_policy = FULL_TAPE
+            x, _, tape = raw.fused_step(*given, plan, *settings, tape_policy)
+        states = [fields.x.new_empty((0,)) if bar is None else bar.contiguous() for bar in bars]
+        out = raw.fused_step_backward(*given, *states, x, tape, plan, *settings, tape_policy, flags)
+    by_name = dict(zip(STEP_ADJOINTS, out, strict=True))
+    return [by_name[name] for name in fields._fields]
 
 
 # A whole step on CUDA: predictor, sweeps, velocity. Not for torch.func, which has the parts.

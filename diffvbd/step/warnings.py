@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
 from contextvars import ContextVar
 from functools import partial
 from typing import Any
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .._common.constants import ELASTIC
-from .._common.context import is_silent, looks_at, unheard
+from .._common.context import inside, is_silent, looks_at, unheard
 from .._common.messages import page, warn
 from ..model.material import inside_out, thinness
 from ..model.model import Model
@@ -72,14 +71,9 @@ def warn_of_solver(model: System) -> None:
 # --- sweeps that are too few, before a step ---------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def proven() -> Iterator[None]:
+def proven() -> contextlib.AbstractContextManager[None]:
     """Inside, it is not doubted that vibrations stay small: a pilot run with these settings has ended well."""
-    token = _proven.set(True)
-    try:
-        yield
-    finally:
-        _proven.reset(token)
+    return inside(_proven, True)
 
 
 def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) -> None:

@@ -4,11 +4,14 @@ silently."""
 
 import contextlib
 import itertools
+import subprocess
+import sys
 from typing import Any
 
 import pytest
 import torch
 from helpers.marks import slow
+from helpers.paths import ROOT
 from helpers.results import saved_bytes
 from helpers.spreads import beyond
 from torch import Tensor
@@ -136,6 +139,21 @@ def test_report_tells_of_each_backward_step(device: str) -> None:
     assert len(solves) == 3
     for solve in solves:
         assert solve.converged and 0 < solve.residual <= 2 * goal and 1 < solve.iterations < 200
+
+
+def test_the_first_solve_of_a_process_is_silent() -> None:
+    """Of which torch says that its block-sparse matrices are new."""
+    script = """
+import diffvbd as dv, warnings
+warnings.resetwarnings()
+warnings.simplefilter("error")
+model = dv.Model(dv.mesh.cube(2, size=0.1), pinned=[0])
+x = model.rest_points.requires_grad_()
+dv.step(model, x, 0 * x, dv.VBD(0.01, 30), mu=1e4, lam=1e4, adjoint=dv.GlobalAdjoint())[0].sum().backward()
+assert x.grad.any()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("assembled", (True, False))
