@@ -206,7 +206,7 @@ class Model:
 
     def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
         """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
-        plan = ops.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])
+        plan = ops.direct.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])  # see csrc/cpu/plan.h
         self._plan, self._color_ptr, self._color_vertices, star_ptr, star = plan
         self._topology = (tets, star_ptr, star)
         self._sizes = ops.plan_sizes(self._plan, device.type)

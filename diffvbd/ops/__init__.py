@@ -52,4 +52,4 @@ from .fields import (
 )
 from .load import has_cuda, raw, require_cuda
 from .sums import broadcast, star_sum, tet_gather
-from .sweep import build_plan, fused_step, pack_rest, plan_order, run_sweep, sweep, sweep_backward
+from .sweep import fused_step, pack_rest, plan_order, run_sweep, sweep, sweep_backward

@@ -1,5 +1,5 @@
 """The sweeps of a step, and whole steps on CUDA, as autograd functions: forward, and the same sweeps transposed. With
-what belongs to them: plans, packed rest shapes, and the rise of potentials."""
+what belongs to them: plans and packed rest shapes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,6 @@ from .fields import (
     tape_rows,
 )
 from .regimes import BLOCK, FEW_LANES, THREAD
-
-
-def build_plan(
-    points: Tensor, tets: Tensor, active: Tensor, lanes: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h; lanes: of :data:`LANES`."""
-    return raw.build_plan(points, tets, active, lanes)
 
 
 def plan_order(plan: Tensor, lanes: int) -> Tensor:
@@ -271,23 +264,3 @@ def fused_step(fields: StepFields, packed_rest: Tensor, plan: Tensor, settings: 
     """Positions and velocities [B, V, 3] after a step on CUDA whose only energy is that of the tets; as sweep()."""
     x, v, _ = _fused_step(*distinct(*fields), packed_rest, plan, settings, tape_policy)
     return x, v
-
-
-# --- potentials -------------------------------------------------------------------------------------------------------
-
-
-def potential_rise(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor, rest: Tensor, index: Sequence[Tensor],
-                   data_count: Sequence[int], time_step: float) -> Tensor:  # fmt: skip
-    """By how much the potential of each body rises from x to ``to`` [kg m^2, times h^2], and the sum of the sizes of
-    its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may.
-
-    Args:
-        fields: Of the step; where its sweeps start does not enter.
-        x, to: Positions [m], [B, V, 3].
-        material, rest: [1 | B, blocks, 2 | 7, 8], of the tets by body.
-        index: order, ptr, of the OtherBodies (of no meaning here), corner and block_ptr of MovingBodies, int32.
-    """
-    absent = x.new_empty((0,))
-    origin = absent if fields.origin is None else fields.origin
-    return raw.potential_rise(x, to, fields.x_prev, fields.y, fields.mass, fields.energy_data, origin, material, rest,
-                              *index, list(data_count), time_step)  # fmt: skip
