@@ -29,7 +29,8 @@ class Bodies(NamedTuple):
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> Bodies:
-        return Bodies(*(t.to(device) for t in self[:5]), self.groups)
+        order, ptr, spread, tets, tet_ptr = (t.to(device) for t in self[:5])
+        return Bodies(order, ptr, spread, tets, tet_ptr, self.groups)
 
 
 class OtherBodies(NamedTuple):
@@ -47,7 +48,8 @@ class OtherBodies(NamedTuple):
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> OtherBodies:
-        return OtherBodies(*(t.to(device) for t in self[:5]), self.groups)
+        of, order, ptr, tets, tet_ptr = (t.to(device) for t in self[:5])
+        return OtherBodies(of, order, ptr, tets, tet_ptr, self.groups)
 
 
 class _Grouped(NamedTuple):
@@ -92,7 +94,11 @@ def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool, flo
 
     return (
         Bodies(
-            free.order.int(), free.ptr.int(), spread.double(), *_tets_of(free, tets if floor else tets[:0]), free.groups
+            free.order.int(),
+            free.ptr.int(),
+            spread.double(),
+            *_tets_of(free, tets if floor else tets[:0]),
+            free.groups,
         ),
         OtherBodies(
             torch.where(free.of >= 0, CORRECTED, other.of).int(),
