@@ -29,7 +29,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench.measure import Card
 from bench.tables import Table, count, median, most
-from diffvbd import mesh, reference, testing
+from diffvbd import mesh, reference, results, testing
 
 EPS = float(np.finfo(np.float64).eps)
 NO_DIGITS = 0.01  # conditioning beyond which a gradient has no digits to compare
@@ -525,7 +525,7 @@ def _run(case: Case) -> dict[str, Any]:
     return row | _gradient(case, model, x, v, material, options)
 
 
-def gained(case: Case, motion: dv.results.Trajectory, material: dict[str, Tensor]) -> float:
+def gained(case: Case, motion: results.Trajectory, material: dict[str, Tensor]) -> float:
     """Most energy of a frame beyond that of the first, over what the scene had and what gravity did; barriers, which
     hold none at the start and are never negative, left out."""
     double = build_feature(replace(case, single=False))[0]
@@ -543,7 +543,7 @@ def gained(case: Case, motion: dv.results.Trajectory, material: dict[str, Tensor
     return float(((moving + elastic + fallen).max() - moving[0] - elastic[0]) / scale)
 
 
-def _crossings(case: Case, model: dv.Model, motion: dv.results.Trajectory) -> int:
+def _crossings(case: Case, model: dv.Model, motion: results.Trajectory) -> int:
     """Edges through triangles at the end, and vertices of the surface at or below the floor or plane."""
     kind = FEATURES[case.feature][0]
     end = motion.x[-1]

@@ -4,7 +4,7 @@ On CUDA with nccl, a GPU for each rank; with `--device cpu --quick` two processe
 steps of scenes are called eagerly, those of the cubes are a CUDA graph, as in the task. Times are the median of several
 iterations of forward and reverse, from when all ranks begin until all have ended; memory is that of the first.
 
-Of scenes: 10 steps, K = 10, gradients of a network and of mu by `dv.distributed.backward`.
+Of scenes: 10 steps, K = 10, gradients of a network and of mu by `distributed.backward`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.tables import Table
+from diffvbd import distributed
 from diffvbd.tasks import Settings, million_cubes
 from diffvbd.tasks.runner import captured
 
@@ -133,7 +134,7 @@ def _scenes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
     def gradient(parts: int) -> Tensor:
         for leaf in leaves:
             leaf.grad = None
-        return dv.distributed.backward(loss, leaves, scenes, parts)
+        return distributed.backward(loss, leaves, scenes, parts)
 
     rows = []
     for count in (parts, ranks):

@@ -23,6 +23,7 @@ import diffvbd as dv
 from bench.measure import Card, timed
 from bench.sweeps import MATERIAL, STEP, bar
 from bench.tables import Table
+from diffvbd import results
 from diffvbd.model.system import system_of
 
 RELAXATION = 1.5  # with corrections
@@ -50,7 +51,7 @@ class Scene:
                ) -> dv.VBD:  # fmt: skip
         return dv.VBD(STEP, sweeps, subspace=subspace, relaxation=relaxation, start=start)
 
-    def rolled(self, solver: dv.VBD, steps: int, save: Any = "all") -> dv.results.Trajectory:
+    def rolled(self, solver: dv.VBD, steps: int, save: Any = "all") -> results.Trajectory:
         with torch.no_grad():
             return dv.rollout(self.model, *self.state(), solver, steps=steps, save=save, **self.material)
 

@@ -5,7 +5,7 @@ import os as _os
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import colliders, contact, distributed, mesh, results, solvers, viz
+from . import colliders, contact, mesh, solvers, viz
 from ._contact.barrier import Friction, PairBarrier
 from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, ReverseSweep, Unrolled
@@ -13,7 +13,7 @@ from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .inspect.diagnose import diagnose
 from .inspect.forces import reactions, stress
 from .inspect.gradcheck import check_gradients
-from .inspect.record import debug_checks, record
+from .inspect.record import record
 from .mesh import TetMesh
 from .model.coarse import CoarseSpace
 from .model.material import lame, young_poisson
@@ -50,9 +50,7 @@ __all__ = [
     "check_gradients",
     "colliders",
     "contact",
-    "debug_checks",
     "diagnose",
-    "distributed",
     "error_budget",
     "lame",
     "memory",
@@ -61,7 +59,6 @@ __all__ = [
     "reactions",
     "record",
     "refine",
-    "results",
     "rollout",
     "solve",
     "solvers",

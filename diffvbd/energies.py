@@ -20,6 +20,7 @@ from ._common.checks import (
     check_positive,
     check_readable,
     fail,
+    init_names_checked,
     mask_or_indices,
     refuse_gradients,
     vertex_mask,
@@ -49,6 +50,7 @@ def _numbers(name: str, value: Any) -> Tensor:
     return out
 
 
+@init_names_checked
 @dataclass(frozen=True, eq=False)
 class StableNeoHookean:
     """Stable Neo-Hookean tets, P = mu F + (lb (J - 1) - mu) cof F with lb = mu + lam.
@@ -148,6 +150,7 @@ def _share(before: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     return damped_fraction(-_barrier_slope(before, kappa, dhat), kappa, dhat)
 
 
+@init_names_checked
 @dataclass(frozen=True, eq=False)
 class FloorBarrier(VertexEnergy):
     """IPC log barrier above planes: b(d) = -kappa (d - dhat)^2 log(d / dhat) for a gap 0 < d < dhat.
@@ -274,10 +277,11 @@ class FloorBarrier(VertexEnergy):
 
     def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, 1 | V, planes, 3]."""
-        normal, kappa, dhat, _ = self._columns(data)
-        return -_barrier_slope(self._gaps(x, data, origin), kappa, dhat), normal
+        gap, normal, kappa, dhat = self.gaps(x, data, origin)
+        return -_barrier_slope(gap, kappa, dhat), normal
 
 
+@init_names_checked
 @dataclass(frozen=True, eq=False)
 class Anchor(VertexEnergy):
     """A spring from vertices to points: k / 2 |x_i - a_i|^2.

@@ -68,7 +68,7 @@ def pytest_pyfunc_call() -> Generator[None, Any, Any]:
 def growth_is_measured_where_asked(request: pytest.FixtureRequest) -> Iterator[None]:
     """Whether vibrations grow takes up to 24 steps of each new scene, and there are thousands: tests of it ask for it
     by MEASURES_GROWTH."""
-    from diffvbd.step.stability import proven
+    from diffvbd.step.warnings import proven
 
     with contextlib.nullcontext() if getattr(request.module, "MEASURES_GROWTH", False) else proven():
         yield
@@ -103,7 +103,7 @@ def one_regime(device: str) -> Iterator[None]:
 @pytest.fixture
 def value_checks(device: str) -> Iterator[None]:
     """CUDA looks at values only inside debug_checks(), the CPU always."""
-    import diffvbd as dv
+    from diffvbd.testing import debug_checks
 
-    with dv.debug_checks(device == "cuda"):
+    with debug_checks(device == "cuda"):
         yield

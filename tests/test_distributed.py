@@ -30,15 +30,15 @@ ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/guides/sc
 SCENES, PARTS = 7, 3  # which two ranks cannot share evenly
 KILL = """
 import os, signal
-import diffvbd as dv
-original = dv.distributed.backward
+from diffvbd import distributed
+original = distributed.backward
 calls = iter(range(100))
 def backward(*arguments, **options):
     if next(calls) == 4 and os.environ.get("RANK") == "1" and not os.path.exists("killed"):
         open("killed", "w").close()
         os.kill(os.getpid(), signal.SIGKILL)
     return original(*arguments, **options)
-dv.distributed.backward = backward
+distributed.backward = backward
 """
 ENDED = """
 for thread in os.listdir("/proc/self/task"):  # one that outlives its group may abort the program as it ends

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd._common import context as scopes
+from diffvbd.testing import debug_checks
 
 OPTIONS: dict[str, Any] = {"mu": 1e4, "lam": 2e4, "solver": dv.VBD(0.01, 2)}
 
@@ -44,11 +45,11 @@ def in_thread(run: Callable[[], Any]) -> list[BaseException]:
 
 
 def test_another_thread_is_not_checked() -> None:
-    with dv.debug_checks():
+    with debug_checks():
         assert not in_thread(overflowing)
         with pytest.raises(RuntimeError, match="step 0, sweep"):
             overflowing()
-        with dv.debug_checks(False):
+        with debug_checks(False):
             overflowing()
     overflowing()
 
@@ -85,8 +86,8 @@ def test_a_compiled_step_sees_the_switch() -> None:
     compiled, x = torch.compile(run, fullgraph=True, backend="eager"), torch.full((), 3.0)
     for _ in range(2):
         assert compiled(x) == 6
-        with dv.debug_checks():
+        with debug_checks():
             assert compiled(x) == 4
-            with dv.debug_checks(False):
+            with debug_checks(False):
                 assert compiled(x) == 6
             assert compiled(x) == 4

@@ -122,7 +122,7 @@ class Device {
   mutable std::vector<cuda::Span> zeroed_;
 };
 
-using cuda::StartChoice;
+using start::StartChoice;
 
 // Bodies by size, as the Model has counted them, and the memory of their sums.
 struct Teams {

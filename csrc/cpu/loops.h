@@ -58,13 +58,8 @@ void rigid_reverse(const rigid::Inputs<T>& in, bool others, const rigid::Adjoint
   });
 }
 
-// Bodies whose start is chosen, null for none; their second state; and what receives whether they take it.
-template <class T>
-struct StartChoice {
-  const start::Candidates<T>* two;
-  T* second;
-  uint8_t* taken;
-};
+using start::StartChoice;
+
 template <class T>
 void begin(const start::Inputs<T>& in, const StartChoice<T>& of_corrected, const StartChoice<T>& of_others, T* x_start,
            T* y) {

@@ -28,13 +28,7 @@ template <class T>
 cudaError_t rigid_reverse(const rigid::Inputs<T>& in, const BodyGroups& groups, bool others,
                           const rigid::Adjoints<T>& a, double* workspace, cudaStream_t stream);
 
-// Bodies whose start is chosen (null for none), their second state, and whether each takes it.
-template <class T>
-struct StartChoice {
-  const start::Candidates<T>* two;
-  T* second;
-  uint8_t* taken;
-};
+using start::StartChoice;
 
 template <class T>
 cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const StartChoice<T>& of_corrected,

@@ -334,6 +334,14 @@ struct Candidates {
   Batched<const T> material[kMaterialScalars], rest;  // [B, T] or [B, 1] each, [B, T, kRestScalars]; null: no tets
 };
 
+// Bodies whose start is chosen (null for none), their second state, and what receives whether each takes it.
+template <class T>
+struct StartChoice {
+  const Candidates<T>* two;
+  T* second;
+  uint8_t* taken;
+};
+
 // The ratio of Path from which on tets resist. Each corner has all of its mass in each of its tets, some 24: there h^2
 // times the stiffness of a layer of vertices is half of their mass.
 constexpr double kSoft = 0.02;

@@ -70,7 +70,7 @@ def names_checked(owner: str) -> Callable[[Function], Function]:
         def checked(*args: Any, **given: Any) -> Any:
             for name in given:
                 if name not in known:
-                    raise TypeError(f"{name}: expected an argument of {owner} ({', '.join(known)})"
+                    raise TypeError(f"{name}: expected an argument of {owner} ({', '.join(known) or 'it has none'})"
                                     f"{where_it_is(name, known)}")  # fmt: skip
             return function(*args, **given)
 

@@ -1,4 +1,4 @@
-"""State inside a ``with``, for the thread or task that is in it: debug_checks(), record() and refine().
+"""State inside a ``with``, for the thread or task that is in it: debug_checks(), record(), refine() and silence().
 
 Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
 guards, and so sees what any thread is inside of.
@@ -10,6 +10,7 @@ import contextlib
 import copy
 import dataclasses
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import Any, NamedTuple, TypeVar
@@ -40,6 +41,7 @@ class Finer(NamedTuple):
 
 _in_segment: ContextVar[bool] = ContextVar("diffvbd.segment", default=False)
 _refining: ContextVar[Finer | None] = ContextVar("diffvbd.refine", default=None)
+_silent: ContextVar[bool] = ContextVar("diffvbd.silent", default=False)
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False
@@ -121,6 +123,16 @@ def refuse_refinement(name: str) -> None:
         )
 
 
+@contextlib.contextmanager
+def inside(variable: ContextVar[Any], value: Any) -> Iterator[None]:
+    """Inside, a context variable has a value."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
 def _count(change: int) -> None:
     global _checked_by, _any_checking
     with _lock:
@@ -132,39 +144,46 @@ def _count(change: int) -> None:
 def checks(enabled: bool) -> Iterator[None]:
     """Inside, checking() is ``enabled``."""
     change = int(enabled) - int(_checking.get())
-    token = _checking.set(enabled)
     _count(change)
     try:
-        yield
+        with inside(_checking, enabled):
+            yield
     finally:
         _count(-change)
-        _checking.reset(token)
 
 
 @contextlib.contextmanager
 def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
     """Inside, recorders(kind) has ``found``."""
     global _recorders
-    token = _recording.set((*_recording.get(), (kind, found)))
     with _lock:
         _recorders = (*_recorders, (kind, found))
     try:
-        yield
+        with inside(_recording, (*_recording.get(), (kind, found))):
+            yield
     finally:
         with _lock:
             _recorders = tuple(r for r in _recorders if r[1] is not found)
-        _recording.reset(token)
 
 
 @contextlib.contextmanager
 def unheard() -> Iterator[None]:
     """Inside, steps are recorded nowhere and not checked: they are none of the caller's."""
-    checked, recording = _checking.set(False), _recording.set(())
-    try:
+    with inside(_checking, False), inside(_recording, ()):
         yield
-    finally:
-        _recording.reset(recording)
-        _checking.reset(checked)
+
+
+def is_silent() -> bool:
+    """Whether nobody would hear a warning, so that nothing need be looked at for one."""
+    return not torch.compiler.is_compiling() and _silent.get()
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Inside, nothing is warned of."""
+    with inside(_silent, True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def in_segment() -> bool:
@@ -173,24 +192,14 @@ def in_segment() -> bool:
     return not torch.compiler.is_compiling() and _in_segment.get()
 
 
-@contextlib.contextmanager
-def segment() -> Iterator[None]:
+def segment() -> contextlib.AbstractContextManager[None]:
     """Inside, in_segment() is True."""
-    token = _in_segment.set(True)
-    try:
-        yield
-    finally:
-        _in_segment.reset(token)
+    return inside(_in_segment, True)
 
 
-@contextlib.contextmanager
-def refined(finer: Finer | None) -> Iterator[None]:
+def refined(finer: Finer | None) -> contextlib.AbstractContextManager[None]:
     """Inside, refinement() is ``finer``; None: a refined rollout runs as it stands."""
-    token = _refining.set(finer)
-    try:
-        yield
-    finally:
-        _refining.reset(token)
+    return inside(_refining, finer)
 
 
 class Scope:
@@ -204,12 +213,8 @@ class Scope:
     def resumed(self) -> Iterator[None]:
         known = _recording.get()
         more = tuple(r for r in self.recorders if all(r[1] is not k[1] for k in known))
-        checked, recording = _checking.set(_checking.get() or self.checking), _recording.set((*known, *more))
-        try:
+        with inside(_checking, _checking.get() or self.checking), inside(_recording, (*known, *more)):
             yield
-        finally:
-            _recording.reset(recording)
-            _checking.reset(checked)
 
 
 # --- constants --------------------------------------------------------------------------------------------------------

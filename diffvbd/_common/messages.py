@@ -8,8 +8,6 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
-from contextvars import ContextVar
 from pathlib import Path
 
 import torch
@@ -47,26 +45,6 @@ def is_own(error: BaseException) -> bool:
     """Whether an error, from where it was caught on, has come through this package and torch alone: through no
     function of a user."""
     return all(frame.f_code.co_filename.startswith(_INSIDE) for frame, _ in traceback.walk_tb(error.__traceback__))
-
-
-_silent: ContextVar[bool] = ContextVar("diffvbd.silent", default=False)
-
-
-def is_silent() -> bool:
-    """Whether nobody would hear a warning, so that nothing need be looked at for one."""
-    return not torch.compiler.is_compiling() and _silent.get()
-
-
-@contextlib.contextmanager
-def silence() -> Iterator[None]:
-    """Inside, nothing is warned of."""
-    token = _silent.set(True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            yield
-        finally:
-            _silent.reset(token)
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

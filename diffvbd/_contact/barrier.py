@@ -8,7 +8,15 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from .._common.checks import check_bool, check_count, check_number, check_positive, fail, refuse_gradients
+from .._common.checks import (
+    check_bool,
+    check_count,
+    check_number,
+    check_positive,
+    fail,
+    init_names_checked,
+    refuse_gradients,
+)
 from .._common.constants import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
@@ -19,6 +27,7 @@ def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
     return {k: torch.as_tensor(getattr(energy, k), dtype=like.dtype, device=like.device) for k in energy.parameters}
 
 
+@init_names_checked
 @dataclass(frozen=True, eq=False)
 class PairBarrier:
     """IPC log barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) between surfaces of a Model's bodies and its colliders.
@@ -95,6 +104,7 @@ class PairBarrier:
         return _scalars(self, like)
 
 
+@init_names_checked
 @dataclass(frozen=True, eq=False)
 class Friction:
     """Friction of everything that touches: floors (FloorBarrier), pairs and colliders (PairBarrier).

@@ -10,6 +10,7 @@ and what is left over, x_bar - (d2G/dx2) w at the pinned vertices, is the adjoin
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from collections.abc import Callable
@@ -24,9 +25,9 @@ from .._common.context import is_captured
 from .._common.messages import warn
 from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
+from ..ops.sweep import sweep
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
-from .sweep import sweep
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
@@ -149,11 +150,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def conjugate_gradients(
-    product: Operator,
-    b: Tensor,
-    precondition: Operator,
-    tolerance: float,
-    max_iterations: int,
+    product: Operator, b: Tensor, precondition: Operator, tolerance: float, max_iterations: int
 ) -> Conjugate:
     """Preconditioned conjugate gradients for each scene of b [B, V, 3] on its own.
 
@@ -180,11 +177,7 @@ def conjugate_gradients(
 
 
 def _cycle(
-    product: Operator,
-    r: Tensor,
-    precondition: Operator,
-    goal: Tensor,
-    max_iterations: int,
+    product: Operator, r: Tensor, precondition: Operator, goal: Tensor, max_iterations: int
 ) -> tuple[Tensor, int, Tensor]:
     """Solution of A x = r by the recurrence from zero: x, the most iterations of a scene, the lowest curvature met."""
     x, rr = torch.zeros_like(r), _dot(r, r)
@@ -244,6 +237,16 @@ def _structure(model: System) -> _Structure:
     return _Structure(row_ptr, blocks % max(count, 1), where[len(off) :], where[: len(off)], terms, vertices)
 
 
+@functools.cache
+def _first_matrix() -> None:
+    """torch says of the first block-sparse matrix of a process that they are in beta: of this one, unheard."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        none = torch.zeros((1,), dtype=torch.int64, device="cpu")
+        values = torch.zeros((0, 3, 3), device="cpu")
+        torch.sparse_bsr_tensor(none, none[:0], values, size=(0, 0), check_invariants=False)
+
+
 class Assembled:
     """The Hessian of all scenes between free vertices, as one sparse matrix of 3x3 blocks."""
 
@@ -268,13 +271,10 @@ class Assembled:
             row_ptr = torch.cat([(row_ptr[:-1] + n * shift).reshape(-1), row_ptr.new_full((1,), n * scenes)])
             columns = (columns + count * shift).reshape(-1)
         index = torch.int32 if 9 * n * scenes < 2**31 else torch.int64  # MKL and cuSPARSE convert the other one anew
+        _first_matrix()
         self.matrix = torch.sparse_bsr_tensor(
             row_ptr.to(index), columns.to(index), values.reshape(-1, 3, 3), size=(3 * count * scenes,) * 2,
             check_invariants=False)  # fmt: skip
 
     def __call__(self, w: Tensor) -> Tensor:
         return (self.matrix @ w.reshape(-1)).reshape(w.shape)
-
-
-# torch says of every first block-sparse matrix that it is new; here, once, because a filter is global to a process
-warnings.filterwarnings("ignore", message="Sparse (BSR tensor support is in beta|invariant checks are implicitly)")

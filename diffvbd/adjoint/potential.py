@@ -21,7 +21,6 @@ from .. import ops
 from ..model.moving import MovingBodies
 from ..model.system import System
 from ..ops.fields import ROUNDINGS
-from ..ops.sweep import potential_increase
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
@@ -262,9 +261,11 @@ def increase_inputs(model: System, fields: ops.SweepFields, time_step: float) ->
 
 
 def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
-    """Increase of the potential of each body, and the sizes of its terms, float64 [B, bodies, 2]; infinite where
-    a vertex comes too near a plane."""
-    model, moving = inputs.model, inputs.model._moving
+    """Increase of the potential of each body from x to ``to`` [B, V, 3] [kg m^2, times h^2], and the sum of the sizes
+    of its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may."""
+    model, moving, f = inputs.model, inputs.model._moving, inputs.fields
+    origin = x.new_empty((0,)) if f.origin is None else f.origin
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
-    return potential_increase(inputs.fields, x, to.contiguous(), inputs.material, inputs.rest, index, model._data_count,
-                              inputs.time_step)  # fmt: skip
+    return ops.direct.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
+                                         inputs.material, inputs.rest, *index, list(model._data_count),
+                                         inputs.time_step)  # fmt: skip

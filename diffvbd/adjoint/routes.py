@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from .. import ops
-from .._common.checks import check_bool, check_count, check_positive, fail, is_word
+from .._common.checks import check_bool, check_count, check_positive, fail, init_names_checked, is_word
 
 # Up to which bytes of a step's full tape "auto" keeps it: these, or on CUDA this share of the device's memory if that
 # is more.
@@ -23,6 +23,7 @@ def full_tape_limit(device: torch.device) -> int:
     return max(FULL_TAPE_LIMIT, int(FULL_TAPE_SHARE * torch.cuda.get_device_properties(device).total_memory))
 
 
+@init_names_checked
 @dataclass(frozen=True)
 class ReverseSweep:
     """The executed sweeps backwards: exact for every number of sweeps, without a global system. Recommended.
@@ -47,6 +48,7 @@ class TapedSweep(ReverseSweep):
         return {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}[self.tape]
 
 
+@init_names_checked
 @dataclass(frozen=True)
 class Unrolled:
     """The executed colored sweep in plain torch (``diffvbd.reference``), differentiated by torch.autograd.
@@ -72,6 +74,7 @@ class LinearSolve:
     converged: bool
 
 
+@init_names_checked
 @dataclass(frozen=True)
 class GlobalAdjoint:
     """The adjoint of the equation, not of the solver: one linear system per step with the Hessian of the incremental

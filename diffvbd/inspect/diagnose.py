@@ -14,13 +14,21 @@ from .._common.checks import check_bool, check_broadcast, check_tensor, name_val
 from .._common.constants import ELASTIC
 from .._common.messages import percent
 from .._common.messages import warn as say
-from ..model.inputs import LOADS, MODULI, Given
 from ..model.material import moduli_of
 from ..model.model import Model
 from ..model.solver import VBD, ImplicitEuler
 from ..model.system import System, system_of
-from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
-from ..step.arguments import acceleration_of, check_prescribed, check_state, given_of, prepare, refuse_non_finite
+from ..step.arguments import (
+    LOADS,
+    MODULI,
+    Given,
+    acceleration_of,
+    check_prescribed,
+    check_state,
+    given_of,
+    prepare,
+    refuse_non_finite,
+)
 from ..step.predict import begin
 from ..step.residual import (
     UNBALANCED,
@@ -37,6 +45,7 @@ from ..step.residual import (
     rounding,
     share,
 )
+from ..step.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
 from .forces import check_previous, wide, widen
 
 # Limits with their measurements in docs/numerics.md
@@ -300,7 +309,7 @@ def _state_messages(model: System, result: Diagnosis) -> list[str]:
     if bool(result.nonfinite.any()):
         first = result.nonfinite.nonzero()[0].tolist()
         out.append(f"{int(result.nonfinite.sum())} positions are NaN or Inf, the first at {first}; run again inside "
-                   "diffvbd.debug_checks() to learn where they appear")  # fmt: skip
+                   "diffvbd.testing.debug_checks() to learn where they appear")  # fmt: skip
     if bool(result.collapsing.any()):
         first = result.collapsing.nonzero()[0].tolist()
         out.append(f"{int(result.collapsing.sum())} tets are inside the F = 0 well (|F| < sqrt(3) s*), the first at "

@@ -18,12 +18,13 @@ from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
-from ..model.inputs import COLLIDERS, Given
 from ..model.material import shape_gradients
 from ..model.model import Model
 from ..model.solver import VBD
 from ..model.system import System, system_of
 from ..step.arguments import (
+    COLLIDERS,
+    Given,
     Prepared,
     acceleration_of,
     broadcastable,

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._common.checks import check_count, fail, is_word
+from .._common.checks import check_count, fail, init_names_checked, is_word
 from .._common.context import replaced
 from ..ops.coarse import PACK as LANES
 from ..ops.coarse import ROW, lengths
@@ -39,6 +39,7 @@ _AT_ONCE = 2**24  # scalars of a batch of bodies
 PACK = ops.LANES["cpu"]  # a body's matrix has 1, 2, 4 or a multiple of as many functions
 
 
+@init_names_checked
 @dataclass(frozen=True)
 class CoarseSpace:
     """Coarse correction between sweeps: what few sweeps do badly, the motion of large parts, done by one small system.

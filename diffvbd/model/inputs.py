@@ -6,14 +6,8 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from .._common.checks import input_name, where_it_is
+from .._common.checks import input_name
 from .._common.constants import ELASTIC
-from .._contact.barrier import Friction, PairBarrier
-from ..energies import VERTEX_ENERGIES
-
-MODULI = ("mu", "lam", "young", "poisson")
-LOADS = ("force", "gravity", "prescribed")
-COLLIDERS = ("colliders", "colliders_before")
 
 
 class Input(NamedTuple):
@@ -80,46 +74,3 @@ def parameter_of(model: Any, given: dict[str, Tensor], name: str) -> Tensor | No
         return given[name]
     known = parameters_of(model).get(name)
     return None if known is None else model.constants(known[0])[known[1]][None]
-
-
-class Given(NamedTuple):
-    """Inputs of a call, sorted."""
-
-    material: dict[str, Any]  # moduli, rest_points, density
-    parameters: dict[str, Any]  # of energies
-    loads: dict[str, Any]  # force, gravity, prescribed, colliders, colliders_before; those not given are None
-
-
-def sorted_inputs(model: Any, inputs: dict[str, Any], gravity: Any = None) -> Given:
-    """The keywords of a call by what they are; raises TypeError for one that the Model does not declare."""
-    loads: dict[str, Any] = {"force": None, "gravity": gravity, "prescribed": None, "colliders": None,
-                             "colliders_before": None}  # fmt: skip
-    material: dict[str, Any] = dict.fromkeys((*MODULI, "rest_points", "density"))
-    parameters: dict[str, Any] = {}
-    elastic = bool(model.energy_mask & ELASTIC)
-    known: dict[str, Any] | None = None
-    for name, value in inputs.items():
-        if name in loads:
-            loads[name] = gravity if name == "gravity" and value is None else value
-        elif name in material and (elastic or name not in MODULI):
-            material[name] = value
-        else:
-            known = parameters_of(model) if known is None else known
-            if name not in known:
-                raise TypeError(f"{name}: expected an input of this Model ({', '.join(inputs_of(model))})"
-                                f"{_meant(model, name)}")  # fmt: skip
-            if value is not None:
-                parameters[name] = value
-    return Given(material, parameters, loads)
-
-
-def _meant(model: Any, name: str) -> str:
-    """The energy that would declare an input, the call that has it as an argument, or the nearest name."""
-    kinds = {
-        input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
-    }
-    if name in MODULI:
-        return ", which has no elastic law among its energies"
-    if name in kinds:
-        return f", which has no {kinds[name].__name__} among its energies"
-    return where_it_is(name, (*inputs_of(model), *kinds))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -184,3 +185,35 @@ def _check(name: str, value: Any, expected: str, good: Any) -> None:
             fail(name, expected, f"{value:g}")
     elif looks_at(value):
         name_value(name, expected, value.detach(), good)
+
+
+# --- shapes of tets: how thin those of a mesh are, and which of a state are inside out --------------------------------
+
+
+def height_of_tets(model: Any) -> np.ndarray:
+    """The shortest of each tet's four heights [m], [T]."""
+    return _shapes_of_tets(model)[0]
+
+
+def thinness(model: Any) -> tuple[float, float]:
+    """Longest edge over shortest height [-], and that height [m], of the median tet."""
+    height, sides = _shapes_of_tets(model)
+    return float(np.median(sides.max(1) / height)), float(np.median(height))
+
+
+def _shapes_of_tets(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    corners = model.mesh.points[model.mesh.tets]
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)
+    volume = np.abs((edges[:, 0] * normals[:, 0]).sum(-1))
+    normals = np.concatenate([normals, -normals.sum(1, keepdims=True)], 1)
+    height = volume / np.linalg.norm(normals, axis=-1).max(1)
+    sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
+    return height, sides
+
+
+def inside_out(tets: Tensor, x: Tensor) -> Tensor:
+    """Tets [T, 4] of states [..., V, 3] with a volume of 0 or less, bool [..., T]."""
+    corners = x.detach()[..., tets, :]
+    a, b, c = (corners[..., 1:, :] - corners[..., :1, :]).unbind(-2)
+    return (torch.linalg.cross(a, b) * c).sum(-1) <= 0

@@ -10,15 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._common.checks import (
-    check_dtype,
-    check_held,
-    check_kind,
-    fail,
-    init_names_checked,
-    vertex_mask,
-    where_it_is,
-)
+from .._common.checks import check_dtype, check_held, check_kind, fail, init_names_checked, vertex_mask, where_it_is
 from .._common.constants import CONTACT, ELASTIC
 from .._common.context import is_captured, lasting, lasting_tensors
 from .._contact.barrier import Friction, PairBarrier
@@ -214,7 +206,7 @@ class Model:
 
     def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
         """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
-        plan = ops.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])
+        plan = ops.direct.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])  # see csrc/cpu/plan.h
         self._plan, self._color_ptr, self._color_vertices, star_ptr, star = plan
         self._topology = (tets, star_ptr, star)
         self._sizes = ops.plan_sizes(self._plan, device.type)

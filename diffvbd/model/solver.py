@@ -47,14 +47,6 @@ class BDF2:
 Integrator = ImplicitEuler | SDIRK2 | BDF2
 
 
-def check_integrator(integrator: Any) -> Integrator:
-    if isinstance(integrator, type) and issubclass(integrator, Integrator):
-        fail("integrator", f"an object, {integrator.__name__}()", "the class")
-    if not isinstance(integrator, Integrator):
-        raise TypeError(f"integrator: expected ImplicitEuler(), SDIRK2() or BDF2(), got {type(integrator).__name__}")
-    return integrator
-
-
 @init_names_checked
 @dataclass(frozen=True)
 class VBD:
@@ -123,7 +115,10 @@ class VBD:
             raise TypeError(
                 f'subspace: expected "rigid", "coarse", a diffvbd.CoarseSpace or None, got {self.subspace!r}'
             )
-        check_integrator(self.integrator)
+        if isinstance(kind := self.integrator, type) and issubclass(kind, Integrator):
+            fail("integrator", f"an object, {kind.__name__}()", "the class")
+        if not isinstance(kind, Integrator):
+            raise TypeError(f"integrator: expected ImplicitEuler(), SDIRK2() or BDF2(), got {type(kind).__name__}")
         for name, words in (("block", ("exact", "paper")), ("start", ("auto", "predictor", "inertia")),
                             ("tape", ("auto", "full", "compact", "recompute"))):  # fmt: skip
             if not is_word(getattr(self, name), *words):

@@ -35,13 +35,8 @@ class System(Model):
     def __init__(self, model: Model, solver: VBD) -> None:
         self.__dict__.update({name: value for name, value in vars(model).items() if name != "surface_of_contact"})
         self.model, self.solver, self._derived = model, solver, {}
-        self.relaxation, self.start, self.block, self.coarse = (
-            solver.relaxation,
-            solver.start,
-            solver.block,
-            solver.coarse,
-        )
-        self.saturation, self.regularization = solver.saturation, solver.regularization
+        self.relaxation, self.start, self.block = solver.relaxation, solver.start, solver.block
+        self.saturation, self.regularization, self.coarse = solver.saturation, solver.regularization, solver.coarse
         self.rigid = self.may_correct and solver.subspace is not None
         self._check()
         if solver.block == "paper" and self.energy_mask & EXACT_BLOCK:

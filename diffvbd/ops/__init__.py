@@ -1,14 +1,16 @@
+# ruff: noqa: F401
 """The compiled operators: the only package that names torch.ops.
 
 Raw operators are private and functional: `raw.NAME`, with shapes for torch.compile in shapes.py. Those that are
 differentiable are rows of autograd.Differentiable or autograd.Linear.
 """
 
-from . import coarse as _coarse  # noqa: F401  (registers what CUDA runs)
-from . import shapes as _shapes  # noqa: F401  (registers what torch.compile asks)
+from . import coarse as _coarse  # registers what CUDA runs
+from . import shapes as _shapes  # registers what torch.compile asks
 from .autograd import (
     Differentiable,
     Linear,
+    direct,
     distinct,
     fold_scenes,
     folded,
@@ -48,61 +50,6 @@ from .fields import (
     tape_rows,
     tape_shape,
 )
-from .load import direct, has_cuda, raw, require_cuda
+from .load import has_cuda, raw, require_cuda
 from .sums import broadcast, star_sum, tet_gather
-from .sweep import build_plan, fused_step, fused_step_backward, pack_rest, plan_order, sweep, sweep_backward
-
-__all__ = [
-    "BeginFields",
-    "COMPACT_TAPE",
-    "CoarseFields",
-    "CoarseSizes",
-    "Differentiable",
-    "FULL_TAPE",
-    "LANES",
-    "Linear",
-    "NO_TAPE",
-    "PLAN_HEADER",
-    "REST_SCALARS",
-    "RigidFields",
-    "STARTS",
-    "STEP_ADJOINTS",
-    "SWEEP_ADJOINTS",
-    "StepFields",
-    "StepNumbers",
-    "SweepFields",
-    "SweepSettings",
-    "TET_READS_X_PREV",
-    "THREAD",
-    "TOUCHING_ADJOINTS",
-    "TouchingFields",
-    "as_list",
-    "broadcast",
-    "build_plan",
-    "corrections_of",
-    "direct",
-    "distinct",
-    "fold_scenes",
-    "folded",
-    "fused_step",
-    "fused_step_backward",
-    "has_cuda",
-    "is_batched",
-    "no_second_derivative",
-    "no_transforms",
-    "not_batched",
-    "of_inputs",
-    "one_by_one",
-    "pack_rest",
-    "plan_order",
-    "plan_sizes",
-    "raw",
-    "require_cuda",
-    "star_sum",
-    "sum_to",
-    "sweep",
-    "sweep_backward",
-    "tape_rows",
-    "tape_shape",
-    "tet_gather",
-]
+from .sweep import fused_step, pack_rest, plan_order, run_sweep, sweep, sweep_backward

@@ -1,7 +1,8 @@
 """One autograd function for all operators: a row says what runs, what its reverse is, and what is differentiated.
 
 A Differentiable serves plain calls, torch.func and torch.compile. Where nothing is differentiated it only runs. The
-reverse of a Linear is another Linear, so that it may be differentiated any number of times.
+reverse of a Linear is another Linear, so that it may be differentiated any number of times. `direct` has the operators
+as they are, for a forward or reverse.
 """
 
 # pyright: reportIncompatibleMethodOverride=false
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function, forward_ad
 
+from .._common.context import transformed
 from .load import raw
 
 Bars = Sequence[Tensor | None]  # adjoints; None where there is none
@@ -23,6 +25,26 @@ Bars = Sequence[Tensor | None]  # adjoints; None where there is none
 # each input that needs one, in a shape that sums to the input's; others may be missing or anything.
 Reverse = Callable[[Bars, Sequence[Any], tuple, Sequence[bool]], Bars]
 Vmap = Callable[..., tuple[Any, Any]]  # as torch.autograd.Function.vmap
+
+
+class _Direct:
+    """Operators of torch.ops.diffvbd without a pass through torch's autograd where nothing would be differentiated:
+    inside the forward of a Function and under no_grad. Half of what a call costs beside its work."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        operator = getattr(raw, name).default
+
+        def call(*args: Any) -> Any:
+            if torch.is_grad_enabled() or torch.compiler.is_compiling() or transformed():
+                return operator(*args)
+            with torch._C._AutoDispatchBelowAutograd():
+                return operator(*args)
+
+        setattr(self, name, call)
+        return call
+
+
+direct = _Direct()
 
 
 def no_second_derivative() -> NoReturn:

@@ -17,8 +17,8 @@ from torch import Tensor
 from .._common.context import is_captured
 from ..energies import VERTEX_ENERGIES
 from .autograd import Bars, Differentiable, sum_to
+from .autograd import direct as raw
 from .fields import TouchingFields
-from .load import direct as raw
 
 # --- searches ---------------------------------------------------------------------------------------------------------
 

@@ -9,13 +9,9 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
-
-from .._common.context import transformed
 
 _FOLDER = Path(__file__).parents[1]  # of the package, where the objects are
 _COMMAND = "pip install --no-build-isolation -e ."  # in a checkout
@@ -157,22 +153,5 @@ def _load_cuda(path: Path) -> None:
     _cuda = True
 
 
-class _Direct:
-    """Operators of torch.ops.diffvbd without a pass through torch's autograd where nothing would be differentiated:
-    inside the forward of a Function and under no_grad. Half of what a call costs beside its work."""
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        operator = getattr(torch.ops.diffvbd, name).default
-
-        def call(*args: Any) -> Any:
-            if torch.is_grad_enabled() or torch.compiler.is_compiling() or transformed():
-                return operator(*args)
-            with torch._C._AutoDispatchBelowAutograd():
-                return operator(*args)
-
-        setattr(self, name, call)
-        return call
-
-
 load()
-raw, direct = torch.ops.diffvbd, _Direct()
+raw = torch.ops.diffvbd

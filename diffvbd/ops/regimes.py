@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Literal
 
 from .._common.checks import fail
-from . import THREAD
+from .fields import THREAD
 
 Regime = Literal["thread", "block", "grid", "color"]
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .autograd import Linear, sum_to
-from .load import direct, raw
+from .autograd import Linear, direct, sum_to
+from .load import raw
 
 Order = tuple[Tensor, Tensor, Tensor]  # of rows by segment: order, ptr (int32) and the segment of each row
 

@@ -13,13 +13,12 @@ from torch import Tensor
 
 from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
-from .._common.context import is_captured, looks_at, may_copy, replaced
-from .._common.messages import is_silent, page, percent, warn
+from .._common.context import is_captured, is_silent, looks_at, may_copy, replaced
+from .._common.messages import page, percent, warn
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import Integrator
 from ..model.system import System
-from ..model.warnings import warn_of_bending
 from ..ops import SweepSettings
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.contact import TRUNCATED, outcomes
@@ -35,7 +34,7 @@ from ..step.residual import (
     unsolved,
     what_helps,
 )
-from ..step.stability import FAR, fault_of, reach_of, size_of
+from ..step.warnings import FAR, fault_of, reach_of, size_of, warn_of_bending
 
 
 @init_names_checked
@@ -251,8 +250,8 @@ def _warn_of_loss(which: str, finite: bool, fault: str) -> None:
     how = f"vertices more than {FAR:g} body sizes from where motion and gravity would have taken them"
     if not finite:
         how = "positions or velocities that are not finite"
-    warn(f"x: {which} ended with {how}: {fault}; dv.debug_checks() says in which step what is not finite began; "
-         + page("numerics.md"))  # fmt: skip
+    warn(f"x: {which} ended with {how}: {fault}; diffvbd.testing.debug_checks() says in which step what is not finite "
+         "began; " + page("numerics.md"))  # fmt: skip
 
 
 # --- what a rollout says of its energy --------------------------------------------------------------------------------
@@ -451,15 +450,16 @@ def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Ten
                     given: dict[str, Any]) -> None:  # fmt: skip
     """Warns (UserWarning) of the steps of a rollout.
 
-    cuts: cut_share() after each step. The others: of the last step, as above.
+    cuts: truncated_fraction() after each step. The others: of the last step, as above.
     """
     shares = torch.stack(cuts).tolist()
     truncated = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
     if truncated > TRUNCATED:
         many = f"{sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than {percent(TRUNCATED)}"
-        warn(f"contact: pairs truncated {percent(truncated)} of the vertices in step {shares.index(cut)}, which lost "
-             f"velocity and momentum (in {many}); {what_helps(model)}")  # fmt: skip
+        step = shares.index(truncated)
+        warn(f"contact: pairs truncated {percent(truncated)} of the vertices in step {step}, which lost velocity "
+             f"and momentum (in {many}); {what_helps(model)}")  # fmt: skip
     if not left > UNBALANCED_FRICTION:
         return
     # does what is left over move a body, beside what forces do in a step?

@@ -130,7 +130,7 @@ def coarse_scalars(model: System, sweeps: int) -> int:
     geometry, plan = model.coarse_geometry, model._coarse_plan
     if model.touches:  # all bodies together: the factor of each correction, its forces and ways
         # one part for each detection of pairs: more parts have fewer cycles, and need less
-        parts = sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections or 1)
+        parts = sweeps_of_substeps(sweeps, 1 if model.contact is None else model.contact.detections or 1)
         count = sum(-(-max(0, n - 1) // model.coarse.every) for n in parts)
         return 9 * plan.mass.numel() + count * (9 * geometry.functions**2 + 12 * model.num_vertices)
     positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0

@@ -16,9 +16,9 @@ from .._common.constants import ELASTIC
 from .._common.context import Finer, record_to, refined
 from .._common.messages import percent
 from ..mesh import subdivide
-from ..model.inputs import MODULI
 from ..model.model import Model
 from ..model.solver import VBD
+from ..step.arguments import MODULI
 from ..step.integrators import History, is_step_of
 from ..step.residual import UNBALANCED, left_of_solve, share
 from .checks import check_checks

@@ -16,25 +16,25 @@ from .._common.checks import check_bool, check_count, check_function, check_kind
 from .._common.context import looks_at, recorders, refinement, replaced
 from .._common.messages import is_own
 from ..adjoint.routes import Adjoint, check_adjoint
-from ..model.inputs import LOADS, Given
 from ..model.model import Model
 from ..model.solver import MAX_SWEEPS, VBD
 from ..model.system import System
-from ..model.warnings import warn_of_inverted_bodies
 from ..step.advance import advance
 from ..step.arguments import (
+    LOADS,
+    Given,
     acceleration_of,
     check_prescribed,
+    check_staged,
     check_state,
     given_of,
     prepare,
     step_settings,
-    system_for,
 )
 from ..step.contact import check_start as refuse_start
-from ..step.integrators import History, check_history, check_staged, solves_of, take
+from ..step.integrators import History, check_history, solves_of, take
 from ..step.residual import ErrorEstimate, error_of, of_steps, truncated_fraction
-from ..step.stability import proven, warn_of_sweeps
+from ..step.warnings import proven, system_for, warn_of_inverted_bodies, warn_of_sweeps
 from .checks import Checks, check_checks, checks_contact, look_at_end, look_at_energy, warn_of_contact, warn_of_last_end
 from .memory import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .refine import LOOKS, rollout_finer

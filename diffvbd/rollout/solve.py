@@ -23,17 +23,18 @@ from ..step.arguments import (
     Prepared,
     acceleration_of,
     check_prescribed,
+    check_staged,
     check_state,
     collider_state,
     given_of,
     prepare,
     refuse_non_finite,
-    system_for,
 )
 from ..step.contact import outcomes
-from ..step.integrators import check_staged, take
+from ..step.integrators import take
 from ..step.predict import Begun, begin
 from ..step.residual import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
+from ..step.warnings import system_for
 
 
 @dataclass(frozen=True)

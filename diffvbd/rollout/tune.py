@@ -14,17 +14,16 @@ import torch
 from torch import Tensor
 
 from .._common.checks import check_bool, check_count, check_kind, check_number, check_positive, check_time_step, fail
-from .._common.context import record_to, refined, refuse_transforms
-from .._common.messages import log_progress, percent, silence
+from .._common.context import record_to, refined, refuse_transforms, silence
+from .._common.messages import log_progress, percent
 from .._contact.barrier import PairBarrier
-from ..model.inputs import MODULI, sorted_inputs
 from ..model.model import Model
 from ..model.solver import BDF2, SDIRK2, VBD, ImplicitEuler, Integrator
 from ..model.system import system_of
-from ..model.warnings import is_nearly_incompressible
-from ..step.arguments import GRAVITY, Prepared, check_state, given_of, material_of, prepare
+from ..step.arguments import GRAVITY, MODULI, Prepared, check_state, given_of, material_of, prepare
 from ..step.integrators import SAME_TIME_STEP
 from ..step.residual import truncated_fraction
+from ..step.warnings import is_nearly_incompressible
 from .checks import NONE, mechanical_energy, unbalanced_friction
 from .refine import (
     MOST_SWEEPS,
@@ -427,7 +426,7 @@ def trials_of(model: Model, x: Tensor, v: Tensor, duration: float,
     """Trial runs of a scene, with the gradients that are asked for. A first short step raises what rollout raises of
     the arguments."""
     refuse_transforms("dv.advise and dv.error_budget, which look at values")
-    sorted_inputs(model, given)
+    given_of(model, given)
     check_bool("gradient", gradient)
     check_bool("progress", progress)
     if gradient and torch.is_inference_mode_enabled():

@@ -24,7 +24,7 @@ class BlockUpdate:
 
     Subclasses set ``rows`` and write ``update``; a hand-derived ``vjp`` replaces the automatic one. Both are pure and
     deterministic functions of their arguments: the backward puts the old rows back and takes it that the same update
-    made the new ones. Inside :func:`diffvbd.debug_checks` the backward repeats each update to see that it did.
+    made the new ones. Inside :func:`diffvbd.testing.debug_checks` the backward repeats each update to see that it did.
 
     Attributes:
         rows: For each state tensor the rows that the update writes: distinct indices [n] (int64), a slice, or None
@@ -151,7 +151,7 @@ class Solver:
         Raises:
             ValueError, TypeError: Naming the argument, or the update whose rows or adjoints do not fit.
             RuntimeError: An update uses a tensor that requires grad and is neither state nor parameter. In a backward
-                inside :func:`diffvbd.debug_checks`: an update makes other rows when it is repeated.
+                inside :func:`diffvbd.testing.debug_checks`: an update makes other rows when it is repeated.
             NotImplementedError: In the backward, for second derivatives.
         """
         single = isinstance(state, Tensor)

@@ -19,10 +19,10 @@ from .._common.constants import VERTEX_ENERGIES
 from .._common.context import checking, recorders, replaced
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, TapedSweep
-from ..adjoint.sweep import fused_step, is_out_of_memory, sweep
 from ..model.system import System
 from ..ops import regimes
 from ..ops.fields import TILE, WORKSPACE_BUDGET
+from ..ops.sweep import fused_step, is_out_of_memory, sweep
 from .arguments import (
     Prepared,
     acceleration_of,

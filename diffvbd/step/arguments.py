@@ -20,28 +20,41 @@ from .._common.checks import (
     check_square,
     check_tensor,
     fail,
+    input_name,
     kind_of,
     name_value,
     to_float,
+    where_it_is,
 )
 from .._common.constants import ELASTIC
 from .._common.context import checking, looks_at, refuse_forward_mode, transformed
+from .._contact.barrier import Friction, PairBarrier
 from .._contact.colliders import MOST_LENGTH, Plane
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
-from ..model.inputs import MODULI, Given, parameters_of, sorted_inputs
+from ..energies import VERTEX_ENERGIES
+from ..model.inputs import inputs_of, parameters_of
 from ..model.material import lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
-from ..model.solver import VBD
-from ..model.system import System, system_of
-from ..model.warnings import warn_of_solver
+from ..model.solver import SDIRK2, Integrator
+from ..model.system import System
 from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
+MODULI = ("mu", "lam", "young", "poisson")
+LOADS = ("force", "gravity", "prescribed")
+COLLIDERS = ("colliders", "colliders_before")
+STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
 
 SCENE_TET = ("scene", "tet")  # what the dimensions of values of tets count
-
-
 LOOKBACK = 1.0  # of implicit Euler, whose velocities are (x - x_prev) / h
+
+
+class Given(NamedTuple):
+    """Inputs of a call, sorted."""
+
+    material: dict[str, Any]  # moduli, rest_points, density
+    parameters: dict[str, Any]  # of energies
+    loads: dict[str, Any]  # force, gravity, prescribed, colliders, colliders_before; those not given are None
 
 
 class Prepared(NamedTuple):
@@ -94,17 +107,39 @@ def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], ow
     return ops.broadcast(value, (*lead, *rest)).reshape(-1, *rest)
 
 
-def system_for(model: Model, solver: VBD) -> System:
-    """The System of a call, with the warnings that it deserves."""
-    system = system_of(model, solver)
-    if system.relaxation > 1 or system.regularization:
-        warn_of_solver(system)
-    return system
-
-
 def given_of(model: Model, inputs: dict[str, Any]) -> Given:
-    """The inputs of a call, sorted, with the default gravity."""
-    return sorted_inputs(model, inputs, GRAVITY)
+    """The keywords of a call by what they are, with the default gravity. TypeError: the Model has no such input."""
+    loads: dict[str, Any] = {"force": None, "gravity": GRAVITY, "prescribed": None, "colliders": None,
+                             "colliders_before": None}  # fmt: skip
+    material: dict[str, Any] = dict.fromkeys((*MODULI, "rest_points", "density"))
+    parameters: dict[str, Any] = {}
+    elastic = bool(model.energy_mask & ELASTIC)
+    known: dict[str, Any] | None = None
+    for name, value in inputs.items():
+        if name in loads:
+            loads[name] = GRAVITY if name == "gravity" and value is None else value
+        elif name in material and (elastic or name not in MODULI):
+            material[name] = value
+        else:
+            known = parameters_of(model) if known is None else known
+            if name not in known:
+                raise TypeError(f"{name}: expected an input of this Model ({', '.join(inputs_of(model))})"
+                                f"{_meant(model, name)}")  # fmt: skip
+            if value is not None:
+                parameters[name] = value
+    return Given(material, parameters, loads)
+
+
+def _meant(model: Any, name: str) -> str:
+    """The energy that would declare an input, the call that has it as an argument, or the nearest name."""
+    kinds = {
+        input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
+    }
+    if name in MODULI:
+        return ", which has no elastic law among its energies"
+    if name in kinds:
+        return f", which has no {kinds[name].__name__} among its energies"
+    return where_it_is(name, (*inputs_of(model), *kinds))
 
 
 def material_of(**material: Any) -> Given:
@@ -201,6 +236,15 @@ def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, 
                              lookback)  # fmt: skip
 
 
+def check_staged(integrator: Integrator, given: dict[str, Any]) -> None:
+    """Raises where motion is given for other solves than those of a step."""
+    for name in STAGED:
+        value = given[name]
+        if isinstance(value, tuple) and not (isinstance(integrator, SDIRK2) and len(value) == 2):
+            fail(name, "a tensor, or with SDIRK2() one for each of its two solves",
+                 f"{len(value)} with {integrator}")  # fmt: skip
+
+
 def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:
     """Raises where ``prescribed`` would move a vertex that is not pinned: a row that is not read and is neither x,
     nor one of the ``others``, nor the Model's rest position, nor NaN."""
@@ -225,8 +269,9 @@ def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) 
 def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tensor, Tensor] | None:
     """Corner points of the colliders at the start and at the end of a step [B, Vc, 3]; one tensor where they rest. None
     for a Model without contact."""
-    count = model.collider_points.shape[0]
-    lead = tuple(x.shape[:-2])
+    if end is None and start is None and not model.touches:
+        return None
+    count, lead = model.collider_points.shape[0], tuple(x.shape[:-2])
     flat = (math.prod(lead), count, 3)
     given = {}
     for name, value in (("colliders", end), ("colliders_before", start)):

@@ -23,16 +23,17 @@ from .._contact.start import SubstepStart, start_above, start_between
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
 from ..adjoint.contact import Pairs, friction_lag, no_pairs, some_of
 from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
-from ..adjoint.sweep import no_transforms, sweep
 from ..model.inputs import parameter_of
+from ..model.material import inside_out
 from ..model.model import Model
 from ..model.system import System
-from ..model.warnings import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
+from ..ops.autograd import no_transforms
 from ..ops.contact import TrustRadii, contact_trust_radii, sweep_radii
 from ..ops.fields import DISPLACEMENTS
+from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
 from .contact_corrections import (
@@ -50,7 +51,7 @@ from .predict import Begun
 CLOSE = 1e-3  # of dhat: pairs with so much more gap do not push, however it is rounded
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
-        "time_step or softer materials, or look with diffvbd.debug_checks()")  # fmt: skip
+        "time_step or softer materials, or look with diffvbd.testing.debug_checks()")  # fmt: skip
 
 
 class ContactStep:

@@ -26,7 +26,7 @@ from ..model.solver import BDF2, SDIRK2, ImplicitEuler, Integrator
 from ..model.system import System
 from ..ops import TET_READS_X_PREV
 from ..reference.distance import EDGE_EDGE, POINT_PLANE
-from .arguments import Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
+from .arguments import STAGED, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse import coarse_mass
 from .contact import ContactStep, motion_of
 from .predict import Begun, begin
@@ -36,7 +36,6 @@ GAMMA = 1 - 1 / math.sqrt(2)
 # tangents, of lookback 0, by which no turn could be measured.
 LOOKBACK_OF_BDF2, LOOKBACKS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
 SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
-STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
 
 
 class History(NamedTuple):
@@ -99,15 +98,6 @@ def is_step_of(history: History, time_step: Any) -> bool:
 def solves_of(integrator: Integrator) -> int:
     """Solves of a step, each of all its sweeps."""
     return 2 if isinstance(integrator, SDIRK2) else 1
-
-
-def check_staged(integrator: Integrator, given: dict[str, Any]) -> None:
-    """Raises where motion is given for other solves than those of a step."""
-    for name in STAGED:
-        value = given[name]
-        if isinstance(value, tuple) and not (isinstance(integrator, SDIRK2) and len(value) == 2):
-            fail(name, "a tensor, or with SDIRK2() one for each of its two solves",
-                 f"{len(value)} with {integrator}")  # fmt: skip
 
 
 def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: History | None, whole: Prepared,

@@ -14,12 +14,12 @@ from .._common.context import replaced
 from .._common.messages import page
 from ..adjoint.contact import ContactPotential, StepContact
 from ..adjoint.potential import IncrementalPotential
-from ..adjoint.sweep import sweep
 from ..model.material import shape_gradients
 from ..model.model import Model
 from ..model.moving import moving_vertices
 from ..model.system import System
 from ..ops.sums import segment_sum
+from ..ops.sweep import sweep
 from .arguments import Prepared, acceleration_of, collider_state
 from .coarse import lengths_of, with_corrections
 from .contact import outcomes

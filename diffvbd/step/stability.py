@@ -8,10 +8,7 @@ solved never add to its energy, kinetic and elastic, and what steps amplify soon
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
-from contextvars import ContextVar
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,19 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._common.constants import ELASTIC, EXACT_BLOCK
-from .._common.context import looks_at, replaced, unheard
-from .._common.messages import is_silent, page, silence, warn
+from .._common.constants import EXACT_BLOCK
+from .._common.context import replaced, silence
+from .._common.messages import page
 from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
+from ..model.material import height_of_tets
 from ..model.model import Model
 from ..model.solver import Integrator
 from ..model.system import System, system_of
-from ..model.warnings import height_of_tets, warn_of_over_relaxation, warn_of_thin_tets, warn_of_units
-from ..ops import broadcast
 from .advance import advance
-from .arguments import Prepared, acceleration_of, material_of, prepare
+from .arguments import acceleration_of, material_of, prepare
 from .integrators import take
 from .predict import begin
 
@@ -43,21 +39,7 @@ GONE = 1e-24  # of the energy: nothing is left that could grow
 MOST_TETS = 4000  # of a larger mesh the part about its stiffest tet is measured: what grows is rough, and local
 MOST_SWEEPS = 100  # of more it is not doubted
 SOFT = 0.2  # elements that a pressure wave crosses in a step, below which inertia does the work
-ALIKE = 8  # moduli that differ by less than 2^(1/8) are measured once
 CALMER = (1.7, 1.5, 1.3, 1.0)  # relaxations that are tried for a message
-EIGENVALUES = "growth at rest"  # of a Model's _derived: what was measured, by the arguments
-
-_proven: ContextVar[bool] = ContextVar("diffvbd.proven", default=False)
-
-
-@contextlib.contextmanager
-def proven() -> Iterator[None]:
-    """Inside, it is not doubted that vibrations stay small: a pilot run with these settings has ended well."""
-    token = _proven.set(True)
-    try:
-        yield
-    finally:
-        _proven.reset(token)
 
 
 class _Part(NamedTuple):
@@ -67,49 +49,8 @@ class _Part(NamedTuple):
     tets: np.ndarray | None  # rows of the Model's; None: all
 
 
-def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) -> None:
-    """Warns (UserWarning) where the sweeps of steps are too few for a mesh and its material. On CUDA, where moduli
-    would be waited for, they are not looked at outside debug_checks()."""
-    if not (looks_at(prepared.mu) and looks_at(prepared.lam)) or is_silent():
-        return
-    h, sweeps = prepared.time_step_and_sweeps
-    if not sweeps or not model.num_tets:
-        return
-    warn_of_units(model, prepared.mu, prepared.lam, h)
-    warn_of_thin_tets(model, prepared.mu, prepared.lam, h, sweeps)
-    if warn_of_over_relaxation(model, prepared.mu, prepared.lam) or _proven.get():
-        return
-    if message := growth_message(model, prepared, integrator):
-        warn(message)
-
-
-def growth_message(model: System, prepared: Prepared, integrator: Integrator) -> str:
-    """Message about steps that amplify vibrations, or ""; measured once for such arguments. Moduli are read."""
-    h, sweeps = prepared.time_step_and_sweeps
-    if not (0 < sweeps <= MOST_SWEEPS and model.num_tets and model.num_active):
-        return ""
-    if not model.energy_mask & ELASTIC:
-        return ""
-    mu, lam = prepared.mu.detach().cpu(), prepared.lam.detach().cpu()
-    if not (mu.numel() and lam.numel()):
-        return ""
-    key = (type(integrator).__name__, h, sweeps, *_mark(mu), *_mark(lam))
-    known = model._derived.setdefault(EIGENVALUES, {})
-    if key not in known:
-        with torch.no_grad(), torch.autocast("cpu", enabled=False), torch.inference_mode(False), unheard():
-            known[key] = _message(model, mu.double(), lam.double(), h, sweeps, integrator)
-    return known[key]
-
-
-def _mark(values: Tensor) -> tuple[float, ...]:
-    """A rough key of moduli."""
-    if values.numel() > 1:
-        return (*_mark(values.amin()), *_mark(values.amax()), *_mark(values.mean()))
-    number = abs(values.item())
-    return (round(ALIKE * math.log2(number)) if 0 < number < math.inf else 0.0,)
-
-
-def _message(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, integrator: Integrator) -> str:
+def measured(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, integrator: Integrator) -> str:
+    """Message about steps that amplify vibrations, or "".  mu, lam: [1 | B, 1 | T], float64 on the CPU."""
     if not bool((mu > 0).all() and (mu + lam > 0).all() and torch.isfinite(mu + lam).all()):  # perhaps refused later
         return ""
     crossed = _crossed(model, mu, lam, h)
@@ -146,7 +87,8 @@ def _message(model: System, mu: Tensor, lam: Tensor, h: float, sweeps: int, inte
 def _crossed(model: System, mu: Tensor, lam: Tensor, h: float) -> Tensor:
     """Number of each tet that a pressure wave crosses in a step, the largest over scenes [T]."""
     speed = ((lam + 2 * mu).amax(0) / model._density.double().cpu()).clamp(min=0).sqrt()
-    return h * speed / torch.from_numpy(height_of_tets(model))
+    heights = model.derived("heights of tets", lambda: height_of_tets(model))
+    return h * speed / torch.from_numpy(heights)
 
 
 def _part_of(model: System, crossed: Tensor) -> _Part:
@@ -232,59 +174,3 @@ def growth(model: System, *, mu: Tensor, lam: Tensor, time_step: float, sweeps: 
 
 def _factor(logs: list[Tensor], first: int, last: int) -> float:
     return math.exp(min(500.0, float((logs[last] - logs[first]).max()) / (2 * (last - first))))
-
-
-# --- motion that is lost ----------------------------------------------------------------------------------------------
-
-FAR = 1e3  # sizes of the Model at rest
-
-
-def size_of(model: System) -> float:
-    """Diagonal of the Model's box at rest [m]."""
-    return model.derived("size", lambda: float((model._rest_points.amax(0) - model._rest_points.amin(0)).norm()))
-
-
-def reach_of(model: System, start: tuple[Tensor, ...], x: Tensor, gravity: Any, duration: float) -> Tensor:
-    """Distance of the farthest vertex from its start, over the Model's size, less what its velocity, gravity and
-    its pins may have given it [-]."""
-    x0, v0 = (t.detach() for t in start)
-    moved = (x.detach() - x0).abs()
-    away = torch.where(model._pinned[:, None], 0.0, moved).amax()
-    carried = torch.where(model._pinned[:, None], moved, 0.0).amax() + duration * v0.abs().amax()
-    if isinstance(gravity, Tensor):
-        carried = carried + 0.5 * duration**2 * gravity.detach().abs().amax()
-    return (away - carried) / max(size_of(model), torch.finfo(x.dtype).tiny)
-
-
-def notice_loss(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any, end: Tensor) -> None:
-    """Warns (UserWarning) where a step made one by one ends at positions that are not finite, or spread over more than
-    FAR sizes of the Model; on the CPU. v: Before the step.
-
-    A rollout looks at its own end, and tells from where it began how far is too far.
-    """
-    if end.is_cuda or not end.numel() or not looks_at(end) or is_silent():
-        return
-    low, high = map(float, end.detach().aminmax())
-    if high - low <= FAR * size_of(model):
-        return
-    x = end.detach()
-    spread = float((x.amax(-2) - x.amin(-2)).amax()) if math.isfinite(high - low) else math.inf
-    if not spread <= FAR * size_of(model):
-        where = f"spread over {spread:.3g} m" if spread < math.inf else "not finite"
-        warn(f"x: this step ended with positions that are {where}: "
-             f"{fault_of(model, prepared, integrator, v, force)}; " + page("numerics.md"))  # fmt: skip
-
-
-def fault_of(model: System, prepared: Prepared, integrator: Integrator, v: Tensor, force: Any) -> str:
-    """Cause of a lost step, and the remedy. v: Before it."""
-    with torch.no_grad():
-        if isinstance(force, Tensor):
-            mass = prepared.mass[..., None].clamp(min=torch.finfo(v.dtype).tiny)
-            push = broadcast(force.detach(), v.shape).reshape(-1, *v.shape[-2:]) / mass
-            push = prepared.settings.numbers.time_step * torch.where(model._pinned[:, None], 0.0, push)
-            if not float(push.norm()) <= float(v.detach().norm()):
-                return ("force: in one step it changes velocities by more than they are, as an explicit drag or spring "
-                        "does that is too strong for the step; limit it, or take a smaller time_step")  # fmt: skip
-        if growth_message(model, prepared, integrator):
-            return "sweeps: so few let vibrations grow in every step; take more, or a smaller relaxation or time_step"
-    return "time step: too long for these speeds and loads; take a smaller time_step"

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from .._common.checks import check_tensor, fail, to_float
 from .._common.context import refuse_refinement, refuse_transforms
-from ..adjoint.routes import Adjoint, check_adjoint
+from ..adjoint.routes import Adjoint, TapedSweep, check_adjoint
 from ..model.model import Model
-from ..model.solver import BDF2, VBD
+from ..model.solver import BDF2, VBD, ImplicitEuler
 from .advance import advance
-from .arguments import check_prescribed, check_state, given_of, prepare, system_for
-from .integrators import check_staged, take
-from .stability import notice_loss, warn_of_sweeps
+from .arguments import check_prescribed, check_staged, check_state, given_of, prepare
+from .integrators import take
+from .warnings import notice_loss, system_for, warn_of_sweeps
 
 
 def step(
@@ -62,7 +62,8 @@ def step(
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """
     refuse_refinement("dv.step")
-    lead, system, adjoint = check_state(model, x, v), system_for(model, solver), check_adjoint(adjoint, solver.tape)
+    lead, system = check_state(model, x, v), system_for(model, solver)
+    adjoint = TapedSweep(solver.tape) if adjoint is None else check_adjoint(adjoint, solver.tape)
     scheme = solver.integrator
     if isinstance(scheme, BDF2):
         fail("solver", "ImplicitEuler() or SDIRK2() in a step: BDF2() needs the step before, which dv.rollout keeps",
@@ -74,9 +75,13 @@ def step(
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
         check_prescribed(system, value, x)
     warn_of_sweeps(system, prepared, scheme)
-    taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
-    notice_loss(system, prepared, scheme, v, given.loads["force"], taken.x)
-    return taken.x, taken.v
+    if isinstance(scheme, ImplicitEuler):
+        x_end, v_end = advance(system, x, v, prepared, adjoint=adjoint, **given.loads)
+    else:
+        taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
+        x_end, v_end = taken.x, taken.v
+    notice_loss(system, prepared, scheme, v, given.loads["force"], x_end)
+    return x_end, v_end
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor, nn
 
 import diffvbd as dv
-from diffvbd import viz
+from diffvbd import results, viz
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 SIZE = (0.08, 0.4, 0.08)  # [m]
@@ -108,7 +108,7 @@ class Arm:
 
     def simulate(
         self, policy: Policy, given: Scenes, lead: tuple[int, ...] = (), save: Literal["all", "last"] = "last"
-    ) -> dv.results.Trajectory:
+    ) -> results.Trajectory:
         """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
         targets, swings = given
         shape = (*lead, len(targets), self.model.num_vertices, 3)

@@ -36,7 +36,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import losses, viz
+from diffvbd import distributed, losses, viz
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 BODIES, QUICK_BODIES = 1_000_000, 64
@@ -148,7 +148,7 @@ class Cubes:
         # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
         self.group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, version.group)
         self.scenes = bodies // self.group
-        part = dv.distributed.share(self.scenes)  # of this rank
+        part = distributed.share(self.scenes)  # of this rank
         mine = slice(part.start * self.group, part.stop * self.group)
         self.bodies = mine.stop - mine.start
         self.shape = (part.stop - part.start, self.group * cube.num_vertices, 3)
@@ -225,11 +225,11 @@ class Cubes:
 
     def own(self, values: Tensor) -> Tensor:
         """Of all bodies [N, ...] -> of those of this rank."""
-        return dv.distributed.own(values.unflatten(0, (self.scenes, self.group))).flatten(0, 1)
+        return distributed.own(values.unflatten(0, (self.scenes, self.group))).flatten(0, 1)
 
     def all_of(self, values: Tensor) -> Tensor:
         """Of the bodies of this rank [n, ...] -> of all."""
-        return dv.distributed.gathered(values.unflatten(0, (-1, self.group)), self.scenes).flatten(0, 1)
+        return distributed.gathered(values.unflatten(0, (-1, self.group)), self.scenes).flatten(0, 1)
 
     def simulate(self, save: int) -> Tensor:
         """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""

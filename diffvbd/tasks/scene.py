@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.mesh.write import replace
 from diffvbd.tasks.folder import read_archive
 
@@ -76,7 +77,7 @@ class Scene:
 
     def simulate(
         self, model: dv.Model, mu: Tensor | float, lam: Tensor | float, steps: int, **options: Any
-    ) -> dv.results.Trajectory:
+    ) -> results.Trajectory:
         """Roll out from (x0, v0); mu and lam in [Pa]; options as in `diffvbd.rollout`."""
         x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (self.x0, self.v0))
         return dv.rollout(model, x, v, self.solver, steps=steps, mu=mu, lam=lam, gravity=self.gravity, **options)

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import losses, viz
+from diffvbd import losses, results, viz
 from diffvbd.tasks.optimizer import lbfgs
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
@@ -121,7 +121,7 @@ class Throw:
 
     def simulate(
         self, raw: Tensor, model: dv.Model, steps: int, save: Literal["all", "last"] = "last"
-    ) -> dv.results.Trajectory:
+    ) -> results.Trajectory:
         bars = self.x + (self.heights(raw)[:steps] @ self.lifts.flatten(1)).unflatten(-1, (-1, 3))
         solver = dv.VBD(self.time_step, SWEEPS, start="predictor")
         return dv.rollout(model, self.x, torch.zeros_like(self.x), solver, steps=steps, save=save,

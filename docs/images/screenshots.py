@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 import diffvbd as dv
+from diffvbd import results
 
 FOLDER = Path(__file__).parent
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -100,7 +101,7 @@ def sliders(picture: Callable[[dv.viz.Viewer], None]) -> None:
     """A motion behind two sliders."""
     model, x, _ = scene()
 
-    def simulate(mu: float, speed: float) -> dv.results.Trajectory:
+    def simulate(mu: float, speed: float) -> results.Trajectory:
         v = torch.tensor([speed, 0.0, 0.0], dtype=x.dtype).expand_as(x)
         return dv.rollout(model, x, v, dv.VBD(0.01, 10), steps=40, mu=mu, lam=4e4)
 

@@ -4,18 +4,21 @@ silently."""
 
 import contextlib
 import itertools
+import subprocess
+import sys
 from typing import Any
 
 import pytest
 import torch
 from helpers.marks import slow
+from helpers.paths import ROOT
 from helpers.results import saved_bytes
 from helpers.spreads import beyond
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import testing
-from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
+from diffvbd import results, testing
+from diffvbd.testing import build_scene, debug_checks, evaluate, relative_error, tolerance
 
 CONVERGED = 300  # sweeps, after which the scenes used here stand still
 SCENES = [("plain", "structured"), ("paper", "delaunay"), ("soft", "random"), ("floor_damped", "delaunay"),
@@ -126,7 +129,7 @@ def test_a_rollout_is_its_steps_under_every_schedule(device: str, adjoint: Any, 
 
 def test_report_tells_of_each_backward_step(device: str) -> None:
     model, inputs = scene_on(device, "batch", 4)
-    solves: list[dv.results.LinearSolve] = []
+    solves: list[results.LinearSolve] = []
     goal = 1e-9
     adjoint = dv.GlobalAdjoint(tolerance=goal, report=solves.append)
     x = inputs.pop("x").requires_grad_()
@@ -138,10 +141,25 @@ def test_report_tells_of_each_backward_step(device: str) -> None:
         assert solve.converged and 0 < solve.residual <= 2 * goal and 1 < solve.iterations < 200
 
 
+def test_the_first_solve_of_a_process_is_silent() -> None:
+    """Of which torch says that its block-sparse matrices are new."""
+    script = """
+import diffvbd as dv, warnings
+warnings.resetwarnings()
+warnings.simplefilter("error")
+model = dv.Model(dv.mesh.cube(2, size=0.1), pinned=[0])
+x = model.rest_points.requires_grad_()
+dv.step(model, x, 0 * x, dv.VBD(0.01, 30), mu=1e4, lam=1e4, adjoint=dv.GlobalAdjoint())[0].sum().backward()
+assert x.grad.any()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("assembled", (True, False))
 def test_a_solve_that_fails_is_never_silent(device: str, assembled: bool) -> None:
     scene = build_scene("batch")
-    solves: list[dv.results.LinearSolve] = []
+    solves: list[results.LinearSolve] = []
     options: dict[str, Any] = {"max_iterations": 2, "report": solves.append}
     message = r"relative residual of 1e-10, got .* in scene \d after 2 iterations"
     with pytest.raises(RuntimeError, match=message):
@@ -231,7 +249,7 @@ def test_bad_values_are_named(device: str, adjoint: Any) -> None:
 def test_debug_checks_reach_every_route(device: str, adjoint: Any) -> None:
     model, inputs = scene_on(device, "plain", 2)
     inputs["x"][-1, 0] = torch.nan
-    with dv.debug_checks(), pytest.raises((RuntimeError, ValueError), match="^x: expected finite values|step 0, sweep"):
+    with debug_checks(), pytest.raises((RuntimeError, ValueError), match="^x: expected finite values|step 0, sweep"):
         dv.step(model, adjoint=adjoint, **inputs)
 
 

@@ -11,9 +11,10 @@ from helpers.detection_scenes import Scene, Surface, capsule, mixed_scene, plane
 from helpers.two_boxes import STEP
 
 import diffvbd as dv
-from diffvbd import colliders
+from diffvbd import colliders, results
 from diffvbd.ops import contact as ops_contact
 from diffvbd.reference import intersections
+from diffvbd.testing import debug_checks
 from diffvbd.testing.scenes import generator
 
 DTYPES = (torch.float64, torch.float32)
@@ -122,7 +123,7 @@ def overlapping(device: str = "cpu", dtype: torch.dtype = torch.float64, shift: 
                     dtype=dtype)  # fmt: skip
 
 
-def run(model: dv.Model, x: Any = None, steps: int = 1, **options: Any) -> dv.results.Trajectory:
+def run(model: dv.Model, x: Any = None, steps: int = 1, **options: Any) -> results.Trajectory:
     x = model.rest_points if x is None else x
     return dv.rollout(model, x, torch.zeros_like(x), steps=steps, **STEP, **options)
 
@@ -143,7 +144,7 @@ def test_a_rollout_refuses_a_start_that_intersects(device: str, dtype: torch.dty
     assert "move the bodies apart" in message and "Checks(start=False)" in message
     assert run(model, checks=dv.Checks(start=False)).x.isfinite().all()
     assert run(model, steps=0).steps == [0]
-    with dv.debug_checks(), pytest.raises(ValueError, match="x: expected surfaces that do not intersect, got"):
+    with debug_checks(), pytest.raises(ValueError, match="x: expected surfaces that do not intersect, got"):
         dv.step(model, model.rest_points, torch.zeros_like(model.rest_points), **STEP)
 
 

@@ -40,7 +40,7 @@ def folding() -> tuple[dv.Model, Tensor, Tensor]:
 
 
 def run(fields: ops.SweepFields, rest: Tensor, plan: Tensor, settings: ops.SweepSettings) -> dict[str, Tensor]:
-    x, tape, cut, corrections = ops.sweep(fields, rest, plan, settings, ops.FULL_TAPE)
+    x, tape, cut, corrections = ops.run_sweep(*fields, rest, plan, settings, ops.FULL_TAPE, -1, False)
     bar = torch.from_numpy(generator(0).standard_normal(x.shape))
     wants: dict[str, bool] = {name: True for name in ops.SWEEP_ADJOINTS}
     bars = ops.sweep_backward(bar, x, tape, corrections, cut, fields, rest, plan, settings, ops.FULL_TAPE, wants)

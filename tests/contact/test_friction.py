@@ -14,7 +14,7 @@ from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import reference
+from diffvbd import reference, results
 from diffvbd.energies import _barrier_slope
 from diffvbd.mesh import box, join
 from diffvbd.testing import relative_error, tolerance
@@ -332,7 +332,7 @@ def block(support: str, bodies: int = 1) -> dv.Model:
 
 def pushed(
     model: dv.Model, share: float | Tensor, sweeps: int, stiffness: float, steps: int = STEPS
-) -> dv.results.Trajectory:
+) -> results.Trajectory:
     """By a share of what friction holds."""
     x = model.rest_points
     force = model.mass[:, None] * 9.81 * COEFFICIENT * share * torch.tensor([1.0, 0.0, 0.0], dtype=x.dtype)

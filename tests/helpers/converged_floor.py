@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import diffvbd as dv
+from diffvbd import results
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # of the sums of the gradient's parts
@@ -189,7 +190,7 @@ class Body:
         return np.stack(xs), np.stack(vs)
 
 
-def apart(body: Body, motion: dv.results.Trajectory, exact: tuple[Array, Array]) -> float:
+def apart(body: Body, motion: results.Trajectory, exact: tuple[Array, Array]) -> float:
     """Error of a rollout: of positions, rms at worst over the largest rms motion, or of the velocity of the center of
     mass at the end, over that at the start."""
     x, v = exact

@@ -11,6 +11,7 @@ from helpers.results import assert_same_bits
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.model.system import system_of
 from diffvbd.rollout import rollout as rollout_module
 from diffvbd.step.residual import _bodies_of, error_of
@@ -64,13 +65,13 @@ def case(name: str) -> Case:
     return Case(model, x, v, material, end)
 
 
-def estimate(c: Case, sweeps: int, **options: Any) -> tuple[Tensor, dv.results.ErrorEstimate]:
+def estimate(c: Case, sweeps: int, **options: Any) -> tuple[Tensor, results.ErrorEstimate]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of few sweeps
         way = dv.rollout(c.model, c.x, c.v, dv.VBD(H, sweeps, **options), steps=1, save="last",
                          checks=dv.Checks(errors=True), **c.material)  # fmt: skip
     assert way.errors is not None
-    return way.x[-1], dv.results.ErrorEstimate(*(t[0] for t in way.errors))
+    return way.x[-1], results.ErrorEstimate(*(t[0] for t in way.errors))
 
 
 def rms(model: dv.Model, way: Tensor) -> float:

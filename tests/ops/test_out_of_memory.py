@@ -6,9 +6,9 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd.adjoint.sweep import backward_memory
 from diffvbd.model.system import system_of
 from diffvbd.ops import FULL_TAPE, NO_TAPE
+from diffvbd.ops.sweep import backward_memory
 
 SWEEPS, SCENES = 2**31 - 1, 256  # more bytes than addresses
 

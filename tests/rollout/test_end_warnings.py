@@ -17,7 +17,7 @@ from diffvbd.rollout import checks
 from diffvbd.step.arguments import material_of, prepare
 from diffvbd.step.contact import TRUNCATED
 from diffvbd.step.residual import truncated_fraction
-from diffvbd.step.stability import FAR
+from diffvbd.step.warnings import FAR
 from diffvbd.testing import tolerance
 
 MEASURES_GROWTH = True  # see conftest.py

@@ -5,7 +5,7 @@ import torch
 from helpers.tilted_box import SOFT, tilted_box
 
 import diffvbd as dv
-from diffvbd import mesh
+from diffvbd import mesh, results
 from diffvbd.rollout import tune
 from diffvbd.testing.tolerances import tolerance
 
@@ -16,7 +16,7 @@ def cantilever(dtype: torch.dtype = torch.float64) -> tuple[dv.Model, torch.Tens
     return model, model.rest_points, torch.zeros_like(model.rest_points)
 
 
-def shares(budget: dv.results.ErrorBudget) -> dict[str, dv.results.Share]:
+def shares(budget: results.ErrorBudget) -> dict[str, results.Share]:
     return {share.cause: share for share in budget.shares}
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.model.system import system_of
 from diffvbd.testing import tolerance
 
@@ -163,7 +164,7 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
     mu = torch.full((model.num_tets,), 1e4, dtype=x.dtype, requires_grad=True)
     solver, quiet = dv.VBD(0.01, SWEEPS, tape=tape), dv.Checks(energy=False)  # a look takes some memory for a moment
 
-    def forward(steps: int = steps, schedule: Any = schedule, save: Any = save) -> dv.results.Trajectory:
+    def forward(steps: int = steps, schedule: Any = schedule, save: Any = save) -> results.Trajectory:
         return dv.rollout(model, x, v, solver, steps=steps, checkpoint_every=schedule, save=save, checks=quiet, mu=mu,
                           lam=1e4)  # fmt: skip
 

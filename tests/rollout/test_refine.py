@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.testing.tolerances import tolerance
 
 H, K, STEPS = 1 / 50, 4, 6
@@ -21,7 +22,7 @@ def beam() -> tuple[dv.Model, Tensor, Tensor]:
     return model, model.rest_points, torch.zeros_like(model.rest_points)
 
 
-def results_of(loss: Any) -> tuple[dv.results.Refinement, list[Any]]:
+def results_of(loss: Any) -> tuple[results.Refinement, list[Any]]:
     """What a loss that keeps its trajectories gave at (h, K), (h, 2K), (h/2, K), (h/2, 2K)."""
     seen: list[Any] = []
     found = dv.refine(lambda: loss(seen))
@@ -154,7 +155,7 @@ def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
     gain = dv.refine(loss_with(60, 1e7), before=0.2)
     assert gain.survives and str(gain).startswith("survives") and "began at 0.2" in str(gain)
     assert "optimise" not in str(gain) and "too coarse" not in str(gain)
-    larger = dv.results.Refinement(-0.046, -0.05, -0.078, -0.08, 0.0, 0.1)
+    larger = results.Refinement(-0.046, -0.05, -0.078, -0.08, 0.0, 0.1)
     assert larger.survives and str(larger).endswith("too coarse to say how much it is")
     strict = tolerance("minimum")
     assert not dv.refine(loss_with(60, 1e7), before=0.2, tolerance=strict).survives

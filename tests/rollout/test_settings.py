@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd.testing import debug_checks
 
 MATERIAL = {"mu": 1e5, "lam": 1e5}
 
@@ -112,9 +113,17 @@ def test_a_name_that_a_call_does_not_have_raises_and_says_what_has_it(call: str,
         (lambda m, x: dv.advise(m, x, 0 * x, duration=0.1, progress=3, **MATERIAL), TypeError,
          "progress: expected a bool, got int"),
         (lambda m, x: dv.memory(m, dv.VBD(0.01, 5), save="first"), ValueError, 'save: expected "all", "last"'),
-        (lambda m, x: dv.debug_checks("no").__enter__(), TypeError, "enabled: expected a bool, got str"),
+        (lambda m, x: debug_checks("no").__enter__(), TypeError, "enabled: expected a bool, got str"),
         (lambda m, x: dv.VBD(0.01, 5, prediction=3), TypeError, "prediction: expected None, got int"),
         (lambda m, x: dv.Model(m.mesh, energies=(dv.StableNeoHookean,)), TypeError, "got the class StableNeoHookean"),
+        (lambda m, x: dv.StableNeoHookean(mu=1.0), TypeError, "mu: .*it has none.*, got an input of dv.step"),
+        (lambda m, x: dv.FloorBarrier(heigth=1.0), TypeError, "heigth: .*dv.FloorBarrier .*: is 'height' meant"),
+        (lambda m, x: dv.Anchor(stifness=1.0), TypeError, "stifness: .*dv.Anchor .*: is 'stiffness' meant"),
+        (lambda m, x: dv.PairBarrier(pair_dhat=0.1), TypeError, "pair_dhat: .*dv.PairBarrier .*: is 'dhat' meant"),
+        (lambda m, x: dv.Friction(coeficient=0.1), TypeError, "coeficient: .*: is 'coefficient' meant"),
+        (lambda m, x: dv.CoarseSpace(function=8), TypeError, "function: .*dv.CoarseSpace .*: is 'functions' meant"),
+        (lambda m, x: dv.GlobalAdjoint(tolerence=0.1), TypeError, "tolerence: .*: is 'tolerance' meant"),
+        (lambda m, x: dv.ReverseSweep(tape="full"), TypeError, "tape: .*dv.ReverseSweep .*, got an argument of dv.VBD"),
     ],
 )  # fmt: skip
 def test_bad_values_raise_by_the_name_of_their_argument(call, error, text) -> None:

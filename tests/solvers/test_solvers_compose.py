@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-import diffvbd as dv
 from diffvbd.solvers import BlockUpdate, Update, compose
-from diffvbd.testing import generator, relative_error, tolerance
+from diffvbd.testing import debug_checks, generator, relative_error, tolerance
 
 
 def rand(*shape: int, key: Any = 0) -> Tensor:
@@ -337,7 +336,7 @@ def test_debug_checks_see_an_impure_update(kind: type[Counting]) -> None:
     for impure in (True, False):
         x = ROWS.clone().requires_grad_()
         out = compose([kind(impure)])(x, sweeps=2)
-        with dv.debug_checks():
+        with debug_checks():
             if impure:
                 with pytest.raises(RuntimeError, match=f"update of {kind.__name__}: .*pure and deterministic"):
                     out.sum().backward()
@@ -353,7 +352,7 @@ def test_debug_checks_change_no_gradient() -> None:
     results = []
     for debug in (False, True):
         x, p = ROWS.clone().requires_grad_(), leaf()
-        with dv.debug_checks(debug):
+        with debug_checks(debug):
             end, _ = compose([update])((x, ROWS), p, sweeps=2)
             end[1:2].sum().backward()
         assert end.isnan().any() and x.grad is not None and x.grad.any()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.testing import tolerance
 
 GRAVITY = (0.0, 0.0, 0.0)
@@ -27,7 +28,7 @@ def model_above(shape: str, gap: float, device: str) -> dv.Model:
     return dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[SHAPES[shape]], device=device)
 
 
-def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list[Tensor], dv.results.Trajectory]:
+def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list[Tensor], results.Trajectory]:
     """A rollout whose colliders go by `ways` [steps, ..., 3]: who took implicit Euler, and the motion."""
     at = model.collider_points
     with dv.record("integrator") as euler:

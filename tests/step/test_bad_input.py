@@ -15,7 +15,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.ops.regimes import regime
-from diffvbd.testing import on_device
+from diffvbd.testing import debug_checks, on_device
 
 # --- arguments of a step ----------------------------------------------------------------------------------------------
 
@@ -259,7 +259,7 @@ def test_debug_checks_say_where_a_position_ceased_to_be_finite(device: str, lead
         for name in ("mu", "lam"):
             options[name] = torch.full((*lead, 1), 1e4, dtype=torch.float64, device=device)
             options[name][-1] = HUGE[name]
-    with dv.debug_checks():
+    with debug_checks():
         with pytest.raises(RuntimeError) as error:
             dv.step(model, x, torch.zeros_like(x), solver, **options)
     scene = lead[-1] - 1 if lead else 0
@@ -272,7 +272,7 @@ def test_debug_checks_change_nothing_in_a_sound_step(device: str) -> None:
     model = model_of(device)
     x = model.rest_points + 0.01
     expected = dv.step(model, x, torch.zeros_like(x), **STEP)
-    with dv.debug_checks():
+    with debug_checks():
         actual = dv.step(model, x, torch.zeros_like(x), **STEP)
     assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.model.system import system_of
-from diffvbd.testing import relative_error, tolerance
+from diffvbd.testing import debug_checks, relative_error, tolerance
 
 pytestmark = pytest.mark.cuda
 REGIMES = (None, "block", "grid", "color")
@@ -113,5 +113,5 @@ def test_debug_checks_name_a_wrong_step() -> None:
     model = bodies("cuda")
     x = model.rest_points.clone()
     x[3, 0] = float("nan")
-    with dv.debug_checks(), pytest.raises((ValueError, RuntimeError)):
+    with debug_checks(), pytest.raises((ValueError, RuntimeError)):
         dv.step(model, x, torch.zeros_like(x), solver_of(3), mu=1e6, lam=1e6)

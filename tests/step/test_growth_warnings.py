@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.step import stability
 
 MEASURES_GROWTH = True  # see conftest.py
@@ -114,7 +115,7 @@ def test_settings_of_pilot_runs_are_not_doubted() -> None:
     model = dv.Model(BODY, pinned=torch.tensor(BODY.points[:, 0] < 1e-9))
     x = model.rest_points
     stiff: dict[str, Any] = {"mu": 1e8, "lam": 1e8}
-    told = dv.results.Prediction(0.01, 0.01, 1.0, 0.03, True, "", (), 1.0, 1)
+    told = results.Prediction(0.01, 0.01, 1.0, 0.03, True, "", (), 1.0, 1)
     proven = replace(FEW, relaxation=1.4, prediction=told)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -11,7 +11,7 @@ from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import colliders
+from diffvbd import colliders, results
 from diffvbd.testing import generator, relative_error, tolerance
 
 SECOND = (dv.SDIRK2(), dv.BDF2())
@@ -347,7 +347,7 @@ def test_bad_integrators() -> None:
     [
         (dv.SDIRK2(), {"history": (1, 2)}, "history: expected None with SDIRK2"),
         (dv.BDF2(), {"history": (1, 2)}, "history: expected what a step with BDF2"),
-        (dv.BDF2(), {"history": dv.results.History(*[torch.zeros(1)] * 3, 0.01)}, "history.moved: expected shape"),
+        (dv.BDF2(), {"history": results.History(*[torch.zeros(1)] * 3, 0.01)}, "history.moved: expected shape"),
         (dv.ImplicitEuler(), {"prescribed": (torch.zeros(3), torch.zeros(3))}, "prescribed: expected"),
     ],
 )

@@ -11,8 +11,8 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import ops, reference
 from diffvbd._common.constants import FILTER_ETA
-from diffvbd.adjoint.sweep import sweep
 from diffvbd.model.system import system_of
+from diffvbd.ops.sweep import sweep
 from diffvbd.testing import build_scene, generator, on_device, relative_error, structured, tolerance
 
 # --- the step filter -------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from helpers.values import STEP, uniform
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd._common.checks import name_value
 from diffvbd.testing import build_scene, relative_error, tolerance
 
@@ -356,7 +357,7 @@ def test_anchor_pulls_chosen_vertices_to_their_points(device: str) -> None:
 # --- tapes ------------------------------------------------------------------------------------------------------------
 
 
-def forward(device: str, **options: Any) -> tuple[Tensor, dv.results.Tape]:
+def forward(device: str, **options: Any) -> tuple[Tensor, results.Tape]:
     model = model_of(device)
     x, _, tape = dv.step_forward(model, model.rest_points, 0 * model.rest_points, **BAD_STEP | options)
     return x, tape
@@ -367,7 +368,7 @@ def forward(device: str, **options: Any) -> tuple[Tensor, dv.results.Tape]:
     [pickle.dumps, copy.deepcopy, copy.copy, lambda tape: torch.save(tape, io.BytesIO())],
     ids=["pickle", "deepcopy", "copy", "save"],
 )
-def test_a_tape_is_not_stored_or_copied(device: str, store: Callable[[dv.results.Tape], Any]) -> None:
+def test_a_tape_is_not_stored_or_copied(device: str, store: Callable[[results.Tape], Any]) -> None:
     x, tape = forward(device)
     with pytest.raises(TypeError, match="Keep the states .* and run step_forward again"):
         store(tape)
@@ -378,7 +379,7 @@ def test_a_tape_is_not_stored_or_copied(device: str, store: Callable[[dv.results
 
 def test_a_tape_without_a_graph_is_refused(device: str) -> None:
     x, tape = forward(device)
-    lost = dv.results.Tape(tape.inputs, (tape.outputs[0].detach(), tape.outputs[1].detach()))
+    lost = results.Tape(tape.inputs, (tape.outputs[0].detach(), tape.outputs[1].detach()))
     for grads in ((torch.ones_like(x),), ()):
         with pytest.raises(RuntimeError, match="tape: expected one with the graph.*run step_forward again"):
             dv.step_backward(lost, *grads)

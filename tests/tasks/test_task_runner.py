@@ -15,6 +15,7 @@ from helpers.task_checks import timeless
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.tasks import Problem, Settings, Stage, solve, table
 from diffvbd.tasks.optimizer import PATIENCE, Newton, optimizer_of
 from diffvbd.tasks.runner import captured
@@ -433,7 +434,7 @@ def test_a_run_ends_with_the_line(tmp_path: Path) -> None:
     result = solve(problem, Settings(tmp_path))
     found = result.refined
     # implicit Euler goes (n + 1) / n of the right way in n steps: smaller ones go less far
-    assert isinstance(found, dv.results.Refinement) and found.before == result.history[0]["loss"]
+    assert isinstance(found, results.Refinement) and found.before == result.history[0]["loss"]
     assert found.loss < found.smaller_steps < result.history[0]["loss"]
     assert str(found) in table(problem, result).splitlines()[-1]
     assert str(found) in (tmp_path / "log.json").read_text(encoding="utf-8")

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.viz import motion, values
 from diffvbd.viz import viewer as clock
 from diffvbd.viz.motion import scenery_of
@@ -22,7 +23,7 @@ X = MODEL.rest_points
 STEP = 0.01
 
 
-def falling(steps: int = 6, scenes: int | None = None) -> dv.results.Trajectory:
+def falling(steps: int = 6, scenes: int | None = None) -> results.Trajectory:
     x = X if scenes is None else X.expand(scenes, -1, -1).clone()
     return dv.rollout(MODEL, x, torch.zeros_like(x), dv.VBD(STEP, 3), steps=steps, mu=1e4, lam=1e4)
 

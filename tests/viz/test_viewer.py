@@ -14,6 +14,7 @@ import torch
 from helpers.browser import page_of
 
 import diffvbd as dv
+from diffvbd import results
 from diffvbd.viz import live
 
 pytest.importorskip("viser")
@@ -22,7 +23,7 @@ MODEL = dv.Model(MESH, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.3)))
 STEP = 0.02
 
 
-def fall(speed: float = 0.0, steps: int = 8) -> dv.results.Trajectory:
+def fall(speed: float = 0.0, steps: int = 8) -> results.Trajectory:
     x = MODEL.rest_points
     v = torch.tensor([0.0, speed, 0.0], dtype=x.dtype).expand_as(x)
     return dv.rollout(MODEL, x, v, dv.VBD(STEP, 3), steps=steps, mu=1e4, lam=1e4)
@@ -151,7 +152,7 @@ def test_a_browser_draws_plays_and_reruns() -> None:
     images = pytest.importorskip("PIL.Image")
     speeds: list[float] = []
 
-    def throw(speed: float) -> dv.results.Trajectory:
+    def throw(speed: float) -> results.Trajectory:
         speeds.append(speed)
         if speed > 4.0:
             raise ValueError("too fast")
