@@ -1,11 +1,9 @@
 """Map the stiffness inside a body from where its surface was seen to move: one unknown for each tet.
 
-A rabbit, 0.3 m high, is held at its lower tenth and pulled at eight places of its surface, one after another, each time
-from rest. Given are the positions of the surface vertices at six times of each pull, simulated with the same mesh and
-solver, with Gaussian noise of 0.1 % of the height. The truth has two regions, a soft one and one four times as stiff,
-but neither their number nor their place is given: every tet has its own log mu, and its lam by a known Poisson's ratio.
-Some tets hardly move the surface, so the total variation of log mu over inner faces is minimised along with the misfit.
-The paper recovers uniform materials only (section 6.5); this is the same gradient, with respect to a field.
+A rabbit, 0.3 m high, is held at its lower tenth and pulled, each time from rest. Its surface is seen at six times of
+each pull, with Gaussian noise of 0.1 % of the height. The stiff region is four times as stiff. Every tet has its own
+log mu, and its lam by a known Poisson's ratio. Some tets hardly move the surface: hence the total variation over inner
+faces. The paper recovers uniform materials only (section 6.5); this is the same gradient, with respect to a field.
 
 How much total variation: the discrepancy principle (Morozov 1966). The misfit is the mean squared residual over the
 variance of the noise; the truth has 1, give or take sqrt(2 / N) for N observed numbers. The weight begins high, where
@@ -14,17 +12,16 @@ that finds it at most 1 goes on at the same weight. The last possible weight, 3.
 the noise happens to be larger than stated. High weights lead the way: with a low one from the start L-BFGS takes
 longer.
 
-Choices the paper leaves open, as it has no such task: the default mesh is `dv.mesh.bunny(10)`, a likeness made of
-ellipsoids that needs no file. A file (option --mesh) holds tets, or a surface that `dv.mesh.tetrahedralize` fills; it
-is scaled to a height of 0.3 m, y up, so that loads, stiffness and time step suit it. A plane through the middle of the
-bounding box, normal to (1, 1, 0), splits the regions: the rabbit's head and ears are stiff. Places to pull at are
-farthest points of the surface above the held part; a pull is a traction on the surface within 3.6 cm, away from the
-middle of the base, so that thin parts are not torn off. No gravity; density 1000 kg/m^3. Steps of 5 ms and 20 sweeps
-relaxed by 1.7 are on average 0.06 mm off converged ones, below the noise; ten sweeps are 1.3 mm off, and the map would
-be one for that solver. Finer meshes need more sweeps, so a surface should be filled with edges of a tenth of its
-diagonal (--edge-length), and larger ones more evaluations (--iterations). Total variation is smoothed below jumps of
-5 % in mu. mu stays within a factor 30 of the first guess, because line searches try wild steps. The sweeps start from
-the predictor, as in the paper's tasks.
+Choices: the default mesh is `dv.mesh.bunny(10)`, a likeness made of ellipsoids that needs no file. A file (option
+--mesh) holds tets, or a surface that `dv.mesh.tetrahedralize` fills; it is scaled to a height of 0.3 m, y up, so that
+loads, stiffness and time step suit it. A plane through the middle of the bounding box, normal to (1, 1, 0), splits the
+regions: the rabbit's head and ears are stiff. Places to pull at are farthest points of the surface above the held part;
+a pull is a traction on the surface within 3.6 cm, away from the middle of the base, so that thin parts are not torn
+off. No gravity; density 1000 kg/m^3. Steps of 5 ms and 20 sweeps relaxed by 1.7 are on average 0.06 mm off converged
+ones, below the noise; ten sweeps are 1.3 mm off, and the map would be one for that solver. Finer meshes need more
+sweeps, so a surface should be filled with edges of a tenth of its diagonal (--edge-length), and larger ones more
+evaluations (--iterations). Total variation is smoothed below jumps of 5 % in mu. mu stays within a factor 30 of the
+first guess, because line searches try wild steps. The sweeps start from the predictor, as in the paper's tasks.
 """
 
 import math

@@ -1,6 +1,6 @@
 """One body with one uniform material: what `simulate` runs and `identify` fits, and the .npz file between them."""
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,10 @@ class Scene:
         return dv.rollout(model, x, v, self.solver, steps=steps, mu=mu, lam=lam, gravity=self.gravity, **options)
 
 
+DEFAULTS = {field.name: field.default for field in fields(Scene) if field.default is not MISSING}
+FIELDS = tuple(DEFAULTS)  # of a Scene that options and files may give
+
+
 @dataclass(frozen=True)
 class Observation:
     """Observed shapes.
@@ -100,20 +104,13 @@ class Observation:
 
     def save(self, path: str | Path) -> None:
         """Write the .npz file that `load` reads."""
-        s = self.scene
-        values: dict[str, Any] = {"x": self.x, "steps": self.steps, "x0": s.x0, "v0": s.v0, "pinned": s.pinned}
-        values |= {"time_step": s.time_step, "sweeps": s.sweeps, "density": s.density, "gravity": s.gravity}
-        if s.floor is not None:
-            values |= {"floor": s.floor, "kappa": s.kappa, "dhat": s.dhat}
-        if s.friction is not None:
-            values["friction"] = s.friction
-        if s.relaxation != 1.0:
-            values["relaxation"] = s.relaxation
-        if s.integrator != Scene.integrator:
-            values["integrator"] = s.integrator
-        if s.subspace != Scene.subspace:
-            values["subspace"] = s.subspace
-        values |= self.truth
+        values: dict[str, Any] = {"x": self.x, "steps": self.steps}
+        always = ["x0", "v0", "pinned", "time_step", "sweeps", "density", "gravity"]
+        always += [] if self.scene.floor is None else ["floor", "kappa", "dhat"]
+        values |= {name: getattr(self.scene, name) for name in always}
+        others = ("friction", "relaxation", "integrator", "subspace")
+        changed = {name: getattr(self.scene, name) for name in others}
+        values |= {name: value for name, value in changed.items() if value != DEFAULTS[name]} | self.truth
 
         def write(new: Path) -> None:
             with new.open("wb") as file:  # numpy adds .npz to other names
@@ -148,9 +145,8 @@ class Observation:
         given = {key: value for key, value in overrides.items() if value is not None}
         recorded = None if {"time_step", "steps"} <= set(given) else values.get("time_step")
         values |= given
-        known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam"}
-        numbers = {"time_step", "density", "floor", "kappa", "dhat", "friction", "relaxation"}
-        known |= numbers | {"sweeps", "gravity", "integrator", "subspace"}
+        numbers = {*FIELDS} - {"sweeps", "gravity", "integrator", "subspace"}
+        known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam", *FIELDS}
         unknown = sorted(set(values) - known)
         if unknown or "x" not in values:
             wrong = f"unknown keys {unknown}" if unknown else "the key x is missing"
@@ -164,23 +160,26 @@ class Observation:
         if len(x) == 0:
             raise ValueError(f"{path}: x: expected at least one observed shape, got none")
         steps = _steps(path, values.get("steps", np.arange(len(x))), len(x))
-        fields: dict[str, Any] = {key: _number(path, key, values[key]) for key in sorted(numbers & set(values))}
-        if recorded is not None and fields["time_step"] > 0:
-            steps = _at_the_same_times(path, steps, _number(path, "time_step", recorded), fields["time_step"])
+        chosen: dict[str, Any] = {key: _number(path, key, values[key]) for key in sorted(numbers & set(values))}
+        if recorded is not None and chosen["time_step"] > 0:
+            steps = _at_the_same_times(path, steps, _number(path, "time_step", recorded), chosen["time_step"])
         if "sweeps" in values:
-            fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
+            chosen["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
         if "gravity" in values:
-            fields["gravity"] = tuple(_array(path, "gravity", values["gravity"], (3,)).tolist())
+            gravity = np.asarray(values["gravity"])
+            if gravity.shape != (3,) or gravity.dtype.kind not in "iuf" or not np.isfinite(gravity).all():
+                raise ValueError(f"{path}: gravity: expected finite numbers of shape [3], got {_shown(gravity)}")
+            chosen["gravity"] = tuple(gravity.astype(np.float64).tolist())
         for key, words in (("integrator", INTEGRATORS), ("subspace", SUBSPACES)):
             if key in values:
-                fields[key] = str(np.asarray(values[key]))
-                if fields[key] not in words:
-                    raise ValueError(f"{path}: {key}: expected one of {[*words]}, got {fields[key]!r}")
+                chosen[key] = str(np.asarray(values[key]))
+                if chosen[key] not in words:
+                    raise ValueError(f"{path}: {key}: expected one of {[*words]}, got {chosen[key]!r}")
         _check_size(path, x[0], mesh)
         scene = Scene(mesh=mesh, x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
                       v0=_checked(path, "v0", values.get("v0", np.zeros(shape)), shape),
                       pinned=_mask(path, values.get("pinned", np.zeros(shape[0], bool)), shape[0]),
-                      **fields)  # fmt: skip
+                      **chosen)  # fmt: skip
         truth = {key: _number(path, key, values[key]) for key in ("mu", "lam") if key in values}
         return cls(scene, x, steps, truth)
 
@@ -226,17 +225,9 @@ def _number(path: str | Path, name: str, given: Any, whole: bool = False) -> flo
     values = np.asarray(given)
     good = values.size == 1 and values.dtype.kind in ("iu" if whole else "iuf")
     if not good or not np.isfinite(values).all():
-        raise ValueError(
-            f"{path}: {name}: expected {'an integer' if whole else 'a finite number'}, got {_shown(values)}"
-        )
+        kind = "an integer" if whole else "a finite number"
+        raise ValueError(f"{path}: {name}: expected {kind}, got {_shown(values)}")
     return values.reshape(-1)[0].item()
-
-
-def _array(path: str | Path, name: str, given: Any, shape: tuple[int, ...]) -> Array:
-    values = np.asarray(given)
-    if values.shape != shape or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-        raise ValueError(f"{path}: {name}: expected finite numbers of shape {list(shape)}, got {_shown(values)}")
-    return values.astype(np.float64)
 
 
 def _mask(path: str | Path, given: Any, count: int) -> NDArray[np.bool_]:

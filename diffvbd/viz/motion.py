@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -24,7 +24,7 @@ from ..mesh.tet_mesh import TetMesh, boundary_faces
 from ..mesh.write import replace
 from ..model.model import Model
 from ..rollout.trajectory import Trajectory
-from .drawing import SCENERY, Scenery, as_array, capsule, check_surface
+from .scenery import SCENERY, Scenery, as_array, capsule, check_surface
 
 Mesh = Model | TetMesh
 
@@ -53,15 +53,15 @@ class Motion:
     velocities: NDArray[np.float64] | None = None
     steps: NDArray[np.int64] | None = None
     scene: int = 0
-    scenery: tuple[Scenery, ...] = field(default=())
+    scenery: tuple[Scenery, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
 
     @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowest and highest corner [m] of all frames."""
-        return self.points.min((0, 1)), self.points.max((0, 1))
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [m] of all frames, shape [2, 3]."""
+        return np.stack([self.points.min((0, 1)), self.points.max((0, 1))])
 
 
 def mesh_of(mesh: Any) -> TetMesh | None:
@@ -90,9 +90,7 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
             fail("source", "at least one motion", "an empty dict")
         return found
     if isinstance(source, (Model, TetMesh)):
-        body = mesh_of(source)
-        assert body is not None
-        return motions_of(body.points, source, time_step)
+        return motions_of((source if isinstance(source, TetMesh) else source.mesh).points, source, time_step)
     body, step = mesh_of(mesh), None if time_step is None else check_positive("time_step", time_step, "s")
     if body is None:
         raise TypeError(f"mesh: expected a dv.Model or a dv.TetMesh with {type(source).__name__}, got None")
@@ -105,12 +103,10 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
     numbers = np.arange(len(points)) if steps is None else steps
     times = None if step is None else as_array(numbers * step)
     triangles, tets = boundary_faces(body.tets, body.num_vertices)
-    motions = {}
-    for b in range(points.shape[1]):
-        of_scene = None if v is None else v.reshape(points.shape)[:, b]
-        name = "motion" if points.shape[1] == 1 else f"scene {b}"
-        motions[name] = Motion(points[:, b], triangles, times, body.body, tets, of_scene, numbers, b)
-    return motions
+    speeds = None if v is None else v.reshape(points.shape)
+    motions = [Motion(points[:, b], triangles, times, body.body, tets, None if speeds is None else speeds[:, b],
+                      numbers, b) for b in range(points.shape[1])]  # fmt: skip
+    return {"motion" if len(motions) == 1 else f"scene {motion.scene}": motion for motion in motions}
 
 
 def positions(name: str, x: Any, vertices: int) -> NDArray[np.float64]:
@@ -217,22 +213,21 @@ def opened(path: Path, time_step: float | None = None) -> Opened:
         FileNotFoundError: no such file.
         ValueError: a file of another kind, or a run that has kept no motion.
     """
+    suffix, expected = path.suffix.lower(), "expected a .pvd, a mesh with tets or the folder of a run"
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist: expected a .pvd, a mesh with tets or the folder of a run")
+        raise FileNotFoundError(f"{path} does not exist: {expected}")
     if path.is_dir():
         return _run(path)
-    if path.suffix.lower() == ".npz":
+    if suffix == ".npz":
         return Opened(load_motions(path))
-    if path.suffix.lower() == ".pvd":
+    if suffix == ".pvd":
         frames = read_frames(path)
         motions = motions_of(frames.points, frames.mesh, time_step)
         if time_step is None:
             motions = {name: _timed(motion, frames.times) for name, motion in motions.items()}
         return Opened(motions, frames.mesh)
-    if path.suffix.lower() in _FOR_OTHERS:
-        raise ValueError(
-            f"{path}: expected a .pvd, a mesh with tets or the folder of a run; {path.suffix} is for other programs"
-        )
+    if suffix in _FOR_OTHERS:
+        raise ValueError(f"{path}: {expected}; {path.suffix} is for other programs")
     mesh = load(path)
     return Opened(motions_of(mesh, time_step=time_step), mesh)
 
@@ -287,21 +282,19 @@ def scenery_of(
     moved = rest if colliders is None else as_array(colliders)
     if moved.shape[-2:] != rest.shape or moved.ndim not in (2, 3):
         fail("colliders", f"shape [N, {len(rest)}, 3]", f"shape {list(moved.shape)}")
-    rows_of = model.collider_rows if model.colliders else ()
-    for collider, rows in zip(model.colliders, rows_of, strict=True):
+    for collider, rows in zip(model.colliders, model.collider_rows if model.colliders else (), strict=True):
         frames = moved[..., rows, :]
         if isinstance(collider, Plane):
-            corners = frames if frames.ndim == 2 else frames[0]
+            corners = frames.reshape(-1, *frames.shape[-2:])[0]
             across = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-            unit = across / np.linalg.norm(across)
-            things.append(plane(corners[0], unit, middle, reach))
+            things.append(plane(corners[0], across / np.linalg.norm(across), middle, reach))
         elif isinstance(collider, (Sphere, Capsule)):
-            ends = frames[None] if frames.ndim == 2 else frames
+            ends = frames.reshape(-1, *frames.shape[-2:])
             shapes = [capsule(each[0], each[-1], collider.radius) for each in ends]
             points = np.stack([shape.points for shape in shapes])
-            things.append(Scenery(points[0] if frames.ndim == 2 else points, shapes[0].triangles, SCENERY))
+            things.append(Scenery(points[0] if frames.ndim == 2 else points, shapes[0].triangles))
         else:
-            things.append(Scenery(frames, collider.corners().triangles, SCENERY))
+            things.append(Scenery(frames, collider.corners().triangles))
     return tuple(things)
 
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from .._common.checks import fail, is_word
 from ..inspect.forces import forces, stress
+from ..mesh.tet_mesh import TetMesh
 from ..model.model import Model
 from ..model.solver import VBD
-from .drawing import as_array
-from .motion import Motion
+from .motion import Mesh, Motion
+from .scenery import as_array
 
 # What each name means, and its unit.
 QUANTITIES = {
@@ -110,8 +111,7 @@ class Values:
 
     def values(self, name: str, motion: Motion) -> NDArray[np.float64]:
         """A quantity of each triangle, shape [N, F], or [F] where it is constant."""
-        compute = {"speed": self._speed, "stress": self._stress, "stiffness": self._stiffness, "contact": self._contact}
-        return compute[name](motion)
+        return getattr(self, f"_{name}")(motion)
 
     def _speed(self, motion: Motion) -> NDArray[np.float64]:
         velocities = motion.velocities
@@ -157,12 +157,11 @@ class Values:
 
     def _stress(self, motion: Motion) -> NDArray[np.float64]:
         model, tets = self._needed("stress"), self._tets_of(motion, "stress")
-        mu, lam = (self._material(name, motion, "stress") for name in ("mu", "lam"))
-        given = [torch.as_tensor(values, dtype=model.dtype, device=model.device) for values in (mu, lam)]
+        mu, lam = (_like(model, self._material(name, motion, "stress")) for name in ("mu", "lam"))
         rows, out = max(1, _CHUNK // max(1, model.num_tets)), []
         for k in range(0, len(motion), rows):
             with torch.no_grad():
-                found = stress(model, _like(model, motion.points[k : k + rows]), mu=given[0], lam=given[1])
+                found = stress(model, _like(model, motion.points[k : k + rows]), mu=mu, lam=lam)
             out.append(as_array(found.von_mises)[:, tets])
         return np.concatenate(out)
 
@@ -180,9 +179,15 @@ class Values:
                 given |= {"previous": (x[k - 1], x[k - 1]), "solver": VBD(step, 1)}
                 given |= {} if places is None else {"colliders_before": places[k - 1]}
             with torch.no_grad():
-                total = forces(model, x[k], **given).vertices.total
-            found[k] = as_array(total.norm(dim=-1))
+                found[k] = as_array(forces(model, x[k], **given).vertices.total.norm(dim=-1))
         return found[:, motion.triangles].mean(-1)
+
+
+def values_of(mesh: Mesh | None, mu: Any, lam: Any, colliders: Any) -> Values:
+    """Quantities of motions of a mesh; with a material it becomes a Model, for stresses."""
+    if isinstance(mesh, TetMesh) and mu is not None and lam is not None:
+        mesh = Model(mesh)
+    return Values(mesh if isinstance(mesh, Model) else None, mu, lam, colliders)
 
 
 def _like(model: Model, points: NDArray[np.float64]) -> torch.Tensor:
