@@ -19,10 +19,10 @@ import diffvbd as dv
 from diffvbd.mesh.motions import EXTENSIONS, check_extension
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.folder import joined
+from diffvbd.tasks.identify import FIELDS, INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
 from diffvbd.tasks.problem import Result, Row, check_device
 from diffvbd.tasks.report import versions
-from diffvbd.tasks.scene import FIELDS, INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
-from diffvbd.viz.server import require_viser
+from diffvbd.viz.scenery import optional
 from diffvbd.viz.values import QUANTITIES
 
 from ._common.context import record_to
@@ -51,17 +51,6 @@ where it stalled, and warns wherever it did not converge; `advise` where the err
 """
 MODULI = {"mu": "shear modulus [Pa]", "lam": "first Lame parameter [Pa]"}
 ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "subspace")  # what advise chooses
-TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
-  x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
-  steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...; where the file has a time_step,
-             another --time-step keeps the times
-  x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
-  pinned     vertices that are held, bool, shape [V]; default none
-  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation,
-             integrator, subspace
-  mu, lam    the true material [Pa], if known: only used to report the error
-`diffvbd simulate --save-target TARGET.npz` writes such a file.
-"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -137,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     advice.set_defaults(command=_advise)
 
     identification = commands.add_parser(
-        "identify", help="recover mu and lam from observed shapes", epilog=TARGET_KEYS, formatter_class=raw
+        "identify", help="recover mu and lam from observed shapes", epilog=identify.KEYS, formatter_class=raw
     )
     identification.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     identification.add_argument("target", type=Path, metavar="TARGET.npz", help="the observation, see below")
@@ -194,10 +183,8 @@ def _simulate(options: argparse.Namespace) -> None:
     if options.stride < 1:
         raise ValueError(f"--stride: expected at least 1, got {options.stride}")
     _check_steps(options.steps)
-    check_device(options.device)
-    mesh = _mesh(options)
-    mu, lam = _material(options)
-    scene = _scene(options, mesh)
+    scene, mu, lam = _scene(options)
+    mesh = scene.mesh
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
@@ -228,10 +215,7 @@ def _advise(options: argparse.Namespace) -> int:
     for name in ADVISED:
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: expected none, since it is what advise chooses")
-    check_device(options.device)
-    mesh = _mesh(options)
-    mu, lam = _material(options)
-    scene = _scene(options, mesh)
+    scene, mu, lam = _scene(options)
     model = scene.model(options.device)
     x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (scene.x0, scene.v0))
     solver = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
@@ -384,15 +368,18 @@ def _material(options: argparse.Namespace) -> tuple[float, float]:
         raise ValueError(f"--{error}") from None
 
 
-def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
-    """The scene of a mesh that the options describe."""
+def _scene(options: argparse.Namespace) -> tuple[Scene, float, float]:
+    """The scene that the options describe, mu and lam [Pa]."""
+    check_device(options.device)
+    mesh = _mesh(options)
+    mu, lam = _material(options)
     v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
     values = _given(options, mesh)
     for name in ("kappa", "dhat", "friction"):
         if name in values and "floor" not in values:
             raise ValueError(f"--{name}: expected --floor with it, got none")
     pinned = values.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
-    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **values)
+    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **values), mu, lam
 
 
 def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
@@ -508,7 +495,7 @@ def _watched(host: str, port: int) -> Iterator[Callable[[dict[str, float]], None
 
     The page stays after the run for as long as a browser shows it.
     """
-    require_viser()
+    optional("viser", "the viewer needs")
     heard: list[Any] = []
     viewer: dv.viz.Viewer | None = None
 

@@ -115,9 +115,7 @@ def forces(
 
     Source: Li et al. (2020); docs/method.md, sections 6 and 12.
     """
-    check_state(model, x, x)
-    check_previous(model, previous, x, solver)
-    given_inputs = given_of(model, inputs)
+    given_inputs = _checked(model, x, solver, previous, inputs)
     start = None if previous is None else previous[0]
     _refuse_non_finite(model, {"x": x, "previous: x": start, **given_inputs.parameters,
                                **{name: given_inputs.loads[name] for name in COLLIDERS}})  # fmt: skip
@@ -134,16 +132,20 @@ def forces(
     surface = given.model.surface_of_contact
     labels = given.model.body
     bodies = int(labels.max()) + 1 if labels.numel() else 0
-    floors = [_by_label(part, labels, bodies) for part in (state.floor, state.floor_friction)]
+    floors = [part.new_zeros(len(part), bodies, *part.shape[2:]).index_add(1, labels, part)
+              for part in (state.floor, state.floor_friction)]  # fmt: skip
     sums = _OfBodies(state, bodies, 0 if surface is None else len(surface.rows), surface.body if surface else labels)
     body_pairs, *between = sums.between()
     return Forces(
-        vertices=shaped(*state.on_vertices()),
-        body_pairs=body_pairs,
-        between=shaped(*between),
-        colliders=shaped(*sums.colliders()),
-        floors=shaped(*floors),
+        shaped(*state.on_vertices()), body_pairs, shaped(*between), shaped(*sums.colliders()), shaped(*floors)
     )
+
+
+def _checked(model: Model, x: Tensor, solver: VBD | None, previous: Any, inputs: dict[str, Any]) -> Given:
+    """Inputs of a step, once the states fit the Model."""
+    check_state(model, x, x)
+    check_previous(model, previous, x, solver)
+    return given_of(model, inputs)
 
 
 def _refuse_non_finite(model: Model, where: dict[str, Tensor | None]) -> None:
@@ -181,11 +183,6 @@ def _contact_at(given: Wide, x: Tensor, previous: tuple[Tensor, Tensor] | None) 
     contact = StepContact(given.model, given.data(), given.prepared.parameters, given.colliders, given.before, start,
                           None, h)  # fmt: skip
     return contact.at(x.double().reshape(flat))
-
-
-def _by_label(values: Tensor, labels: Tensor, count: int) -> Tensor:
-    """[B, V, ...] -> [B, count, ...]"""
-    return values.new_zeros(len(values), count, *values.shape[2:]).index_add(1, labels, values)
 
 
 class _OfBodies:
@@ -252,9 +249,7 @@ def reactions(
 
     Source: docs/method.md, sections 1, 2 and 12.
     """
-    check_state(model, x, x)
-    check_previous(model, previous, x, solver)
-    given_inputs = given_of(model, inputs)
+    given_inputs = _checked(model, x, solver, previous, inputs)
     loads = given_inputs.loads
     state = {} if previous is None else {"previous: x": previous[0], "previous: v": previous[1]}
     pull, force = acceleration_of(loads["gravity"], x), loads["force"]

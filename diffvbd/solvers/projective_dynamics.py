@@ -146,16 +146,13 @@ class LocalGlobal(BlockUpdate):
 class ProjectiveDynamics(ParticleSolver):
     """Particles with springs and tets, solved by K local-global iterations per step.
 
-    What is given here are constants, no tensors that require grad; what is differentiated is an argument of
-    :meth:`step` or :meth:`factor`.
+    What is given here are constants, as in :class:`XPBD`; what is differentiated is an argument of :meth:`step` or
+    :meth:`factor`.
 
     Args:
-        points: Rest positions [m], shape [V, 3]; the number of particles V is enough without tets.
-        mass: [kg], a number or shape [V], > 0 where not pinned.
+        points, mass, pinned, dtype, device: As in :class:`XPBD`; with tets, ``points`` are rest positions.
         edges: The two particles of each spring, integers [C, 2]; None: no springs.
         tets: The corners of each tet, integers [T, 4], of positive volume at ``points``; None: no tets.
-        pinned: A bool mask [V] or indices.
-        dtype, device: torch.float64 or torch.float32; where the constants live.
 
     Attributes:
         edges: int64 [C, 2]. rest_length: Distances of the rest positions [m], [C]; None without such.
@@ -204,13 +201,10 @@ class ProjectiveDynamics(ParticleSolver):
         tets: bool = True,
         **options: Any,
     ) -> ProjectiveDynamics:
-        """Springs along the edges of a mesh, its tets, or both; density [kg/m^3], lumped; options: dtype, device.
-
-        Points and density are constants; give ``mass`` to :meth:`step` for its gradient.
+        """Springs along the edges of a mesh, its tets, or both; otherwise as :meth:`XPBD.from_mesh`.
 
         Raises:
-            TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
-            ValueError: density is not > 0, pinned or an option does not fit, or too many particles are free.
+            TypeError, ValueError: As :meth:`XPBD.from_mesh`; ValueError also where too many particles are free.
         """
         mass, edges = mesh_mass(mesh, density), mesh_edges(mesh) if springs else None
         return cls(mesh.points, mass, edges, mesh.tets if tets else None, pinned, **options)
@@ -302,9 +296,7 @@ class ProjectiveDynamics(ParticleSolver):
             x, v, mass, force, gravity, prescribed, sweeps: As in :meth:`XPBD.step`.
             factor: What :meth:`factor` made of time_step, stiffness, tet_stiffness and mass, which are then not given
                 here. None: they are, and this step factors the matrix.
-            time_step: h [s] > 0, not differentiable.
-            stiffness: k [N/m] >= 0 of the springs, broadcasts to x.shape[:-2] + (C,).
-            tet_stiffness: [Pa] >= 0; weight over volume of the tets, broadcasts to x.shape[:-2] + (T,).
+            time_step, stiffness, tet_stiffness: As in :meth:`factor`, with the scenes of x.
             rest_length: L [m] >= 0, broadcasts to x.shape[:-2] + (C,); None: the distances of the rest positions.
 
         Returns:

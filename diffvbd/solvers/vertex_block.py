@@ -115,7 +115,8 @@ class VertexBlock(BlockUpdate):
         gradient = mu * stretch + (lb * (det - 1) - mu) / 6 * normal
         # J is linear in x_i, so the exact block of a tet has no term with its second derivative.
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
-        block = (mu * self.k_ii)[..., None] * eye + (lh * self.c6 / 6)[..., None] * _outer(normal, normal)
+        outer = normal[..., :, None] * normal[..., None, :]
+        block = (mu * self.k_ii)[..., None] * eye + (lh * self.c6 / 6)[..., None] * outer
         m = mass.expand(*mass.shape[:-1], self.num_vertices)[..., self.vertices, None]
         offset = x[..., self.vertices, :] - y[..., self.vertices, :]
         gradient = m * offset + self.factor * self.to_block(gradient)
@@ -141,7 +142,9 @@ class VertexBlock(BlockUpdate):
         block = self.assemble(x, y, mu, lam, mass)
         raw = -_solve(block.hessian, block.gradient)
         p = _solve(block.hessian, self.saturation_vjp(self.relaxation * out_bar, raw))
-        pairs = self.elastic_tangent(block, p[..., self.owner, :], raw[..., self.owner, :])
+        pair_p, pair_raw = p[..., self.owner, :], raw[..., self.owner, :]
+        one, two = self.gradient_tangent(block, pair_p), self.hessian_tangent(block, pair_p, pair_raw)
+        pairs = PairBars(one.own + two.own, one.normal + two.normal, one.stretch, one.mu + two.mu, one.lam + two.lam)
 
         rows = self.vertices
         inertia = placed(block.mass * p, rows, self.num_vertices)
@@ -159,11 +162,6 @@ class VertexBlock(BlockUpdate):
         length = torch.linalg.vector_norm(raw, dim=-1, keepdim=True)
         direction = torch.where(length > 0, raw / torch.where(length > 0, length, 1.0), 0.0)
         return s * z - s**2 / self.saturation * dot(raw, z) * direction
-
-    def elastic_tangent(self, b: Block, p: Tensor, raw: Tensor) -> PairBars:
-        """Both tangents of the tets' part of phi; p and d_raw per pair."""
-        one, two = self.gradient_tangent(b, p), self.hessian_tangent(b, p, raw)
-        return PairBars(one.own + two.own, one.normal + two.normal, one.stretch, one.mu + two.mu, one.lam + two.lam)
 
     def gradient_tangent(self, b: Block, p: Tensor) -> PairBars:
         """From p . g with n and x_i independent (stage 1 of the paper)."""
@@ -245,16 +243,14 @@ class _ColorSolver(Solver):
             fail("state", "1 tensor (x)", len(tensors))
         if len(given) != 4:
             fail("parameters", "4 tensors (y, mu, lam, mass)", len(given))
-        x = check_tensor("x", tensors[0], model.mass)
-        own = (model.num_vertices, 3)
-        if x.dim() < 2 or x.shape[-2:] != own:
-            fail("x", f"shape [..., {own[0]}, 3]", f"shape {list(x.shape)}")
+        x, own = check_tensor("x", tensors[0], model.mass), (model.num_vertices, 3)
         lead = tuple(x.shape[:-2])
         shapes = {"y": own, "mu": (model.num_tets,), "lam": (model.num_tets,), "mass": own[:1]}
+        for name, value in (("x", x), ("y", given[0])):
+            if isinstance(value, Tensor) and value.shape[-2:] != own:
+                fail(name, f"shape [..., {own[0]}, 3]", f"shape {list(value.shape)}")
         for (name, shape), value in zip(shapes.items(), given, strict=True):
             check_broadcast(name, check_tensor(name, value, model.mass), (*lead, *shape))
-        if given[0].shape[-2:] != own:
-            fail("y", f"shape [..., {own[0]}, 3]", f"shape {list(given[0].shape)}")
         if not x.is_cuda:  # on CUDA a look would wait for the device
             _check_values(model, x.detach(), *(t.detach() for t in given))
         return super().__call__(state, given, sweeps=sweeps)
@@ -273,9 +269,8 @@ def _check_values(model: Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, m
 def check_elastic(model: Model) -> None:
     """Raises where a Model has other energies than the one that VertexBlock knows."""
     check_kind("model", model, Model)
-    energies = model.energies
-    if len(energies) != 1 or not isinstance(energies[0], StableNeoHookean):
-        names = [type(e).__name__ for e in energies]
+    names = [type(energy).__name__ for energy in model.energies]
+    if len(names) != 1 or not isinstance(model.energies[0], StableNeoHookean):
         fail("model", "a StableNeoHookean as its only energy", f"{names or 'none'}")
 
 
@@ -283,10 +278,6 @@ def _shaped(parameters: Tensors) -> Tensors:
     """y, mu, lam, mass; numbers for all tets or vertices as tensors of one entry."""
     y, *scalars = parameters
     return (y, *(s[None] if s.dim() == 0 else s for s in scalars))
-
-
-def _outer(a: Tensor, b: Tensor) -> Tensor:
-    return a[..., :, None] * b[..., None, :]
 
 
 def _solve(matrix: Tensor, rhs: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ four times as short with four times as many sweeps.
 
 import math
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -85,7 +85,12 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
                   before=fall.anneal, criterion="uncovered", capturable=True)
         ],
         estimates=fall.estimates,
-        protocol=protocol(fall, radius),
+        protocol={"radius": radius, "target_radius": TARGET_RADIUS, "vertices": fall.model.num_vertices,
+                  "tets": fall.model.num_tets, "rings": version.rings, "steps": version.steps, "time_step": TIME_STEP,
+                  "sweeps": version.sweeps, "density": DENSITY, "mu": MU, "lam": LAM, "kappa": KAPPA, "dhat": DHAT,
+                  "damping": DAMPING, "reach": REACH, "detections": 1, "heights": fall.centers[:, 1].tolist(),
+                  "sharpness": SHARPNESS, "clip": CLIP, "offset": OFFSET, "noise": NOISE,
+                  "samples": (SAMPLES, FINE_SAMPLES)},
         findings=None if settings.quick else fall.findings,
         picture=fall.picture,
         animation=fall.animation,
@@ -166,15 +171,6 @@ def model_of(disk: dv.TetMesh, centers: np.ndarray) -> dv.Model:
         dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
     )
     return dv.Model(dv.mesh.join([disk.translate(c) for c in centers]), density=DENSITY, energies=energies)
-
-
-def protocol(fall: Fall, radius: float) -> dict[str, Any]:
-    return {"radius": radius, "target_radius": TARGET_RADIUS, "vertices": fall.model.num_vertices,
-            "tets": fall.model.num_tets, "rings": fall.version.rings, "steps": fall.version.steps,
-            "time_step": TIME_STEP, "sweeps": fall.version.sweeps, "density": DENSITY, "mu": MU, "lam": LAM,
-            "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING, "reach": REACH, "detections": 1,
-            "heights": fall.centers[:, 1].tolist(), "sharpness": SHARPNESS, "clip": CLIP, "offset": OFFSET,
-            "noise": NOISE, "samples": (SAMPLES, FINE_SAMPLES)}  # fmt: skip
 
 
 def outline(disk: dv.TetMesh) -> np.ndarray:

@@ -89,7 +89,11 @@ def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], 
 
     return Problem(name=name, parameters={"log_mu": drape.log_mu, "log_lam": drape.log_lam}, stages=stages,
                    estimates=drape.estimates, truth=TRUTH, units={"mu": "Pa", "lam": "Pa"},
-                   protocol=protocol(drape.model, version, len(stages)),
+                   protocol={"vertices": drape.model.num_vertices, "tets": drape.model.num_tets, "thickness": THICKNESS,
+                             "steps": version.steps, "early": version.early, "settled": version.settled,
+                             "time_step": TIME_STEP, "sweeps": SWEEPS, "density": DENSITY,
+                             "mannequin": [FOOT, HEAD, RADIUS], "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING,
+                             "reach": REACH, "detections": 1, "start": START, "stages": len(stages)},
                    findings=None if alone or settings.quick else findings,
                    **pictures(drape.mesh.surface, drape.motions, TIME_STEP, [0, version.early, version.steps], TRUTH,
                               scenery=scenery()))  # fmt: skip
@@ -102,20 +106,25 @@ class Drape:
         self.observe, self.version = observe, version
         self.mesh = dv.mesh.dress(version.segments, version.rings, THICKNESS, NECK, HEM)
         neck = ring_of_vertices(self.mesh, version.segments, version.rings) == 0
-        self.model = model_of(self.mesh, neck).to(settings.device)
+        energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
+                    dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH)
+                    )  # fmt: skip
+        mannequin = dv.colliders.Capsule(FOOT, HEAD, RADIUS)
+        model = dv.Model(self.mesh, density=DENSITY, pinned=neck, energies=energies, colliders=[mannequin])
+        self.model = model.to(settings.device)
         self.still = torch.zeros_like(self.model.rest_points)
         self.start, truth = (self.still.new_tensor(values) for values in (START, list(TRUTH.values())))
         with torch.no_grad():
-            self.target = self.fall(truth[0], truth[1])
+            self.target = self.fall(*truth)
             self.target_early, self.target_settled = self.first_frames(self.target), self.settled_drape(self.target)
         self.log_mu, self.log_lam = (value.log().requires_grad_() for value in self.start)
 
     @few_sweeps()
     def fall(self, mu: Tensor, lam: Tensor, steps: int | None = None) -> Tensor:
         """Positions [m] of all frames, shape [steps + 1, V, 3]."""
-        steps = self.version.steps if steps is None else steps
         solver = dv.VBD(TIME_STEP, SWEEPS, start="predictor")
-        return dv.rollout(self.model, self.model.rest_points, self.still, solver, steps=steps, mu=mu, lam=lam).x
+        return dv.rollout(self.model, self.model.rest_points, self.still, solver, steps=steps or self.version.steps,
+                          mu=mu, lam=lam).x  # fmt: skip
 
     def recovered(self, steps: int | None = None) -> Tensor:
         return self.fall(self.log_mu.exp(), self.log_lam.exp(), steps)
@@ -143,26 +152,7 @@ class Drape:
 
     @torch.no_grad()
     def motions(self) -> dict[str, Tensor]:
-        return {
-            "initial": self.fall(self.start[0], self.start[1]),
-            "target": self.target,
-            "recovered": self.recovered(),
-        }
-
-
-def model_of(mesh: dv.TetMesh, neck: np.ndarray) -> dv.Model:
-    """The dress, pinned at the neck, above floor and mannequin."""
-    return dv.Model(
-        mesh,
-        density=DENSITY,
-        pinned=neck,
-        energies=(
-            dv.StableNeoHookean(),
-            dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
-            dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
-        ),
-        colliders=[dv.colliders.Capsule(FOOT, HEAD, RADIUS)],
-    )
+        return {"initial": self.fall(*self.start), "target": self.target, "recovered": self.recovered()}
 
 
 def newton(loss: Callable[[], Tensor], moved: str, name: str) -> Stage:
@@ -183,13 +173,6 @@ def scenery() -> list[viz.Scenery]:
     cuts = np.linspace(FOOT, HEAD, 13)
     mannequin = [viz.capsule(a, b, RADIUS) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
     return [viz.floor((-0.5, -0.5), (0.5, 0.5)), *mannequin]
-
-
-def protocol(model: dv.Model, version: Version, stages: int) -> dict[str, Any]:
-    return {"vertices": model.num_vertices, "tets": model.num_tets, "thickness": THICKNESS, "steps": version.steps,
-            "early": version.early, "settled": version.settled, "time_step": TIME_STEP, "sweeps": SWEEPS,
-            "density": DENSITY, "mannequin": [FOOT, HEAD, RADIUS], "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING,
-            "reach": REACH, "detections": 1, "start": START, "stages": stages}  # fmt: skip
 
 
 def dress_mu_lam(settings: Settings) -> Problem:

@@ -79,9 +79,9 @@ def problem(
         ImportError: the file holds a surface, and pytetwild is missing.
     """
     version = QUICK if settings.quick else FULL
+    if iterations is not None and iterations < 1:
+        raise ValueError(f"iterations: expected at least 1, got {iterations}")
     if iterations is not None:
-        if iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {iterations}")
         version = version._replace(counts=(version.counts[0], *(iterations for _ in version.counts[1:])))
     if edge_length is not None and (mesh is None or mesh.suffix.lower() not in SURFACES):
         raise ValueError(f"edge_length: expected it with a mesh that is a surface ({', '.join(SURFACES)}), got {mesh}")
@@ -92,7 +92,10 @@ def problem(
         name="fit-real-mesh",
         parameters={"level": fit.level, "exponents": fit.exponents},
         state={"lowered": fit.lowered},
-        stages=[stage_of(fit, k, count) for k, count in enumerate(version.counts)],
+        # L-BFGS on one number for all tets (stage 0), or on one for each
+        stages=[Stage(loss=fit.loss, iterations=count, optimizer=lambda p: lbfgs(p, history=30),
+                      moves=("exponents",) if k else ("level",), before=partial(fit.lower, k), capturable=True,
+                      name=f"field, weight {k}" if k else "uniform") for k, count in enumerate(version.counts)],
         estimates=fit.estimates,
         truth={"mu_soft": SOFT, "mu_stiff": STIFF},
         units={"mu_soft": "Pa", "mu_stiff": "Pa"},
@@ -202,17 +205,9 @@ class Fit:
         viz.animation(path, self.body.surface, motions, TIME_STEP)
 
 
-def stage_of(fit: Fit, number: int, iterations: int) -> Stage:
-    """L-BFGS on one number for all tets (stage 0), or on one for each."""
-    return Stage(loss=fit.loss, iterations=iterations, optimizer=lambda p: lbfgs(p, history=30),
-                 moves=("exponents",) if number else ("level",), before=partial(fit.lower, number), capturable=True,
-                 name=f"field, weight {number}" if number else "uniform")  # fmt: skip
-
-
 def read(path: Path, edge_length: float | None = None) -> dv.TetMesh:
     """Tets of a file, or those that fill the surface in it; edge_length as in `dv.mesh.tetrahedralize`."""
-    surface = path.suffix.lower() in SURFACES
-    if not surface:
+    if path.suffix.lower() not in SURFACES:
         return dv.mesh.load(path)
     with warnings.catch_warnings():  # the unit of the file does not matter: the body is scaled
         warnings.filterwarnings("ignore", message="surface: its largest extent")

@@ -30,6 +30,7 @@ from torch import Tensor, nn
 import diffvbd as dv
 from diffvbd import viz
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
+from diffvbd.viz.scenery import optional
 
 SIZE = (0.08, 0.4, 0.08)  # [m]
 DENSITY = 1000.0  # [kg/m^3]
@@ -251,14 +252,10 @@ def cma_es(
     Raises:
         ImportError: the package cma is not installed.
     """
-    try:
-        import cma
-    except ImportError:
-        raise ImportError("no comparison with CMA-ES: it needs cma: pip install 'diffvbd[tasks]'") from None
+    cma = optional("cma", "no comparison with CMA-ES: it needs", "tasks")
     begun = time.perf_counter()
-    search = cma.CMAEvolutionStrategy(
-        start.tolist(), SPREAD, {"seed": seed % (2**32 - 1) + 1, "verbose": -9}
-    )  # 0 is the clock
+    options = {"seed": seed % (2**32 - 1) + 1, "verbose": -9}  # seed 0 is the clock
+    search = cma.CMAEvolutionStrategy(start.tolist(), SPREAD, options)
     course: list[tuple[float, float]] = []
     count = 0
     while not course or course[-1][0] < seconds:

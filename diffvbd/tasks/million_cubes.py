@@ -27,7 +27,7 @@ getting worse.
 import math
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -107,7 +107,13 @@ def problem(
         ],
         estimates=lambda: {"mean_error": cubes.error.mean().item()},
         units={"mean_error": "m"},
-        protocol=protocol(cubes.cube, version),
+        protocol={"bodies": version.bodies, "vertices": version.bodies * cubes.cube.num_vertices,
+                  "tets": version.bodies * cubes.cube.num_tets, "steps": version.steps,
+                  "target_step": version.target_step, "iterations": version.counts, "edge": EDGE, "squeeze": SQUEEZE,
+                  "density": DENSITY, "mu": MU, "lam": LAM, "time_step": TIME_STEP, "sweeps": SWEEPS,
+                  "checkpoint_every": CHECKPOINT_EVERY, "radius": RADIUS, "stiffness": STIFFNESS, "huber": HUBER,
+                  "clip": CLIP, "spacing": (PAD_SPACING, RING_SPACING), "height": HEIGHT,
+                  "dtype": str(version.dtype)},
         findings=cubes.findings,
         picture=cubes.picture,
         animation=cubes.animation,
@@ -125,11 +131,9 @@ def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int |
     steps = version.steps if steps is None else steps
     if steps < version.target_step:
         raise ValueError(f"steps: expected at least {version.target_step}, which are 0.6 s, got {steps}")
-    counts = version.counts
-    if iterations is not None:
-        if iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {iterations}")
-        counts = (iterations, iterations)
+    if iterations is not None and iterations < 1:
+        raise ValueError(f"iterations: expected at least 1, got {iterations}")
+    counts = version.counts if iterations is None else (iterations, iterations)
     return version._replace(bodies=bodies, steps=steps, counts=counts)
 
 
@@ -260,15 +264,13 @@ class Cubes:
         return found
 
     @torch.no_grad()
-    def frames(self, every: int) -> Tensor:
-        return self.simulate(save=every)
-
     def picture(self, path: Path, history: list[Row]) -> None:
         every, count = self.version.target_step // 4, 6 if self.version.steps > self.version.target_step else 5
-        viz.cloud(path, self.frames(every)[:count], every * TIME_STEP, history, "mean_error")
+        viz.cloud(path, self.simulate(save=every)[:count], every * TIME_STEP, history, "mean_error")
 
+    @torch.no_grad()
     def animation(self, path: Path) -> None:
-        viz.cloud_animation(path, self.frames(every=4), 4 * TIME_STEP)
+        viz.cloud_animation(path, self.simulate(save=4), 4 * TIME_STEP)
 
 
 def is_near(points: Tensor, others: Tensor) -> Tensor:
@@ -280,15 +282,6 @@ def is_near(points: Tensor, others: Tensor) -> Tensor:
     apart = (others - others.clamp(low, high)).abs().amax(1)  # from the box around the points
     far = (apart > 1.01 * RADIUS) & others.isfinite().all()  # by more than what rounding can move
     return ~far
-
-
-def protocol(cube: dv.TetMesh, version: Version) -> dict[str, Any]:
-    return {"bodies": version.bodies, "vertices": version.bodies * cube.num_vertices,
-            "tets": version.bodies * cube.num_tets, "steps": version.steps, "target_step": version.target_step,
-            "iterations": version.counts, "edge": EDGE, "squeeze": SQUEEZE, "density": DENSITY, "mu": MU, "lam": LAM,
-            "time_step": TIME_STEP, "sweeps": SWEEPS, "checkpoint_every": CHECKPOINT_EVERY, "radius": RADIUS,
-            "stiffness": STIFFNESS, "huber": HUBER, "clip": CLIP, "spacing": (PAD_SPACING, RING_SPACING),
-            "height": HEIGHT, "dtype": str(version.dtype)}  # fmt: skip
 
 
 def launch_pad(bodies: int) -> np.ndarray:

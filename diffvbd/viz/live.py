@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 
 from .._common.checks import check_bool, check_count, fail
+from ..inspect.gradcheck import check_names
 from ..model.model import Model
 from .motion import Mesh, mesh_of, motions_of, opened, scenery_of
 from .scenery import Scenery
@@ -74,7 +74,10 @@ def live(
         course = opened(Path(source), time_step)
         motions, mesh = course.motions, course.mesh if mesh is None else mesh
     elif callable(source) and not isinstance(source, (Model, torch.Tensor)):
-        simulate = _simulation(source, ranges)
+        if not ranges:
+            fail("sliders", "ranges of the function's parameters by name", "none")
+        check_names("source", source, ranges)
+        simulate = torch.no_grad()(source)
         motions = motions_of(simulate(**{name: first for name, (_, _, first) in ranges.items()}), mesh, time_step)
     else:
         mesh = source if mesh is None and isinstance(source, Model) else mesh
@@ -119,24 +122,6 @@ def _ranges(sliders: Mapping[str, Sequence[float]]) -> dict[str, Slider]:
             fail(f"sliders[{name!r}]", "(lowest, highest) or (lowest, highest, first), ascending", repr(given))
         found[name] = (low, high, first)
     return found
-
-
-def _simulation(function: Callable[..., Any], ranges: Mapping[str, Slider]) -> Callable[..., Any]:
-    """A user's function without gradients; raises for one that does not take the sliders' names."""
-    if not ranges:
-        fail("sliders", "ranges of the function's parameters by name", "none")
-    try:
-        inspect.signature(function).bind(**dict.fromkeys(ranges))
-    except TypeError as error:
-        raise TypeError(f"source: expected a function of {', '.join(ranges)}: {error}") from None
-    except ValueError:
-        pass  # a builtin without a signature
-
-    def simulate(**values: float) -> Any:
-        with torch.no_grad():
-            return function(**values)
-
-    return simulate
 
 
 def _with_material(simulate: Callable[..., Any], values: Values) -> Callable[..., Any]:

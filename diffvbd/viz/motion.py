@@ -150,6 +150,12 @@ def save_motions(
         arrays[f"scenery_points_{k}"] = as_array(thing.points).astype(np.float32)
         arrays[f"scenery_triangles_{k}"] = np.asarray(thing.triangles, np.int32)
 
+    save_arrays(path, arrays)
+
+
+def save_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
+    """Write an .npz file, which is whole or not there."""
+
     def write(new: Path) -> None:
         with new.open("wb") as file:  # numpy adds .npz to other names
             np.savez_compressed(file, **arrays)

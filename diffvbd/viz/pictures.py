@@ -14,7 +14,7 @@ from diffvbd.mesh.tet_mesh import boundary_faces
 
 from .._common.checks import check_positive
 from .motion import save_motions
-from .scenery import Scenery, as_array, check_surface, floor, motions_as_arrays
+from .scenery import Scenery, as_array, check_surface, floor, motions_as_arrays, optional
 
 COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
 OTHER = "#8c8c8c"
@@ -533,12 +533,8 @@ def grid(
 
 def new_figure(width: float, height: float, dots: int = 130) -> Any:
     """A figure [inches]; an ImportError that says what is missing."""
-    try:
-        # Not pyplot: it would choose a window system, and pictures are only written to files.
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ImportError("pictures need matplotlib: pip install 'diffvbd[viz]'") from None
-    return Figure(figsize=(width, height), dpi=dots)
+    # Not pyplot: it would choose a window system, and pictures are only written to files.
+    return optional("matplotlib.figure", "pictures need").Figure(figsize=(width, height), dpi=dots)
 
 
 def save_motion(

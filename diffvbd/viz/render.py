@@ -13,7 +13,7 @@ from .._common.checks import check_positive, fail
 from ..mesh.write import replace
 from ..model.model import Model
 from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of
-from .scenery import Scenery, as_array
+from .scenery import Scenery, as_array, optional
 from .values import rgb, values_of
 
 ANIMATED = (".webp", ".gif")
@@ -67,7 +67,7 @@ def render(
         ImportError: pyvista is not installed.
         ValueError, TypeError: as :func:`live`, or another suffix.
     """
-    path, pyvista = Path(path), _pyvista()
+    path, pyvista = Path(path), optional("pyvista", "rendering needs")
     if path.suffix.lower() not in ANIMATED + STILL:
         fail("path", f"a name that ends in {', '.join(ANIMATED + STILL)}", repr(path.name))
     offset = as_array(apart)
@@ -123,14 +123,6 @@ def render(
         _save(path, [picture(k) for k in shown], lasts, quality)
     finally:
         stage.plotter.close()
-
-
-def _pyvista() -> Any:
-    try:
-        import pyvista
-    except ImportError:
-        raise ImportError("rendering needs pyvista: pip install 'diffvbd[viz]'") from None
-    return pyvista
 
 
 def _shift(motions: Sequence[Motion]) -> list[int]:

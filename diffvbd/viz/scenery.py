@@ -1,5 +1,6 @@
 """Scenery around bodies, and arrays of positions: what every kind of picture shares."""
 
+import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -60,6 +61,15 @@ def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = 
     p, q = i * around + j, i * around + (j + 1) % around
     triangles = np.concatenate([np.stack([p, q, q + around], 1), np.stack([p, q + around, p + around], 1)])
     return Scenery(points, triangles, color)
+
+
+def optional(module: str, what: str, extra: str = "viz") -> Any:
+    """A module of another package; an ImportError says what needs it, and which extra brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise ImportError(f"{what} {package}: pip install 'diffvbd[{extra}]'") from None
 
 
 def as_array(values: Any) -> NDArray[np.float64]:

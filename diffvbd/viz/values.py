@@ -111,7 +111,8 @@ class Values:
 
     def values(self, name: str, motion: Motion) -> NDArray[np.float64]:
         """A quantity of each triangle, shape [N, F], or [F] where it is constant."""
-        return getattr(self, f"_{name}")(motion)
+        compute = {"speed": self._speed, "stress": self._stress, "stiffness": self._stiffness, "contact": self._contact}
+        return compute[name](motion)
 
     def _speed(self, motion: Motion) -> NDArray[np.float64]:
         velocities = motion.velocities

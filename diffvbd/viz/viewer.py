@@ -77,7 +77,7 @@ class Clock:
 
 
 class Rerun:
-    """Runs a function in a thread of its own once its arguments have stood still for a while.
+    """Runs a function in another thread once its arguments have stood still for a while.
 
     Args:
         function: Called with the latest arguments; never twice at a time.
@@ -95,40 +95,32 @@ class Rerun:
     ) -> None:
         self.function, self.done, self.failed, self.delay = function, done, failed, delay
         self.runs = 0
-        self._asked: tuple[float, dict[str, Any]] | None = None
-        self._stopped = False
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._work, name="diffvbd-rerun", daemon=True)
-        self._thread.start()
+        self._latest: threading.Timer | None = None
+        self._changing, self._running = threading.Lock(), threading.RLock()
 
     def request(self, **arguments: Any) -> None:
         """Asks for a run with these arguments, in place of what was asked for before and has not begun."""
-        with self._changed:
-            self._asked = (time.monotonic() + self.delay, arguments)
-            self._changed.notify()
+        timer = threading.Timer(self.delay, self._run, (arguments,))
+        timer.daemon = True
+        self._replace(timer)
+        timer.start()
 
     def stop(self, wait: float = 2.0) -> None:
-        """Ends the thread, after a run that is under way."""
-        with self._changed:
-            self._stopped = True
-            self._changed.notify()
-        if self._thread is not threading.current_thread():
-            self._thread.join(wait)
+        """No more runs; returns after one that is under way."""
+        self._replace(None)
+        if self._running.acquire(timeout=wait):
+            self._running.release()
 
-    def _next(self) -> dict[str, Any] | None:
-        with self._changed:
-            while not self._stopped:
-                if self._asked is None:
-                    self._changed.wait()
-                elif (left := self._asked[0] - time.monotonic()) > 0:
-                    self._changed.wait(left)
-                else:
-                    arguments, self._asked = self._asked[1], None
-                    return arguments
-        return None
+    def _replace(self, timer: threading.Timer | None) -> None:
+        with self._changing:
+            if self._latest is not None:
+                self._latest.cancel()
+            self._latest = timer
 
-    def _work(self) -> None:
-        while (arguments := self._next()) is not None:
+    def _run(self, arguments: dict[str, Any]) -> None:
+        with self._running:
+            if self._latest is not threading.current_thread():  # asked for again meanwhile
+                return
             try:
                 self.runs += 1
                 self.done(self.function(**arguments))
