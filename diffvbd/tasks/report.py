@@ -18,6 +18,7 @@ import diffvbd as dv
 from diffvbd import losses, viz
 from diffvbd.results import Refinement
 from diffvbd.tasks.problem import Problem, Result, Row, Settings, Stage, estimates_of
+from diffvbd.viz.pictures import VIEW
 
 LOG = logging.getLogger("diffvbd")
 
@@ -103,9 +104,8 @@ def fitted(
     target_name: str = "",
     findings: Callable[[Tensor], dict[str, Any]] | None = None,
     truth: Row | None = None,
-    protocol: dict[str, Any] | None = None,
-    units: dict[str, str] | None = None,
-    **options: Any,
+    view: tuple[float, float] = VIEW,
+    **fields: Any,
 ) -> Problem:
     """Problem of one stage of Adam: the values whose motion looks like that of the true ones.
 
@@ -121,7 +121,7 @@ def fitted(
         weight: Of the loss.
         target_name: Entry of the protocol for what is seen of the true motion, where that is one number.
         findings: As in Problem, from the present values.
-        options: Those of `pictures`.
+        fields: Protocol and units of the Problem.
     """
     is_log = unknown.startswith("log_")
     parameter = (start.log() if is_log else start.clone()).requires_grad_()
@@ -132,6 +132,8 @@ def fitted(
     with torch.no_grad():
         target_motion = simulate(true)
         target = observe(target_motion)
+    if target_name:
+        fields["protocol"][target_name] = target.item()
 
     @torch.no_grad()
     def motions() -> dict[str, Tensor]:
@@ -146,10 +148,9 @@ def fitted(
         stages=[Stage(loss=loss, capturable=True, **stage)],
         estimates=lambda: estimates(now()),
         truth=truth or {},
-        units=units or {},
-        protocol=(protocol or {}) | ({target_name: target.item()} if target_name else {}),
         findings=None if findings is None else lambda history: findings(now()),
-        **pictures(*drawn[:1], motions, *drawn[1:], truth, **options),
+        **fields,
+        **pictures(*drawn[:1], motions, *drawn[1:], truth, view=view),
     )
 
 

@@ -40,16 +40,9 @@ def animation(
 
     Args:
         path: The .gif or .npz to write.
-        surface: Boundary triangles, shape [F, 3], as `TetMesh.surface`.
-        motions: Positions [m] of each motion by name, shape [N, V, 3], array or tensor; y points up.
+        surface, motions, scenery, view: As in :func:`comparison`, which also says what raises.
         time_step: Between frames [s].
-        scenery: What else stands in every picture, for example `floor(...)`.
-        view: Elevation and azimuth of the eye [degrees].
         color: Of the body, as in `draw`; default: one for each motion.
-
-    Raises:
-        ImportError: matplotlib is not installed, for a .gif.
-        ValueError: motions or triangles of another shape.
     """
     path, time_step = to_path("path", path), check_positive("time_step", time_step, "s")
     if path.suffix == ".npz":
