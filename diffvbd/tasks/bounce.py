@@ -33,28 +33,17 @@ VOXEL = 0.05  # side of the target in pictures [m]; the distance is that to its 
 
 @dataclass(frozen=True)
 class Bounce:
-    """A soft body that is released above the floor y = 0, and where it shall go.
+    """A soft body that is released above the floor y = 0, and where it shall go."""
 
-    Attributes:
-        mesh: The body where it is released, at rest.
-        target: Where the center of mass shall pass after the first contact [m].
-        density: [kg/m^3].
-        mu, lam: Lame parameters [Pa].
-        time_step: [s].
-        steps, sweeps: Number of steps, and of sweeps in each.
-        kappa, dhat: Stiffness [N/m] and range [m] of the floor's barrier; a vertex below dhat is in contact.
-        device: A torch device.
-    """
-
-    mesh: dv.TetMesh
-    target: tuple[float, float, float]
-    density: float
-    mu: float
+    mesh: dv.TetMesh  # where it is released, at rest
+    target: tuple[float, float, float]  # where the center of mass shall pass after the first contact [m]
+    density: float  # [kg/m^3]
+    mu: float  # [Pa]
     lam: float
-    time_step: float
+    time_step: float  # [s]
     steps: int
-    sweeps: int
-    kappa: float = 400.0
+    sweeps: int  # of a step
+    kappa: float = 400.0  # stiffness [N/m] and range [m] of the floor's barrier; a vertex below dhat is in contact
     dhat: float = 0.05
     device: str = "cpu"
 
@@ -72,12 +61,8 @@ class Bounce:
         return torch.tensor(values, dtype=self.model.dtype, device=self.model.device)
 
     def motion(self, offset: Tensor, velocity: Tensor) -> Tensor:
-        """Positions [m] of all frames, shape [steps + 1, ..., V, 3].
-
-        Args:
-            offset: Of the release [m], shape [..., 3]; leading dimensions are scenes.
-            velocity: Of all vertices at the release [m/s], shape [..., 3].
-        """
+        """Positions [m] of all frames, shape [steps + 1, ..., V, 3], from the offset of the release [m] and the
+        velocity of all vertices [m/s], shape [..., 3]; leading dimensions are scenes."""
         x = self.model.rest_points + offset.unsqueeze(-2)
         v = velocity.unsqueeze(-2).expand_as(x)
         solver = dv.VBD(self.time_step, self.sweeps)
@@ -201,11 +186,7 @@ def scene(settings: Settings, sweeps: int = SWEEPS) -> Bounce:
 
 
 def cube_bounce(settings: Settings, sweeps: int = SWEEPS) -> Problem:
-    """The task cube-bounce; with another number of sweeps per step on request.
-
-    Raises:
-        ValueError: no sweeps.
-    """
+    """The task cube-bounce; with another number of sweeps per step, at least 1, on request."""
     if sweeps < 1:
         raise ValueError(f"sweeps: expected at least 1, got {sweeps}")
     return problem("cube-bounce", scene(settings, sweeps), VELOCITY, moves=("offset", "velocity"),

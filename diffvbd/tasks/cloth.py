@@ -231,13 +231,8 @@ def reference_wind() -> Tensor:
 
 
 def singular_values(simulate: Callable[[Tensor], Tensor], wind: Tensor, step: float = 1e-4) -> Tensor:
-    """Of the derivative of the motion by the wind [m per m/s^2], so that their squares are those of the loss.
-
-    Args:
-        simulate: Motions [frames, B, V, 3] of winds [8, B, 3].
-        wind: [m/s^2], shape [8, 3].
-        step: Of central differences [m/s^2].
-    """
+    """Of the derivative of the motion by the wind [8, 3] [m per m/s^2], so that their squares are those of the loss; by
+    central differences of a step [m/s^2]. `simulate` gives motions [frames, B, V, 3] of winds [8, B, 3]."""
     # all the 48 perturbed flags are scenes of one batch
     offsets = step * torch.eye(wind.numel(), dtype=wind.dtype, device=wind.device).unflatten(1, wind.shape)
     scenes = torch.cat([wind + offsets, wind - offsets]).transpose(0, 1)

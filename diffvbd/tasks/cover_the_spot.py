@@ -64,11 +64,7 @@ FULL, QUICK = Version(3, HEIGHT, 160, SWEEPS, 600), Version(2, 0.5, 75, 4, 30)
 
 
 def problem(settings: Settings, radius: float = RADIUS) -> Problem:
-    """The task; disks of another radius [m] on request.
-
-    Raises:
-        ValueError: radius is at most R sqrt(3)/2.
-    """
+    """The task; disks of another radius [m] on request. ValueError for at most R sqrt(3)/2."""
     least = 0.5 * math.sqrt(3) * TARGET_RADIUS
     if not radius > least:
         raise ValueError(
@@ -194,13 +190,8 @@ def sunflower(count: int, radius: float) -> Tensor:
 
 
 def smooth_uncovered(rims: Tensor, points: Tensor, sharpness: Tensor) -> Tensor:
-    """Mean over points of the product over disks of sigmoid(-sharpness distance), distance to the outline from inside.
-
-    Args:
-        rims: Outlines [m], shape [disks, n, 3], convex, in the order of `outline` or against it.
-        points: (x, z) [m], shape [N, 2].
-        sharpness: Scalar [1/m].
-    """
+    """Mean over points (x, z) [N, 2] [m] of the product over disks of sigmoid(-sharpness distance), distance to the
+    outline from inside; rims [disks, n, 3] [m] are convex, in the order of `outline` or against it."""
     start = rims[..., ::2]
     edge = start.roll(-1, 1) - start
     # a disk that has landed upside down is gone round the other way

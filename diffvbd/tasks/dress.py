@@ -187,12 +187,7 @@ def dress_silhouette(settings: Settings) -> Problem:
 
 
 def profile(x: Tensor, heights: Tensor) -> Tensor:
-    """Radius of the outline around the y axis [m] at each height, shape [..., H].
-
-    Args:
-        x: Positions [m], shape [..., V, 3].
-        heights: [m], shape [H].
-    """
+    """Radius [m] of the outline of positions x [..., V, 3] [m] around the y axis at each height [H] [m], [..., H]."""
     radius = x[..., ::2].norm(dim=-1)[..., None, :]
     below = (x[..., None, :, 1] - heights[:, None]) / WINDOW
     return ((radius / SOFTNESS - 0.5 * below.square()).softmax(-1) * radius).sum(-1)

@@ -35,41 +35,23 @@ INTEGRATORS = {"implicit-euler": dv.ImplicitEuler, "sdirk2": dv.SDIRK2, "bdf2": 
 
 @dataclass(frozen=True)
 class Scene:
-    """A mesh and everything else that a simulation needs, except the material.
-
-    Attributes:
-        mesh: The body.
-        x0: Initial positions [m], shape [V, 3].
-        v0: Initial velocities [m/s], shape [V, 3].
-        pinned: Vertices that are held, bool, shape [V].
-        time_step: [s].
-        sweeps: Sweeps per step.
-        density: [kg/m^3].
-        gravity: [m/s^2], shape [3].
-        floor: Height of a floor with normal +y [m]; None: no floor.
-        kappa: Stiffness of the floor's barrier.
-        dhat: Distance at which the barrier begins [m].
-        friction: Coefficient of the floor's friction; None: none.
-        relaxation: Multiplies every update, as in `diffvbd.VBD`.
-        integrator: One of INTEGRATORS.
-        subspace: One of SUBSPACES: which corrections go between the sweeps.
-    """
+    """A mesh and everything else that a simulation needs, except the material."""
 
     mesh: dv.TetMesh
-    x0: Array
-    v0: Array
-    pinned: NDArray[np.bool_]
-    time_step: float = 1 / 60
-    sweeps: int = 20
-    density: float = 1000.0
-    gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)
-    floor: float | None = None
-    kappa: float = 400.0
-    dhat: float = 0.02
-    friction: float | None = None
-    relaxation: float = 1.0
-    integrator: str = "implicit-euler"
-    subspace: str = "rigid"
+    x0: Array  # initial positions [m] [V, 3]
+    v0: Array  # initial velocities [m/s] [V, 3]
+    pinned: NDArray[np.bool_]  # [V]
+    time_step: float = 1 / 60  # [s]
+    sweeps: int = 20  # of a step
+    density: float = 1000.0  # [kg/m^3]
+    gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)  # [m/s^2]
+    floor: float | None = None  # height of a floor with normal +y [m]
+    kappa: float = 400.0  # stiffness of the floor's barrier
+    dhat: float = 0.02  # distance at which the barrier begins [m]
+    friction: float | None = None  # coefficient of friction on the floor
+    relaxation: float = 1.0  # multiplies every update, as in `diffvbd.VBD`
+    integrator: str = "implicit-euler"  # one of INTEGRATORS
+    subspace: str = "rigid"  # one of SUBSPACES: corrections between the sweeps
 
     def model(self, device: str = "cpu") -> dv.Model:
         energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
@@ -110,19 +92,12 @@ FIELDS = tuple(DEFAULTS)  # of a Scene that options and files may give
 
 @dataclass(frozen=True)
 class Observation:
-    """Observed shapes.
-
-    Attributes:
-        scene: The scene they were observed in.
-        x: Positions [m], shape [N, V, 3].
-        steps: Number of steps after which each was observed, shape [N], increasing.
-        truth: {"mu": [Pa], "lam": [Pa]} where known, else empty.
-    """
+    """Observed shapes, and the scene that they were observed in."""
 
     scene: Scene
-    x: Array
-    steps: NDArray[np.int64]
-    truth: dict[str, float]
+    x: Array  # positions [m] [N, V, 3]
+    steps: NDArray[np.int64]  # number of steps after which each was observed [N], increasing
+    truth: dict[str, float]  # {"mu": [Pa], "lam": [Pa]} where known, else empty
 
     def save(self, path: str | Path) -> None:
         """Write the .npz file that `load` reads."""

@@ -156,11 +156,7 @@ class Training:
             return found
 
     def comparison(self, history: list[Row]) -> dict[str, Any]:
-        """CMA-ES for as long as the gradient took.
-
-        Raises:
-            ImportError: the package cma is not installed.
-        """
+        """CMA-ES for as long as the gradient took; ImportError as of `cma_es`."""
         network, like, seconds = self.network, self.arm.like, history[-1]["seconds"]
 
         def losses(candidates: Tensor) -> Tensor:
@@ -240,17 +236,10 @@ def policies(network: nn.Module, vectors: Tensor) -> Policy:
 def cma_es(
     losses: Callable[[Tensor], Tensor], start: Tensor, seconds: float, seed: int
 ) -> tuple[Tensor, list[tuple[float, float]], int]:
-    """Lower a loss without its gradient for some seconds, at least one generation.
+    """Lower a loss, of rows [n, N] on the CPU, without its gradient for some seconds, at least one generation.
 
-    Args:
-        losses: Of each row of a tensor [n, N] on the CPU, shape [n].
-        start: [N].
-
-    Returns:
-        The best row, (seconds, lowest loss so far) after each generation, and how many losses that took.
-
-    Raises:
-        ImportError: the package cma is not installed.
+    Returns the best row, (seconds, lowest loss so far) after each generation, and how many losses that took. Raises
+    ImportError where the package cma is not installed.
     """
     cma = optional("cma", "no comparison with CMA-ES: it needs", "tasks")
     begun = time.perf_counter()

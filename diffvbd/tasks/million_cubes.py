@@ -83,16 +83,10 @@ QUICK = Version(QUICK_BODIES, 24, 20, 0.05, 0.6, torch.float64, (15, 10), (0.5, 
 def problem(
     settings: Settings, bodies: int | None = None, steps: int | None = None, iterations: int | None = None
 ) -> Problem:
-    """The task.
+    """The task with so many cubes, steps of a rollout and iterations of each stage; defaults BODIES, STEPS, ITERATIONS.
 
-    Args:
-        settings: As of every task.
-        bodies: Number of cubes; default BODIES, or QUICK_BODIES in the quick version, which takes no more.
-        steps: Steps of a rollout, at least 120; default STEPS. The quick version has its own.
-        iterations: Of each stage; default ITERATIONS.
-
-    Raises:
-        ValueError: no bodies or iterations, too many bodies, or a rollout that ends before t = 0.6 s.
+    The quick version takes at most QUICK_BODIES, and has its own steps. ValueError for no bodies or iterations, too
+    many bodies, or a rollout that ends before t = 0.6 s.
     """
     version = chosen(settings.quick, bodies, steps, iterations)
     cubes = Cubes(settings, version)

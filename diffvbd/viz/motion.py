@@ -31,29 +31,17 @@ Mesh = Model | TetMesh
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of a surface over time.
+    """Positions of a surface over time."""
 
-    Attributes:
-        points: Positions [m], shape [N, V, 3].
-        triangles: Boundary triangles, outward oriented, shape [F, 3].
-        times: Of each frame [s], shape [N]; None: not known.
-        body: Label of each vertex, shape [V].
-        tets: Tet that each triangle bounds, shape [F]; None for a bare surface.
-        velocities: [m/s], shape [N, V, 3]; None: those between frames.
-        steps: Step number of each frame, shape [N]; None: not known.
-        scene: Which of several scenes it is, for values [B, T].
-        scenery: What else is there; points may have shape [N, P, 3].
-    """
-
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    times: NDArray[np.float64] | None = None
-    body: NDArray[np.int64] | None = None
-    tets: NDArray[np.int64] | None = None
-    velocities: NDArray[np.float64] | None = None
-    steps: NDArray[np.int64] | None = None
-    scene: int = 0
-    scenery: tuple[Scenery, ...] = ()
+    points: NDArray[np.float64]  # [m] [N, V, 3]
+    triangles: NDArray[np.int64]  # of the boundary, outward oriented [F, 3]
+    times: NDArray[np.float64] | None = None  # of each frame [s] [N]; None: not known
+    body: NDArray[np.int64] | None = None  # label of each vertex [V]
+    tets: NDArray[np.int64] | None = None  # tet that each triangle bounds [F]; None for a bare surface
+    velocities: NDArray[np.float64] | None = None  # [m/s] [N, V, 3]; None: those between frames
+    steps: NDArray[np.int64] | None = None  # step number of each frame [N]; None: not known
+    scene: int = 0  # which of several scenes it is, for values [B, T]
+    scenery: tuple[Scenery, ...] = ()  # what else is there; points may have shape [N, P, 3]
 
     def __len__(self) -> int:
         return len(self.points)
@@ -74,11 +62,8 @@ def mesh_of(mesh: Any) -> TetMesh | None:
 
 
 def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = None) -> dict[str, Motion]:
-    """A trajectory, positions [m] of shape [V, 3], [N, V, 3] or [N, B, V, 3], or a mesh, as motions by name.
-
-    Raises:
-        TypeError, ValueError: something else, a shape that is not the mesh's, positions that are not finite.
-    """
+    """A trajectory, positions [m] of shape [V, 3], [N, V, 3] or [N, B, V, 3], or a mesh, as motions by name. TypeError
+    or ValueError for something else, a shape that is not the mesh's, positions that are not finite."""
     if isinstance(source, Motion):
         return {"motion": source}
     if isinstance(source, Mapping):
@@ -164,12 +149,7 @@ def save_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
 
 
 def load_motions(path: str | PathLike[str]) -> dict[str, Motion]:
-    """Motions by name from a file that :func:`save_motions` wrote.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: another content.
-    """
+    """Motions by name from a file that :func:`save_motions` wrote; ValueError for another content."""
     try:
         with np.load(path, allow_pickle=False) as content:
             arrays = dict(content)
@@ -213,12 +193,8 @@ class Opened(NamedTuple):
 
 
 def opened(path: Path, time_step: float | None = None) -> Opened:
-    """The motions of a .pvd, of a mesh file, of a motion.npz, or of the folder of a run.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file of another kind, or a run that has kept no motion.
-    """
+    """The motions of a .pvd, of a mesh file, of a motion.npz, or of the folder of a run. FileNotFoundError for no such
+    file; ValueError for one of another kind, or a run that has kept no motion."""
     suffix, expected = path.suffix.lower(), "expected a .pvd, a mesh with tets or the folder of a run"
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: {expected}")
@@ -267,16 +243,8 @@ REACH = 2.5  # planes are shown so far around a scene, in its radii
 def scenery_of(
     model: Model, low: NDArray[np.float64], high: NDArray[np.float64], colliders: Any = None
 ) -> tuple[Scenery, ...]:
-    """Floors and colliders around a scene between two corners [m].
-
-    Args:
-        model: The scene.
-        low, high: Its lowest and highest corner [m], shape [3].
-        colliders: Where the corner points of the colliders are in each frame [m], shape [N, Vc, 3]; None: at rest.
-
-    Raises:
-        ValueError: colliders of another shape.
-    """
+    """Floors and colliders around a scene between two corners [m]; colliders: where their corner points are in each
+    frame [m], shape [N, Vc, 3], else at rest. Raises ValueError for another shape."""
     middle, reach = 0.5 * (low + high), REACH * 0.5 * float(np.linalg.norm(high - low))
     things = []
     if model.floor is not None:

@@ -323,11 +323,7 @@ def field(
 def behind(
     points: NDArray[np.float64], tets: NDArray[np.int64], origin: Sequence[float], normal: Sequence[float]
 ) -> NDArray[np.int64]:
-    """Tets whose centroids lie on the side of a plane that its normal points away from.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """Tets whose centroids lie on the side of a plane that its normal points away from; ValueError for none."""
     height = (points[tets].mean(1) - np.asarray(origin)) @ np.asarray(normal)
     kept = np.flatnonzero(height <= 0)
     if len(kept) == 0:

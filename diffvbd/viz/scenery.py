@@ -93,11 +93,8 @@ def check_surface(surface: Any, vertices: int) -> None:
 def motions_as_arrays(
     motions: Mapping[str, Any], surface: Any, times: int | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Positions of each motion, shape [N, V, 3].
-
-    Raises:
-        ValueError: another shape, another N than there are times, or a surface of other vertices.
-    """
+    """Positions of each motion, shape [N, V, 3]; ValueError for another shape, another N than there are times, or a
+    surface of other vertices."""
     if not isinstance(motions, Mapping):
         raise TypeError(f"motions: expected positions by name, got {type(motions).__name__}")
     frames = {name: as_array(motion) for name, motion in motions.items()}

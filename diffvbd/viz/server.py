@@ -22,9 +22,8 @@ _REPLACING = threading.Lock()
 def open_server(host: str, port: int) -> Any:
     """A viser server on the first free port from `port` on, which refuses what other sites' pages ask for.
 
-    Raises:
-        ValueError: an address that this machine does not have; no free port.
-        ImportError: viser is missing, or does not let its requests be checked.
+    ValueError for an address that this machine does not have, or no free port; ImportError where viser is missing, or
+    does not let its requests be checked.
     """
     viser = optional("viser", "the viewer needs")
     port = _free_port(host, port)

@@ -45,18 +45,12 @@ def palette() -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Colors:
-    """Colors of the triangles of a motion.
+    """Colors of the triangles of a motion."""
 
-    Attributes:
-        palette: Colors, shape [K, 3].
-        levels: Row of the palette of each triangle, shape [F], or [N, F] where it changes.
-        low, high, unit, title: Of the legend; a unit of "" is a color that means no number.
-    """
-
-    palette: NDArray[np.uint8]
-    levels: NDArray[np.int64]
-    title: str
-    unit: str = ""
+    palette: NDArray[np.uint8]  # [K, 3]
+    levels: NDArray[np.int64]  # row of the palette of each triangle [F], or [N, F] where it changes
+    title: str  # of the legend, as are the others
+    unit: str = ""  # "" is a color that means no number
     low: float = 0.0
     high: float = 0.0
 
@@ -67,26 +61,16 @@ class Colors:
 
 @dataclass
 class Values:
-    """The quantities of motions, computed when they are asked for.
+    """The quantities of motions, computed when they are asked for."""
 
-    Attributes:
-        model: Scene of the motions; None: there is no stress and no contact.
-        mu, lam: Material [Pa], a number or [T] or [B, T]; None: there is no stress and no stiffness.
-        colliders: Where the corner points of the colliders are in each frame [m], shape [N, Vc, 3]; None: at rest.
-    """
-
-    model: Model | None = None
-    mu: Any = None
+    model: Model | None = None  # scene of the motions; None: there is no stress and no contact
+    mu: Any = None  # [Pa], a number or [T] or [B, T]; None: there is no stress and no stiffness
     lam: Any = None
-    colliders: Any = None
+    colliders: Any = None  # where their corner points are in each frame [m] [N, Vc, 3]; None: at rest
     _kept: dict[tuple[int, str], tuple[Motion, Colors]] = field(default_factory=dict, repr=False)
 
     def colors(self, name: str, motion: Motion) -> Colors:
-        """Colors of a motion.
-
-        Raises:
-            ValueError: an unknown name, or a quantity that these arguments do not tell.
-        """
+        """Colors of a motion; ValueError for an unknown name, or a quantity that these arguments do not tell."""
         if not is_word(name, *QUANTITIES):
             fail("color", f"one of {', '.join(QUANTITIES)}", repr(name))
         kept = self._kept.get((id(motion), name))

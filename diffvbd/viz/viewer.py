@@ -77,21 +77,14 @@ class Clock:
 
 
 class Rerun:
-    """Runs a function in another thread once its arguments have stood still for a while.
-
-    Args:
-        function: Called with the latest arguments; never twice at a time.
-        done: Called with its result.
-        failed: Called with the exception that it raised.
-        delay: [s] without another request before it runs.
-    """
+    """Runs a function in another thread once its arguments have stood still for a while."""
 
     def __init__(
         self,
-        function: Callable[..., Any],
-        done: Callable[[Any], object],
-        failed: Callable[[Exception], object],
-        delay: float = DELAY,
+        function: Callable[..., Any],  # gets the latest arguments; never called twice at a time
+        done: Callable[[Any], object],  # gets its result
+        failed: Callable[[Exception], object],  # gets the exception that it raised
+        delay: float = DELAY,  # [s] without another request before it runs
     ) -> None:
         self.function, self.done, self.failed, self.delay = function, done, failed, delay
         self.runs = 0
@@ -238,24 +231,16 @@ Slider = tuple[float, float, float]  # lowest, highest, first value
 
 
 class Panel:
-    """Controls of a viser server. What the user does is told to functions; what is shown is set by methods.
-
-    Args:
-        server: The viser server.
-        names: Of the motions.
-        tell: Called as tell(what, value) with "play", "frame", "loop", "speed", "color", "motion" or "camera".
-        sliders: Lowest, highest and first value of each parameter.
-        moved: Called with all parameters once a slider has moved.
-    """
+    """Controls of a viser server. What the user does is told to functions; what is shown is set by methods."""
 
     def __init__(
         self,
         server: Any,
-        names: Sequence[str],
+        names: Sequence[str],  # of the motions
         color: str,
-        tell: Callable[[str, Any], None],
+        tell: Callable[[str, Any], None],  # what ("play", "frame", "loop", "speed", "color", "motion", "camera"), value
         sliders: Mapping[str, Slider],
-        moved: Callable[[dict[str, float]], None],
+        moved: Callable[[dict[str, float]], None],  # gets all parameters once a slider has moved
     ) -> None:
         self.gui = server.gui
         self.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 111, 159))
