@@ -268,7 +268,8 @@ def _start(options: argparse.Namespace) -> tuple[float, float]:
     """First guess of mu and lam [Pa] from either pair of options."""
     young, poisson = options.start_young, options.start_poisson
     if young is None and poisson is None:
-        return tuple(options.start or (1e5, 1e5))
+        mu, lam = options.start or (1e5, 1e5)
+        return mu, lam
     if young is None or poisson is None or options.start is not None:
         raise ValueError("--start: expected --start MU LAM, or --start-young and --start-poisson")
     return dv.lame(young, poisson)

@@ -9,6 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypedDict
 
 import numpy as np
 import torch
@@ -28,6 +29,13 @@ WINDOWS = 8  # of flag-wind
 STRENGTH = 16.0  # of the reference wind of the flag [m/s^2]
 TOLERATED = 5e-3  # loss of the flag in the paper [m^2]
 VISIBLE = 0.1  # of the largest singular value
+
+
+class Moduli(TypedDict):
+    """Lame parameters [Pa]."""
+
+    mu: float
+    lam: float
 
 
 def cape_mu(settings: Settings) -> Problem:
@@ -88,7 +96,7 @@ def cape_wind(settings: Settings) -> Problem:
     iterations, the paper's count.
     """
     vertices, steps, sweeps, iterations = ((5, 6), 15, 5, 50) if settings.quick else ((18, 24), 30, 8, 120)
-    size, density, moduli = (0.6, 0.8, THICKNESS), 200.0, {"mu": 5e3, "lam": 5e3}
+    size, density, moduli = (0.6, 0.8, THICKNESS), 200.0, Moduli(mu=5e3, lam=5e3)
     mesh, top = hanging(*vertices, *size)
     model = dv.Model(mesh, density=density, pinned=top).to(settings.device)
     solver = dv.VBD(TIME_STEP, sweeps, relaxation=RELAXATION, subspace="coarse")
@@ -135,7 +143,7 @@ def flag_wind(settings: Settings) -> Problem:
     the paper's K = 10, it stays within 7 cm of converged steps; thinner flags do not. It may pass through itself.
     """
     vertices, steps, iterations = ((5, 4), 48, 40) if settings.quick else ((17, 13), 120, 199)
-    size, density, moduli, time_step, sweeps = (1.2, 0.9, 0.02), 200.0, {"mu": 5e3, "lam": 5e3}, 1 / 120, 10
+    size, density, moduli, time_step, sweeps = (1.2, 0.9, 0.02), 200.0, Moduli(mu=5e3, lam=5e3), 1 / 120, 10
     mesh, top = hanging(*vertices, *size)
     model = dv.Model(mesh, density=density, pinned=top).to(settings.device)
     solver = dv.VBD(time_step, sweeps, relaxation=RELAXATION, start="predictor")
@@ -195,7 +203,7 @@ def dress_size(settings: Settings) -> Problem:
     iterations, the paper's count.
     """
     (around, rings), steps, sweeps, iterations = ((8, 6), 15, 15, 40) if settings.quick else ((22, 21), 35, 40, 80)
-    neck_height, density, moduli, true_size, start_size = 1.45, 100.0, {"mu": 1e4, "lam": 1e4}, 0.910, 0.45
+    neck_height, density, moduli, true_size, start_size = 1.45, 100.0, Moduli(mu=1e4, lam=1e4), 0.910, 0.45
     mesh = dv.mesh.dress(around, rings, THICKNESS, neck_height=neck_height)
     ring = ring_of_vertices(mesh, around, rings)
     model = dv.Model(mesh, density=density, pinned=ring == 0).to(settings.device)

@@ -115,7 +115,7 @@ class Drape:
         self.still = torch.zeros_like(self.model.rest_points)
         self.start, truth = (self.still.new_tensor(values) for values in (START, list(TRUTH.values())))
         with torch.no_grad():
-            self.target = self.fall(*truth)
+            self.target = self.fall(truth[0], truth[1])
             self.target_early, self.target_settled = self.first_frames(self.target), self.settled_drape(self.target)
         self.log_mu, self.log_lam = (value.log().requires_grad_() for value in self.start)
 
@@ -152,7 +152,11 @@ class Drape:
 
     @torch.no_grad()
     def motions(self) -> dict[str, Tensor]:
-        return {"initial": self.fall(*self.start), "target": self.target, "recovered": self.recovered()}
+        return {
+            "initial": self.fall(self.start[0], self.start[1]),
+            "target": self.target,
+            "recovered": self.recovered(),
+        }
 
 
 def newton(loss: Callable[[], Tensor], moved: str, name: str) -> Stage:
