@@ -30,7 +30,6 @@ from torch import Tensor, nn
 import diffvbd as dv
 from diffvbd import viz
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
-from diffvbd.viz.scenery import optional
 
 SIZE = (0.08, 0.4, 0.08)  # [m]
 DENSITY = 1000.0  # [kg/m^3]
@@ -241,7 +240,10 @@ def cma_es(
     Returns the best row, (seconds, lowest loss so far) after each generation, and how many losses that took. Raises
     ImportError where the package cma is not installed.
     """
-    cma = optional("cma", "no comparison with CMA-ES: it needs", "tasks")
+    try:
+        import cma
+    except ImportError:
+        raise ImportError("no comparison with CMA-ES: it needs cma: pip install 'diffvbd[tasks]'") from None
     begun = time.perf_counter()
     options = {"seed": seed % (2**32 - 1) + 1, "verbose": -9}  # seed 0 is the clock
     search = cma.CMAEvolutionStrategy(start.tolist(), SPREAD, options)

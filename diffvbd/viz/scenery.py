@@ -63,13 +63,12 @@ def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = 
     return Scenery(points, triangles, color)
 
 
-def optional(module: str, what: str, extra: str = "viz") -> Any:
-    """A module of another package; an ImportError says what needs it, and which extra brings it."""
+def optional(module: str, what: str) -> Any:
+    """A module of a package of the extra [viz]; an ImportError says what needs it."""
     try:
         return importlib.import_module(module)
     except ImportError:
-        package = module.partition(".")[0]
-        raise ImportError(f"{what} {package}: pip install 'diffvbd[{extra}]'") from None
+        raise ImportError(f"{what} {module.partition('.')[0]}: pip install 'diffvbd[viz]'") from None
 
 
 def as_array(values: Any) -> NDArray[np.float64]:
