@@ -7,6 +7,7 @@ page of them.
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -18,9 +19,8 @@ from typing import Any
 from bench.common import RESULTS, ROOT, as_json, cell, commit, device_suffix, digits, environment, keep_picture, place
 from bench.paper import TASKS as PAPER
 from bench.tables import markdown_table
-from diffvbd.tasks import TASKS, Settings, dress, solve
+from diffvbd.tasks import TASKS, Settings, solve
 
-SHARED = {"dress-mu-lam": dress}  # what several tasks share is told once, in the section of the first
 IMAGES = ROOT / "docs" / "images" / "tasks"
 
 
@@ -123,10 +123,11 @@ def place_on_page(entry: tuple[str, dict[str, Any]]) -> tuple[str, int, int, str
 
 def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: Path, root: Path) -> str:
     """One task: what it is, its picture, and a row for each run."""
-    module = sys.modules[TASKS[name].build.__module__]
-    text = [f"## {name}\n", (module.__doc__ or "").strip() + "\n"]
-    if name in SHARED:
-        text.append((SHARED[name].__doc__ or "").strip() + "\n")
+    build = TASKS[name].build
+    own = inspect.getdoc(build) or ""
+    if "Choices:" not in own:  # then the module says them
+        own = (sys.modules[build.__module__].__doc__ or "").strip()
+    text = [f"## {name}\n", own + "\n"]
     if (picture := picture_of(name, images)).exists():
         text.append(f"![{TASKS[name].summary}](../{picture.relative_to(root).as_posix()})\n")
     rows = []

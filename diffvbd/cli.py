@@ -19,10 +19,10 @@ import diffvbd as dv
 from diffvbd.mesh.motions import EXTENSIONS, check_extension
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.folder import joined
+from diffvbd.tasks.identify import FIELDS, INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
 from diffvbd.tasks.problem import Result, Row, check_device
 from diffvbd.tasks.report import versions
-from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, SUBSPACES, Observation, Scene, side
-from diffvbd.viz.server import require_viser
+from diffvbd.viz.scenery import optional
 from diffvbd.viz.values import QUANTITIES
 
 from ._common.context import record_to
@@ -49,18 +49,8 @@ EXAMPLES = """examples:
 where it stalled, and warns wherever it did not converge; `advise` where the error cannot be reached. An interrupted
 `run` or `identify` continues where it stopped when the same command is given again.
 """
+MODULI = {"mu": "shear modulus [Pa]", "lam": "first Lame parameter [Pa]"}
 ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "subspace")  # what advise chooses
-TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
-  x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
-  steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...; where the file has a time_step,
-             another --time-step keeps the times
-  x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
-  pinned     vertices that are held, bool, shape [V]; default none
-  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation,
-             integrator, subspace
-  mu, lam    the true material [Pa], if known: only used to report the error
-`diffvbd simulate --save-target TARGET.npz` writes such a file.
-"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -94,9 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run one of the shipped inverse problems", description=_task_list())
     run.formatter_class = raw
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
-    run.add_argument(
-        "--quick", action="store_true", help="a small version that takes seconds and need not be as accurate"
-    )
+    quick = "a small version that takes seconds and need not be as accurate"
+    run.add_argument("--quick", action="store_true", help=quick)
     _add_run_options(run, "runs/NAME, or runs/NAME-quick")
     for name, texts in sorted(_task_options().items()):
         run.add_argument(f"--{name}", help="; ".join(texts))
@@ -112,9 +101,8 @@ def _parser() -> argparse.ArgumentParser:
 
     simulate = commands.add_parser("simulate", help="simulate a mesh and write its motion")
     simulate.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra (.msh, .vtu, .vtk, ...)")
-    simulate.add_argument(
-        "--out", type=Path, required=True, metavar="PART.pvd", help=f"{', '.join(EXTENSIONS)}; missing folders are made"
-    )
+    kinds = f"{', '.join(EXTENSIONS)}; missing folders are made"
+    simulate.add_argument("--out", type=Path, required=True, metavar="PART.pvd", help=kinds)
     simulate.add_argument("--force", action="store_true", help="overwrite without asking")
     simulate.add_argument("--steps", type=int, default=100, help="time steps (default 100)")
     simulate.add_argument("--stride", type=int, default=1, help="write every n-th frame (default 1)")
@@ -128,9 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     advice.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     advice.add_argument("--duration", type=float, required=True, help="of the motion [s]")
     error, budget = (inspect.signature(dv.advise).parameters[name].default for name in ("error", "time_budget"))
-    advice.add_argument(
-        "--error", type=float, default=error, help=f"fraction of the motion, below 1 (default {error:g})"
-    )
+    text = f"fraction of the motion, below 1 (default {error:g})"
+    advice.add_argument("--error", type=float, default=error, help=text)
     advice.add_argument("--gradient", action="store_true", help="of gradients, too")
     advice.add_argument("--time-budget", type=float, default=budget, help=f"of trial runs [s] (default {budget:g})")
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
@@ -139,17 +126,12 @@ def _parser() -> argparse.ArgumentParser:
     advice.set_defaults(command=_advise)
 
     identification = commands.add_parser(
-        "identify", help="recover mu and lam from observed shapes", epilog=TARGET_KEYS, formatter_class=raw
+        "identify", help="recover mu and lam from observed shapes", epilog=identify.KEYS, formatter_class=raw
     )
     identification.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     identification.add_argument("target", type=Path, metavar="TARGET.npz", help="the observation, see below")
-    identification.add_argument(
-        "--start",
-        type=float,
-        nargs=2,
-        metavar=("MU", "LAM"),
-        help=f"first guess [Pa] (default 1e5); the result stays within a factor {identify.RANGE:.0e} of it",
-    )
+    text = f"first guess [Pa] (default 1e5); the result stays within a factor {identify.RANGE:.0e} of it"
+    identification.add_argument("--start", type=float, nargs=2, metavar=("MU", "LAM"), help=text)
     identification.add_argument("--start-young", type=float, help="the same as Young's modulus [Pa]")
     identification.add_argument("--start-poisson", type=float, help="and Poisson's ratio, above 0 and below 0.5")
     identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
@@ -201,10 +183,8 @@ def _simulate(options: argparse.Namespace) -> None:
     if options.stride < 1:
         raise ValueError(f"--stride: expected at least 1, got {options.stride}")
     _check_steps(options.steps)
-    check_device(options.device)
-    mesh = _mesh(options)
-    mu, lam = _material(options)
-    scene = _scene(options, mesh)
+    scene, mu, lam = _scene(options)
+    mesh = scene.mesh
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
@@ -215,28 +195,27 @@ def _simulate(options: argparse.Namespace) -> None:
     count = int(scene.pinned.sum())
     print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices, {count} pinned)")
     if options.pin and count < 3:
-        print(
-            f"warning: --pin holds {count} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
-        )
+        _warn(f"--pin holds {count} vertices; a fraction takes more, for example --pin x-:0.05")
     if len(steps) > 1 and options.stride == 1:
         previous = (motion.x[-2], motion.v[-2]) if scene.integrator == Scene.integrator else None
         found = dv.diagnose(model, motion.x[-1], scene.solver, previous=previous, warn=False, mu=mu, lam=lam,
                             gravity=scene.gravity)  # fmt: skip
         for message in found.messages:
-            print(f"warning: {message}", file=sys.stderr)
+            _warn(message)
     if options.save_target:
         Observation(scene, frames, steps, {"mu": mu, "lam": lam}).save(options.save_target)
         print(f"wrote {options.save_target}")
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def _advise(options: argparse.Namespace) -> int:
     for name in ADVISED:
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: expected none, since it is what advise chooses")
-    check_device(options.device)
-    mesh = _mesh(options)
-    mu, lam = _material(options)
-    scene = _scene(options, mesh)
+    scene, mu, lam = _scene(options)
     model = scene.model(options.device)
     x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (scene.x0, scene.v0))
     solver = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
@@ -311,7 +290,7 @@ def _identify(options: argparse.Namespace) -> int:
     if not result.converged:
         how = "stalled" if result.stalled else f"did not converge in {len(result.history)} evaluations"
         advice = "try another --start, more --iterations, or --fixed-lam"
-        print(f"warning: identify {how}: mu and lam are the best seen and may be far off; {advice}", file=sys.stderr)
+        _warn(f"identify {how}: mu and lam are the best seen and may be far off; {advice}")
     return int(result.stalled)
 
 
@@ -342,7 +321,7 @@ def _task_list() -> str:
 def _add_material(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--velocity", type=float, nargs=3, metavar=("VX", "VY", "VZ"), help="initial velocity [m/s]")
     material = parser.add_argument_group("material (default: mu = lam = 1e5 Pa)")
-    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
+    for name, text in MODULI.items():
         material.add_argument(f"--{name}", type=float, help=text)
     material.add_argument("--young", type=float, help="Young's modulus [Pa], together with --poisson")
     material.add_argument("--poisson", type=float, help="Poisson's ratio, below 0.5")
@@ -350,9 +329,8 @@ def _add_material(parser: argparse.ArgumentParser) -> None:
 
 def _add_scene(parser: argparse.ArgumentParser, chosen: tuple[str, ...] = ()) -> None:
     """``chosen``: what the command chooses itself: such options are known, to say so, and not shown."""
-    parser.add_argument(
-        "--scale", type=float, default=1.0, help="metres per unit of the file, 0.001 for mm (default 1)"
-    )
+    text = "metres per unit of the file, 0.001 for mm (default 1)"
+    parser.add_argument("--scale", type=float, default=1.0, help=text)
     # No defaults: identify must know which options were given, and Scene has the defaults.
     scene = parser.add_argument_group("scene")
 
@@ -373,13 +351,9 @@ def _add_scene(parser: argparse.ArgumentParser, chosen: tuple[str, ...] = ()) ->
     scene.add_argument("--subspace", choices=[*SUBSPACES], help=shown("subspace", text))
     scene.add_argument("--integrator", choices=[*INTEGRATORS],
                        help=shown("integrator", f"of time (default {Scene.integrator})"))  # fmt: skip
-    scene.add_argument(
-        "--pin",
-        action="append",
-        metavar="SIDE[:FRACTION]",
-        help="hold the vertices at a side of the bounding box: x-, x+, y-, y+, z- or z+; up to this fraction of its "
-        "extent (default 0.001), for example y+:0.05 for a round body; may be repeated",
-    )
+    text = ("hold the vertices at a side of the bounding box: x-, x+, y-, y+, z- or z+; up to this fraction of its "
+            "extent (default 0.001), for example y+:0.05 for a round body; may be repeated")  # fmt: skip
+    scene.add_argument("--pin", action="append", metavar="SIDE[:FRACTION]", help=text)
 
 
 def _material(options: argparse.Namespace) -> tuple[float, float]:
@@ -395,22 +369,23 @@ def _material(options: argparse.Namespace) -> tuple[float, float]:
         raise ValueError(f"--{error}") from None
 
 
-def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
-    """The scene of a mesh that the options describe."""
+def _scene(options: argparse.Namespace) -> tuple[Scene, float, float]:
+    """The scene that the options describe, mu and lam [Pa]."""
+    check_device(options.device)
+    mesh = _mesh(options)
+    mu, lam = _material(options)
     v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
     values = _given(options, mesh)
     for name in ("kappa", "dhat", "friction"):
         if name in values and "floor" not in values:
             raise ValueError(f"--{name}: expected --floor with it, got none")
     pinned = values.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
-    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **values)
+    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **values), mu, lam
 
 
 def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
     """Fields of a Scene that were given; `pinned` [V] of --pin."""
-    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
-             "integrator", "subspace")  # fmt: skip
-    values = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    values = {name: getattr(options, name) for name in FIELDS if getattr(options, name) is not None}
     for name, value in values.items():
         if not isinstance(value, (str, int)) and not np.isfinite(value).all():
             raise ValueError(f"--{name.replace('_', '-')}: expected finite numbers, got {value}")
@@ -421,26 +396,20 @@ def _given(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
 
 def _add_mesh(commands: Any) -> None:
     """Add the command to those of `diffvbd`."""
-    parser = commands.add_parser(
-        "mesh", help="repair a surface (.ply, .stl, .obj, ...) and fill it with tets; needs the extra [mesh]"
-    )
+    text = "repair a surface (.ply, .stl, .obj, ...) and fill it with tets; needs the extra [mesh]"
+    parser = commands.add_parser("mesh", help=text)
     parser.add_argument("surface", type=Path, metavar="SURFACE", help="a file with triangles")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="PART.msh", help="the file to write")
     parser.add_argument("--force", action="store_true", help="overwrite it if it is there")
     unit = parser.add_mutually_exclusive_group()
     unit.add_argument("--size", type=float, help="the largest extent that it shall have [m]")
     unit.add_argument("--scale", type=float, help="metres per unit of the file, 0.001 for mm (default 1)")
-    parser.add_argument(
-        "--up",
-        default="y",
-        choices=["x", "y", "z", "-x", "-y", "-z"],
-        help="the file's axis that points up, for example z; --up=-z for a minus (default y)",
-    )
+    text = "the file's axis that points up, for example z; --up=-z for a minus (default y)"
+    parser.add_argument("--up", default="y", choices=["x", "y", "z", "-x", "-y", "-z"], help=text)
     parser.add_argument("--edge", type=float, help="wanted edge length [m] (default: 1/20 of the diagonal)")
     parser.add_argument("--epsilon", type=float, help="tets may miss the surface by so much [m] (default: edge / 20)")
-    parser.add_argument(
-        "--max-triangles", type=int, default=3000, help="larger surfaces are decimated to so many first (default 3000)"
-    )
+    text = "larger surfaces are decimated to so many first (default 3000)"
+    parser.add_argument("--max-triangles", type=int, default=3000, help=text)
     parser.set_defaults(command=_run_mesh)
 
 
@@ -494,12 +463,11 @@ PORT = 8080
 def _add_view(commands: Any) -> None:
     """Add the command to those of `diffvbd`."""
     parser = commands.add_parser("view", help="show a motion, a mesh or a run in the browser; needs the extra [viz]")
-    parser.add_argument(
-        "path", type=Path, metavar="FILE|RUN", help="a .pvd, a mesh with tets, or the folder of a `diffvbd run`"
-    )
+    text = "a .pvd, a mesh with tets, or the folder of a `diffvbd run`"
+    parser.add_argument("path", type=Path, metavar="FILE|RUN", help=text)
     parser.add_argument("--color", choices=[*QUANTITIES], default="body", help="of the triangles (default body)")
     parser.add_argument("--time-step", type=float, help="between frames [s] (default: what the file says)")
-    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
+    for name, text in MODULI.items():
         parser.add_argument(f"--{name}", type=float, help=f"{text}, for stress and stiffness")
     _add_server(parser)
     parser.add_argument("--open", action="store_true", help="open the page in the system's browser")
@@ -528,7 +496,7 @@ def _watched(host: str, port: int) -> Iterator[Callable[[dict[str, float]], None
 
     The page stays after the run for as long as a browser shows it.
     """
-    require_viser()
+    optional("viser", "the viewer needs")
     heard: list[Any] = []
     viewer: dv.viz.Viewer | None = None
 
@@ -539,9 +507,10 @@ def _watched(host: str, port: int) -> Iterator[Callable[[dict[str, float]], None
                 return
             viewer = dv.viz.live(heard[0][0], host=host, port=port)
             print(f"live view at {viewer.url}", file=sys.stderr, flush=True)
+        x = None
         if heard:
-            viewer.update_model(heard[0][0])
-        x = heard[0][1] if heard else None
+            model, x = heard[0]
+            viewer.update_model(model)
         heard.clear()
         others = {key: value for key, value in row.items() if key not in ("iteration", "loss", "seconds")}
         viewer.update(x, loss=row["loss"], **others)

@@ -22,7 +22,7 @@ from diffvbd import mesh as dm
 from diffvbd.cli import main
 from diffvbd.tasks import folder as archive
 from diffvbd.tasks.folder import alone_in
-from diffvbd.tasks.scene import Observation
+from diffvbd.tasks.identify import Observation
 from diffvbd.testing import tolerance
 
 SCENE = ["--steps", "12", "--time-step", "0.01", "--sweeps", "8", "--pin", "x-"]

@@ -351,40 +351,32 @@ def _error_messages(model: System, result: Diagnosis, edge: Tensor) -> list[str]
     if result.errors is None:
         return []
     relative = _relative(result.errors, edge)
-    wrong = relative > INACCURATE
-    if not bool(wrong.any()):
+    wrong = torch.where(relative > INACCURATE, relative, 0)  # without those that are NaN
+    if not _largest(wrong):
         return []
-    *scene, body = torch.where(wrong, relative, 0).eq(relative[wrong].max()).nonzero()[0].tolist()
-    where = f"body {body}" + (f" of scene {scene}" if scene else "")
     coarse = ', or subspace="coarse"' if model.coarse is None else ""
-    return [f"the step ends about {percent(float(relative[(*scene, body)]))} of its motion from where it would "
-            f"converge, in {where}; often three times as much: take more sweeps{coarse}"]  # fmt: skip
+    return [f"the step ends about {percent(_largest(wrong))} of its motion from where it would converge, in "
+            f"{_place(wrong)}; often three times as much: take more sweeps{coarse}"]  # fmt: skip
 
 
 def _setting_messages(model: System, mu: Tensor, lam: Tensor, edge: Tensor) -> list[str]:
-    out = []
-    paper = model.block == "paper"
-    if bool((3 * lam + 2 * mu < 0).any()):
-        out.append("lam < -2/3 mu: the bulk modulus is negative and the rest state unstable")
-    if paper and model.saturation is None and bool((lam < mu).any()):
-        out.append('block="paper" with lam < mu and no saturation: an update may raise the potential')
-    if paper and model.saturation is None and model.relaxation > 1:
-        out.append('block="paper" with relaxation above 1 and no saturation diverges on many scenes')
-    if model.relaxation > STABLE_RELAXATION:
-        out.append(f"relaxation {model.relaxation:g} is above {STABLE_RELAXATION:g}: each step descends, but rollouts "
-                   "may grow")  # fmt: skip
-    if edge.numel() == 0 or model.num_active == 0:
-        return out
-    if model.saturation is not None:
-        ratio = model.saturation / float(edge.mean())
-        if ratio > SATURATION_TOO_LARGE:
-            out.append(
-                f"saturation {model.saturation:g} m is {ratio:.3g} mean edges: it never limits an update of this mesh"
-            )
-        if ratio < SATURATION_TOO_SMALL:
-            out.append(f"saturation {model.saturation:g} m is {ratio:.3g} mean edges: sweeps move by that little")
-    lightest = float(model.mass[model.color_vertices].min())
-    if model.regularization > HEAVY_REGULARIZATION * lightest:
-        out.append(f"regularization {model.regularization:g} kg is {model.regularization / lightest:.3g} of the "
-                   "lightest vertex: it slows every update")  # fmt: skip
-    return out
+    unlimited = model.block == "paper" and model.saturation is None
+    found = {
+        "lam < -2/3 mu: the bulk modulus is negative and the rest state unstable": bool((3 * lam + 2 * mu < 0).any()),
+        'block="paper" with lam < mu and no saturation: an update may raise the potential':
+            unlimited and bool((lam < mu).any()),
+        'block="paper" with relaxation above 1 and no saturation diverges on many scenes':
+            unlimited and model.relaxation > 1,
+        f"relaxation {model.relaxation:g} is above {STABLE_RELAXATION:g}: each step descends, but rollouts may grow":
+            model.relaxation > STABLE_RELAXATION,
+    }  # fmt: skip
+    if edge.numel() and model.num_active:
+        if model.saturation is not None:
+            ratio = model.saturation / float(edge.mean())
+            size = f"saturation {model.saturation:g} m is {ratio:.3g} mean edges"
+            found[f"{size}: it never limits an update of this mesh"] = ratio > SATURATION_TOO_LARGE
+            found[f"{size}: sweeps move by that little"] = ratio < SATURATION_TOO_SMALL
+        lightest = float(model.mass[model.color_vertices].min())
+        size = f"regularization {model.regularization:g} kg is {model.regularization / lightest:.3g} of the"
+        found[f"{size} lightest vertex: it slows every update"] = model.regularization > HEAVY_REGULARIZATION * lightest
+    return [message for message, applies in found.items() if applies]

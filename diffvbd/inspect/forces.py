@@ -128,9 +128,7 @@ def forces(
 
     Source: Li et al. (2020); docs/method.md, sections 6 and 12.
     """
-    check_state(model, x, x)
-    check_previous(model, previous, x, solver)
-    given_inputs = given_of(model, inputs)
+    given_inputs = _checked(model, x, solver, previous, inputs)
     start = None if previous is None else previous[0]
     _refuse_non_finite(model, {"x": x, "previous: x": start, **given_inputs.parameters,
                                **{name: given_inputs.loads[name] for name in COLLIDERS}})  # fmt: skip
@@ -180,6 +178,13 @@ def _points_about(about: Tensor | Sequence[float], x: Tensor) -> Tensor:
     if looks_at(point):
         name_value("about", "finite coordinates", point, torch.isfinite(point))
     return point.expand(*lead, 3).reshape(lead.numel(), 3)
+
+
+def _checked(model: Model, x: Tensor, solver: VBD | None, previous: Any, inputs: dict[str, Any]) -> Given:
+    """Inputs of a step, once the states fit the Model."""
+    check_state(model, x, x)
+    check_previous(model, previous, x, solver)
+    return given_of(model, inputs)
 
 
 def _refuse_non_finite(model: Model, where: dict[str, Tensor | None]) -> None:
@@ -299,9 +304,7 @@ def reactions(
 
     Source: docs/method.md, sections 1, 2 and 12.
     """
-    check_state(model, x, x)
-    check_previous(model, previous, x, solver)
-    given_inputs = given_of(model, inputs)
+    given_inputs = _checked(model, x, solver, previous, inputs)
     loads = given_inputs.loads
     state = {} if previous is None else {"previous: x": previous[0], "previous: v": previous[1]}
     pull, force = acceleration_of(loads["gravity"], x), loads["force"]

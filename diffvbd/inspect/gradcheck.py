@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -76,7 +77,7 @@ def check_gradients(
         if not isinstance(value, Tensor) or value.dtype != torch.float64:
             fail(name, "a float64 tensor", getattr(value, "dtype", type(value).__name__))
     leaves = {k: t.detach().clone().requires_grad_() for k, t in arguments.items()}
-    _check_names(loss, arguments)
+    check_names("loss", loss, arguments)
     value = loss(**leaves)
     if not isinstance(value, Tensor):
         raise TypeError(f"loss: expected a function that returns a scalar tensor, got {type(value).__name__}")
@@ -111,12 +112,13 @@ def check_gradients(
     return result
 
 
-def _check_names(loss: Callable[..., Tensor], arguments: dict[str, Tensor]) -> None:
+def check_names(name: str, function: Callable[..., Any], arguments: Iterable[str]) -> None:
+    """Raises TypeError for a function that does not take arguments of these names."""
     try:
-        signature = inspect.signature(loss, follow_wrapped=False)
+        signature = inspect.signature(function, follow_wrapped=False)
     except (TypeError, ValueError):  # of a builtin, or no function: calling it will tell
         return
     try:
-        signature.bind(**arguments)
+        signature.bind(**dict.fromkeys(arguments))
     except TypeError as error:
-        raise TypeError(f"loss: expected a function of {', '.join(arguments)}: {error}") from None
+        raise TypeError(f"{name}: expected a function of {', '.join(arguments)}: {error}") from None

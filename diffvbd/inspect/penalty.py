@@ -157,7 +157,7 @@ def center_of_mass_penalty(
     Source: the paper's center-of-mass penalty between bodies (section on implementation and its appendix).
     """
     bodies = _bodies_of(model_or_bodies)
-    lead = _check_centers(x) if bodies is None else _check_positions(x, bodies)
+    lead = _check_positions(x, bodies)
     radius = check_positive("radius", radius, "m")
     stiffness = _check_stiffness(stiffness, x)
     reach = radius
@@ -210,24 +210,17 @@ def _bodies_of(given: Any) -> Bodies | None:
     raise TypeError(f"model_or_bodies: expected {expected}, got {type(given).__name__}")
 
 
-def _check_positions(x: Any, bodies: Bodies) -> tuple[int, ...]:
-    """The leading shape of x."""
-    shape = f"[..., {bodies.num_vertices}, 3]"
-    if not isinstance(x, Tensor):
-        raise TypeError(f"x: expected a tensor of shape {shape}, got {type(x).__name__}")
-    check_tensor("x", x, bodies.mass, owner="the masses'")
-    if x.dim() < 2 or x.shape[-2:] != (bodies.num_vertices, 3):
-        fail("x", f"shape {shape}", f"shape {list(x.shape)}")
-    return tuple(x.shape[:-2])
-
-
-def _check_centers(x: Any) -> tuple[int, ...]:
-    """The leading shape of x where each row is a body."""
-    if not isinstance(x, Tensor) or x.dtype not in (torch.float64, torch.float32):
-        raise TypeError(f"x: expected a float64 or float32 tensor of shape [..., N, 3], got {_kind(x)}")
+def _check_positions(x: Any, bodies: Bodies | None) -> tuple[int, ...]:
+    """The leading shape of x; without bodies each of its rows is one."""
+    shape = f"[..., {'N' if bodies is None else bodies.num_vertices}, 3]"
+    if not isinstance(x, Tensor) or (bodies is None and x.dtype not in (torch.float64, torch.float32)):
+        kind = "a tensor" if bodies is not None else "a float64 or float32 tensor"
+        raise TypeError(f"x: expected {kind} of shape {shape}, got {_kind(x)}")
     check_dense("x", x)
-    if x.dim() < 2 or x.shape[-1] != 3:
-        fail("x", "shape [..., N, 3]", f"shape {list(x.shape)}")
+    if bodies is not None:
+        check_tensor("x", x, bodies.mass, owner="the masses'")
+    if x.dim() < 2 or x.shape[-1] != 3 or (bodies is not None and x.shape[-2] != bodies.num_vertices):
+        fail("x", f"shape {shape}", f"shape {list(x.shape)}")
     return tuple(x.shape[:-2])
 
 

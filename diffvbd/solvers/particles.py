@@ -48,10 +48,8 @@ class FixedSum:
         self.table[index[order], place] = order
 
     def __call__(self, values: Tensor) -> Tensor:
-        padded = torch.cat((values, torch.zeros_like(values[..., :1, :])), -2) if values.shape[-2] else None
-        if padded is None:
-            return values.new_zeros(*values.shape[:-2], self.table.shape[0], values.shape[-1])
-        return padded[..., self.table, :].sum(-2)
+        zero = values.new_zeros((*values.shape[:-2], 1, values.shape[-1]))
+        return torch.cat((values, zero), -2)[..., self.table, :].sum(-2)
 
 
 def placed(values: Tensor, index: Tensor, size: int, dim: int = -2) -> Tensor:
@@ -96,7 +94,7 @@ class Springs:
     def project_vjp(self, d: Tensor, rest_length: Tensor, bar: Tensor) -> tuple[Tensor, Tensor]:
         """Adjoints of d [..., C, 3] and of rest_length [..., C], from that of L n [..., C, 3]."""
         direction, inverse, _ = direction_of(d)
-        along = (direction * bar).sum(-1, keepdim=True)
+        along = dot(direction, bar)
         # n turns only by what is across it; along it, d changes nothing and L everything
         return rest_length[..., None] * inverse * (bar - along * direction), along[..., 0]
 
@@ -180,10 +178,9 @@ def direction_of(d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _signed_svd(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """U, s, V^T with det(U V^T) = 1; the sign goes into the last column of U and the last singular value."""
     u, s, vt = torch.linalg.svd(f)
-    # The smallest singular value takes the sign: of all rotations U V^T that leaves the one closest to F.
-    last = torch.where(torch.linalg.det(u @ vt) < 0, -1.0, 1.0)
     signs = torch.ones_like(s)
-    signs[..., 2] = last
+    # The smallest singular value takes the sign: of all rotations U V^T that leaves the one closest to F.
+    signs[..., 2] = torch.where(torch.linalg.det(u @ vt) < 0, -1.0, 1.0)
     return u * signs[..., None, :], s * signs, vt
 
 
@@ -198,21 +195,11 @@ def _assembled(nodes: Tensor, blocks: Tensor, size: int) -> Tensor:
 
 
 class ParticleSolver:
-    """Particles: rest positions (if known), masses and pins.
-
-    What is given here are constants, no tensors that require grad; what is differentiated is an argument of a step.
-
-    Args:
-        points: Rest positions [m], shape [V, 3], or the number of particles V.
-        mass: [kg], a number or shape [V], > 0 where not pinned; the value that a step uses unless it is given another.
-        pinned: Particles that nothing but ``prescribed`` moves: a bool mask [V] or indices.
-        dtype, device: Of the solver's constants, and of what its steps take.
+    """Particles and edges: rest positions and rest lengths (if known), masses and pins; arguments as in ``XPBD``.
 
     Attributes:
-        num_points: V. rest_points [m]: [V, 3] or None. mass [kg]: [V]. pinned: bool [V].
-
-    Raises:
-        ValueError, TypeError: naming the argument, what was expected and what came.
+        num_points: V. rest_points [m]: [V, 3] or None. mass [kg]: [V]. pinned: bool [V]. edges: int64 [C, 2].
+        rest_length [m]: [C] or None.
     """
 
     @lasting_tensors()
@@ -220,10 +207,10 @@ class ParticleSolver:
         self,
         points: Any,
         mass: Any,
-        pinned: Any = None,
-        *,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str = "cpu",
+        edges: Any,
+        pinned: Any,
+        dtype: torch.dtype,
+        device: torch.device | str,
     ) -> None:
         check_dtype(dtype)
         device = checked_device(device)
@@ -240,6 +227,11 @@ class ParticleSolver:
             fail("mass", f"a number or shape [{points}]", f"shape {list(mass.shape)}")
         self.mass = mass.expand(points).clone()
         self._check_mass(self.mass)
+        self.edges = checked_edges(edges, points, device)
+        self.rest_length: Tensor | None = None
+        if self.rest_points is not None:
+            ends = self.rest_points[self.edges]
+            self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
 
     def _check_mass(self, mass: Tensor) -> None:
         wrong = ~(torch.isfinite(mass) & (mass > 0) | self.pinned)
@@ -283,6 +275,14 @@ class ParticleSolver:
             fail("x, v, force, mass, time_step", "a finite predictor x + h v + h^2 (gravity + force / m)", "NaN or Inf")
         return y, masses
 
+    def lengths(self, rest_length: float | Tensor | None, x: Tensor) -> Tensor:
+        """Rest lengths of a step [m], [..., C]."""
+        count = self.edges.shape[0]
+        if rest_length is None and self.rest_length is None and count:
+            fail("rest_length", "a value, because the solver was made without rest positions", None)
+        given = self.rest_length if rest_length is None else rest_length
+        return self.per("rest_length", x.new_zeros(0) if given is None else given, x, count, ">= 0")
+
     def tensor(self, name: str, value: Any) -> Tensor:
         """``value`` as a tensor of the solver's dtype and device; numbers are converted, other tensors must match."""
         return check_tensor(name, value, self.mass, owner="the solver's")
@@ -303,6 +303,11 @@ class ParticleSolver:
             if bool(wrong.any()):
                 fail(name, f"{'' if least == '> 0' else 'finite '}numbers {least}", float(value.detach()[wrong][0]))
         return ops.broadcast(value, (*value.shape[:-1], count))
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """[..., c] each -> [..., 1]."""
+    return (a * b).sum(-1, keepdim=True)
 
 
 def all_finite(value: Tensor) -> bool:
@@ -357,10 +362,6 @@ def mesh_edges(mesh: TetMesh) -> np.ndarray:
 
 def mesh_mass(mesh: TetMesh, density: float) -> np.ndarray:
     """Lumped masses m_i = sum of density V / 4 over the tets of a vertex [kg], shape [V]; constants."""
+    check_kind("mesh", mesh, TetMesh)
     quarter = np.repeat(check_positive("density", density, "kg/m^3") * mesh.volume / 4, 4)
     return np.bincount(mesh.tets.reshape(-1), quarter, minlength=mesh.num_vertices)
-
-
-def checked_mesh(mesh: Any) -> TetMesh:
-    check_kind("mesh", mesh, TetMesh)
-    return mesh

@@ -15,17 +15,7 @@ from ..mesh import TetMesh
 from ..ops.sums import one_thread
 from ..step.arguments import GRAVITY
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import (
-    ParticleSolver,
-    Springs,
-    Tets,
-    all_finite,
-    checked_edges,
-    checked_mesh,
-    mesh_edges,
-    mesh_mass,
-    placed,
-)
+from .particles import ParticleSolver, Springs, Tets, all_finite, mesh_edges, mesh_mass, placed
 
 MAX_FREE = 4096  # free particles of one dense factor: 128 MiB in float64
 
@@ -156,16 +146,13 @@ class LocalGlobal(BlockUpdate):
 class ProjectiveDynamics(ParticleSolver):
     """Particles with springs and tets, solved by K local-global iterations per step.
 
-    What is given here are constants, no tensors that require grad; what is differentiated is an argument of
-    :meth:`step` or :meth:`factor`.
+    What is given here are constants, as in :class:`XPBD`; what is differentiated is an argument of :meth:`step` or
+    :meth:`factor`.
 
     Args:
-        points: Rest positions [m], shape [V, 3]; the number of particles V is enough without tets.
-        mass: [kg], a number or shape [V], > 0 where not pinned.
+        points, mass, pinned, dtype, device: As in :class:`XPBD`; with tets, ``points`` are rest positions.
         edges: The two particles of each spring, integers [C, 2]; None: no springs.
         tets: The corners of each tet, integers [T, 4], of positive volume at ``points``; None: no tets.
-        pinned: A bool mask [V] or indices.
-        dtype, device: torch.float64 or torch.float32; where the constants live.
 
     Attributes:
         edges: int64 [C, 2]. rest_length: Distances of the rest positions [m], [C]; None without such.
@@ -188,15 +175,10 @@ class ProjectiveDynamics(ParticleSolver):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(points, mass, pinned, dtype=dtype, device=device)
+        super().__init__(points, mass, [] if edges is None else edges, pinned, dtype, device)
         self.free = (~self.pinned).nonzero()[:, 0]
         if self.free.numel() > MAX_FREE:
             fail("points", f"at most {MAX_FREE} free particles (the factor is dense)", self.free.numel())
-        self.edges = checked_edges([] if edges is None else edges, self.num_points, device)
-        self.rest_length: Tensor | None = None
-        if self.rest_points is not None:
-            ends = self.rest_points[self.edges]
-            self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
         self.springs = Springs(self.edges, self.num_points)
         corners = torch.zeros((0, 4), dtype=torch.int64, device="cpu")
         rest_points = torch.zeros((self.num_points, 3), dtype=dtype, device="cpu")
@@ -205,8 +187,7 @@ class ProjectiveDynamics(ParticleSolver):
                 fail("points", "rest positions, because there are tets", "a number of particles")
             # A mesh checks the corners and that no volume is zero or negative, where F and w would be worthless.
             rest_points = self.rest_points.cpu()
-            mesh = TetMesh(rest_points, tets)
-            corners = torch.from_numpy(mesh.tets.copy())
+            corners = torch.from_numpy(TetMesh(rest_points, tets).tets.copy())
         self.tets = Tets(corners.to(device), rest_points.to(device))
 
     @classmethod
@@ -220,18 +201,13 @@ class ProjectiveDynamics(ParticleSolver):
         tets: bool = True,
         **options: Any,
     ) -> ProjectiveDynamics:
-        """Springs along the edges of a mesh, its tets, or both; density [kg/m^3], lumped; options: dtype, device.
-
-        Points and density are constants; give ``mass`` to :meth:`step` for its gradient.
+        """Springs along the edges of a mesh, its tets, or both; otherwise as :meth:`XPBD.from_mesh`.
 
         Raises:
-            TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
-            ValueError: density is not > 0, pinned or an option does not fit, or too many particles are free.
+            TypeError, ValueError: As :meth:`XPBD.from_mesh`; ValueError also where too many particles are free.
         """
-        mesh = checked_mesh(mesh)
-        edges = mesh_edges(mesh) if springs else None
-        corners = mesh.tets if tets else None
-        return cls(mesh.points, mesh_mass(mesh, density), edges, corners, pinned, **options)
+        mass, edges = mesh_mass(mesh, density), mesh_edges(mesh) if springs else None
+        return cls(mesh.points, mass, edges, mesh.tets if tets else None, pinned, **options)
 
     def factor(
         self,
@@ -317,26 +293,18 @@ class ProjectiveDynamics(ParticleSolver):
         """One time step: predictor, K iterations from it, velocity. Differentiable in every tensor argument.
 
         Args:
-            x, v: Positions [m] and velocities [m/s], shape [..., V, 3]; leading dimensions are scenes.
-            sweeps: K >= 0.
+            x, v, mass, force, gravity, prescribed, sweeps: As in :meth:`XPBD.step`.
             factor: What :meth:`factor` made of time_step, stiffness, tet_stiffness and mass, which are then not given
                 here. None: they are, and this step factors the matrix.
-            time_step: h [s] > 0, not differentiable.
-            stiffness: k [N/m] >= 0 of the springs, broadcasts to x.shape[:-2] + (C,).
-            tet_stiffness: [Pa] >= 0; weight over volume of the tets, broadcasts to x.shape[:-2] + (T,).
+            time_step, stiffness, tet_stiffness: As in :meth:`factor`, with the scenes of x.
             rest_length: L [m] >= 0, broadcasts to x.shape[:-2] + (C,); None: the distances of the rest positions.
-            mass: [kg], broadcasts to x.shape[:-2] + (V,); None: the solver's.
-            force: External forces [N], broadcasts to x.shape.
-            gravity: Acceleration [m/s^2], 3 numbers, or a tensor that broadcasts to x.shape.
-            prescribed: Where pinned particles go [m], broadcasts to x.shape; None: they stay.
 
         Returns:
             Positions and velocities after the step, shape of x.
 
         Raises:
-            ValueError, TypeError: Naming the argument; values are looked at on the CPU only. ValueError also for a
-                factor of values that have been changed in place since.
-            NotImplementedError: In the backward, for second derivatives.
+            ValueError, TypeError, NotImplementedError: As in :meth:`XPBD.step`; ValueError also for a factor of values
+                that have been changed in place since.
         """
         own = {"time_step": time_step, "stiffness": stiffness, "tet_stiffness": tet_stiffness, "mass": mass}
         if factor is None:
@@ -350,17 +318,13 @@ class ProjectiveDynamics(ParticleSolver):
         elif factor.network is not self:
             fail("factor", "one that this solver has made", "one of another solver")
         factor.check()
-        h, count = factor.time_step, self.edges.shape[0]
+        h = factor.time_step
         y, masses = self.begin(x, v, mass=factor.mass, time_step=h, force=force, gravity=gravity, prescribed=prescribed)
         # A factor of one scene serves a batch; one per scene must fit the batch that it meets here.
-        k = self.per("stiffness", factor.stiffness, x, count)
+        k = self.per("stiffness", factor.stiffness, x, self.edges.shape[0])
         stiff = self.per("tet_stiffness", factor.tet_stiffness, x, self.tets.nodes.shape[0])
-        if rest_length is None:
-            if self.rest_length is None and count:
-                fail("rest_length", "a value, because the solver was made without rest positions", None)
-            rest_length = x.new_zeros(0) if self.rest_length is None else self.rest_length
-        lengths = self.per("rest_length", rest_length, x, count, ">= 0")
-        (end,) = factor.solver((y,), (y, masses, k, lengths, stiff), sweeps=sweeps)
+        parameters = (y, masses, k, self.lengths(rest_length, x), stiff)
+        (end,) = factor.solver((y,), parameters, sweeps=sweeps)
         return end, (end - x) / h
 
 

@@ -16,7 +16,7 @@ from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import VBD
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
-from .particles import FixedSum, check_finite, placed
+from .particles import FixedSum, check_finite, dot, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
 _OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], device="cpu")
@@ -33,6 +33,7 @@ class Block:
     Source: docs/method.md, section 2; a tet seen from its vertex i, whose other vertices are j, k, l.
     """
 
+    mass: Tensor  # m_i [..., n, 1]
     offset: Tensor  # x_i - y_i [..., n, 3]
     gradient: Tensor  # g [..., n, 3]
     hessian: Tensor  # H [..., n, 3, 3]
@@ -72,7 +73,8 @@ class VertexBlock(BlockUpdate):
 
     def __init__(self, model: Model, solver: VBD, vertices: Tensor) -> None:
         check_elastic(model)
-        self.rows, self.factor = (vertices,), check_time_step(solver.time_step, model.mass.dtype) ** 2
+        self.vertices, self.rows = vertices, (vertices,)
+        self.factor = check_time_step(solver.time_step, model.mass.dtype) ** 2
         self.exact = solver.block == "exact"
         self.relaxation, self.saturation = solver.relaxation, solver.saturation
         self.regularization = solver.regularization
@@ -107,28 +109,27 @@ class VertexBlock(BlockUpdate):
         xi, xj, xk, xl = (x[..., index, :] for index in (self.i, self.j, self.k, self.l))
         edge_k, edge_l, spoke = xk - xj, xl - xj, xi - xj
         normal = torch.linalg.cross(edge_k, edge_l)
-        det = self.c6 * _dot(normal, spoke)
+        det = self.c6 * dot(normal, spoke)
         w_j, w_k, w_l = self.weights.split(1, 1)
         stretch = w_j * (xj - xi) + w_k * (xk - xi) + w_l * (xl - xi)
         gradient = mu * stretch + (lb * (det - 1) - mu) / 6 * normal
         # J is linear in x_i, so the exact block of a tet has no term with its second derivative.
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
-        block = (mu * self.k_ii)[..., None] * eye + (lh * self.c6 / 6)[..., None] * _outer(normal, normal)
-        (rows,) = self.rows
-        assert isinstance(rows, Tensor)
-        m = mass.expand(*mass.shape[:-1], self.num_vertices)[..., rows, None]
-        offset = x[..., rows, :] - y[..., rows, :]
+        outer = normal[..., :, None] * normal[..., None, :]
+        block = (mu * self.k_ii)[..., None] * eye + (lh * self.c6 / 6)[..., None] * outer
+        m = mass.expand(*mass.shape[:-1], self.num_vertices)[..., self.vertices, None]
+        offset = x[..., self.vertices, :] - y[..., self.vertices, :]
         gradient = m * offset + self.factor * self.to_block(gradient)
         block = self.factor * self.to_block(block.flatten(-2)).unflatten(-1, (3, 3))
         # Regularization stands in the block only: it shortens the update, and does not move its fixed point.
         block = (m + self.regularization)[..., None] * eye + block
-        return Block(offset, gradient, block, mu, lb, lh, normal, spoke, edge_k, edge_l, stretch, det)
+        return Block(m, offset, gradient, block, mu, lb, lh, normal, spoke, edge_k, edge_l, stretch, det)
 
     def update(self, state: Tensors, parameters: Tensors) -> Bars:
         (x,) = state
         block = self.assemble(x, *_shaped(parameters))
         raw = -_solve(block.hessian, block.gradient)
-        return (x[..., self.rows[0], :] + self.relaxation * self.saturated(raw),)
+        return (x[..., self.vertices, :] + self.relaxation * self.saturated(raw),)
 
     def saturated(self, raw: Tensor) -> Tensor:
         """s d_raw with s = c / (|d_raw| + c + eps)."""
@@ -141,14 +142,14 @@ class VertexBlock(BlockUpdate):
         block = self.assemble(x, y, mu, lam, mass)
         raw = -_solve(block.hessian, block.gradient)
         p = _solve(block.hessian, self.saturation_vjp(self.relaxation * out_bar, raw))
-        pairs = self.elastic_tangent(block, p[..., self.owner, :], raw[..., self.owner, :])
+        pair_p, pair_raw = p[..., self.owner, :], raw[..., self.owner, :]
+        one, two = self.gradient_tangent(block, pair_p), self.hessian_tangent(block, pair_p, pair_raw)
+        pairs = PairBars(one.own + two.own, one.normal + two.normal, one.stretch, one.mu + two.mu, one.lam + two.lam)
 
-        (rows,) = self.rows
-        assert isinstance(rows, Tensor)
-        m = mass.expand(*mass.shape[:-1], self.num_vertices)[..., rows, None]
-        inertia = placed(m * p, rows, self.num_vertices)
+        rows = self.vertices
+        inertia = placed(block.mass * p, rows, self.num_vertices)
         x_bar = placed(out_bar, rows, self.num_vertices) - inertia - self.factor * self.scatter(block, pairs)
-        mass_bar = placed(-_dot(block.offset + raw, p)[..., 0], rows, self.num_vertices, dim=-1)
+        mass_bar = placed(-dot(block.offset + raw, p)[..., 0], rows, self.num_vertices, dim=-1)
         mu_bar, lam_bar = (-self.factor * self.to_tets(bar)[..., 0] for bar in (pairs.mu, pairs.lam))
         return (x_bar,), (inertia, mu_bar, lam_bar, mass_bar)
 
@@ -160,40 +161,29 @@ class VertexBlock(BlockUpdate):
         # s changes with the length of d_raw; at length 0, where that has no derivative, the factor d_raw is 0
         length = torch.linalg.vector_norm(raw, dim=-1, keepdim=True)
         direction = torch.where(length > 0, raw / torch.where(length > 0, length, 1.0), 0.0)
-        return s * z - s**2 / self.saturation * _dot(raw, z) * direction
-
-    def elastic_tangent(self, b: Block, p: Tensor, raw: Tensor) -> PairBars:
-        """Both tangents of the tets' part of phi; p and d_raw per pair."""
-        first, second = self.gradient_tangent(b, p), self.hessian_tangent(b, p, raw)
-        return PairBars(
-            first.own + second.own,
-            first.normal + second.normal,
-            first.stretch,
-            first.mu + second.mu,
-            first.lam + second.lam,
-        )
+        return s * z - s**2 / self.saturation * dot(raw, z) * direction
 
     def gradient_tangent(self, b: Block, p: Tensor) -> PairBars:
         """From p . g with n and x_i independent (stage 1 of the paper)."""
-        np = _dot(b.normal, p)
+        np = dot(b.normal, p)
         volume = b.lb * self.c6 / 6 * np
         return PairBars(
             own=volume * b.normal,
             normal=((b.lb * (b.det - 1) - b.mu) / 6) * p + volume * b.spoke,
             stretch=b.mu * p,
-            mu=_dot(b.stretch, p) + (b.det - 2) / 6 * np,
+            mu=dot(b.stretch, p) + (b.det - 2) / 6 * np,
             lam=(b.det - 1) / 6 * np,
         )
 
     def hessian_tangent(self, b: Block, p: Tensor, raw: Tensor) -> PairBars:
         """From p . H d_raw (stage 2): the block depends on the state through n only."""
-        np, nd = _dot(b.normal, p), _dot(b.normal, raw)
+        np, nd = dot(b.normal, p), dot(b.normal, raw)
         along = self.c6 / 6 * np * nd
         return PairBars(
             own=torch.zeros_like(p),
             normal=b.lh * self.c6 / 6 * (nd * p + np * raw),
             stretch=None,
-            mu=self.k_ii * _dot(raw, p) + (along if self.exact else 0.0),
+            mu=self.k_ii * dot(raw, p) + (along if self.exact else 0.0),
             lam=along,
         )
 
@@ -253,16 +243,14 @@ class _ColorSolver(Solver):
             fail("state", "1 tensor (x)", len(tensors))
         if len(given) != 4:
             fail("parameters", "4 tensors (y, mu, lam, mass)", len(given))
-        x = check_tensor("x", tensors[0], model.mass)
-        own = (model.num_vertices, 3)
-        if x.dim() < 2 or x.shape[-2:] != own:
-            fail("x", f"shape [..., {own[0]}, 3]", f"shape {list(x.shape)}")
+        x, own = check_tensor("x", tensors[0], model.mass), (model.num_vertices, 3)
         lead = tuple(x.shape[:-2])
         shapes = {"y": own, "mu": (model.num_tets,), "lam": (model.num_tets,), "mass": own[:1]}
+        for name, value in (("x", x), ("y", given[0])):
+            if isinstance(value, Tensor) and value.shape[-2:] != own:
+                fail(name, f"shape [..., {own[0]}, 3]", f"shape {list(value.shape)}")
         for (name, shape), value in zip(shapes.items(), given, strict=True):
             check_broadcast(name, check_tensor(name, value, model.mass), (*lead, *shape))
-        if given[0].shape[-2:] != own:
-            fail("y", f"shape [..., {own[0]}, 3]", f"shape {list(given[0].shape)}")
         if not x.is_cuda:  # on CUDA a look would wait for the device
             _check_values(model, x.detach(), *(t.detach() for t in given))
         return super().__call__(state, given, sweeps=sweeps)
@@ -281,9 +269,8 @@ def _check_values(model: Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, m
 def check_elastic(model: Model) -> None:
     """Raises where a Model has other energies than the one that VertexBlock knows."""
     check_kind("model", model, Model)
-    energies = model.energies
-    if len(energies) != 1 or not isinstance(energies[0], StableNeoHookean):
-        names = [type(e).__name__ for e in energies]
+    names = [type(energy).__name__ for energy in model.energies]
+    if len(names) != 1 or not isinstance(model.energies[0], StableNeoHookean):
         fail("model", "a StableNeoHookean as its only energy", f"{names or 'none'}")
 
 
@@ -291,14 +278,6 @@ def _shaped(parameters: Tensors) -> Tensors:
     """y, mu, lam, mass; numbers for all tets or vertices as tensors of one entry."""
     y, *scalars = parameters
     return (y, *(s[None] if s.dim() == 0 else s for s in scalars))
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(-1, keepdim=True)
-
-
-def _outer(a: Tensor, b: Tensor) -> Tensor:
-    return a[..., :, None] * b[..., None, :]
 
 
 def _solve(matrix: Tensor, rhs: Tensor) -> Tensor:

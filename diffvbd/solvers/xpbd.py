@@ -13,16 +13,7 @@ from .._common.context import lasting_tensors
 from ..mesh import TetMesh
 from ..step.arguments import GRAVITY
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import (
-    ParticleSolver,
-    all_finite,
-    checked_edges,
-    checked_mesh,
-    direction_of,
-    mesh_edges,
-    mesh_mass,
-    placed,
-)
+from .particles import ParticleSolver, all_finite, direction_of, dot, mesh_edges, mesh_mass, placed
 
 
 class Projection(NamedTuple):
@@ -84,13 +75,13 @@ class DistanceProjection(BlockUpdate):
         x_bar, after_bar = rows_bar
         assert x_bar is not None and after_bar is not None
         a_bar, b_bar = x_bar.split(self.a.numel(), -2)
-        along_a, along_b = _dot(direction, a_bar), _dot(direction, b_bar)
+        along_a, along_b = dot(direction, a_bar), dot(direction, b_bar)
         change_bar = wa * along_a - wb * along_b + after_bar
         per_scale = change_bar * scale  # minus the adjoint of the gap
 
         # Of the adjoint of the direction only what is across it matters: the direction has length 1.
         direction_bar = change * (wa * a_bar - wb * b_bar)
-        across = direction_bar - _dot(direction, direction_bar) * direction
+        across = direction_bar - dot(direction, direction_bar) * direction
         apart_bar = across * inverse - per_scale * direction
         points, constraints = state[0].shape[-2], state[1].shape[-2]
         to_x = placed(torch.cat((a_bar + apart_bar, b_bar - apart_bar), -2), self.both, points)
@@ -144,14 +135,9 @@ class XPBD(ParticleSolver):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(points, mass, pinned, dtype=dtype, device=device)
+        super().__init__(points, mass, edges, pinned, dtype, device)
         if not is_word(order, "sequential", "colored"):
             fail("order", '"sequential" or "colored"', repr(order))
-        self.edges = checked_edges(edges, self.num_points, device)
-        self.rest_length: Tensor | None = None
-        if self.rest_points is not None:
-            ends = self.rest_points[self.edges]
-            self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
         # Two pinned particles have no weight between them: with infinite stiffness, too, scale would be 1 / 0.
         kept = (~self.pinned[self.edges].all(1)).nonzero()[:, 0]
         listed = [[c] for c in kept.tolist()] if order == "sequential" else _colors(self.edges.tolist(), kept.tolist())
@@ -170,8 +156,8 @@ class XPBD(ParticleSolver):
             TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
             ValueError: density is not > 0, or pinned, order or an option does not fit.
         """
-        mesh = checked_mesh(mesh)
-        return cls(mesh.points, mesh_edges(mesh), mesh_mass(mesh, density), pinned, order, **options)
+        mass = mesh_mass(mesh, density)
+        return cls(mesh.points, mesh_edges(mesh), mass, pinned, order, **options)
 
     def step(
         self,
@@ -211,9 +197,7 @@ class XPBD(ParticleSolver):
             x, v, mass=mass, time_step=time_step, force=force, gravity=gravity, prescribed=prescribed
         )
         h, count = check_time_step(time_step, self.mass.dtype), self.edges.shape[0]
-        if rest_length is None and self.rest_length is None:
-            fail("rest_length", "a value, because the solver was made without rest positions", None)
-        lengths = self.per("rest_length", self.rest_length if rest_length is None else rest_length, x, count, ">= 0")
+        lengths = self.lengths(rest_length, x)
         compliance = 1 / (self.per("stiffness", stiffness, x, count, "> 0") * (h * h))
         if not compliance.is_cuda and not all_finite(compliance):
             fail("stiffness", "numbers for which the compliance 1 / (k h^2) is finite", "NaN or Inf")
@@ -237,7 +221,3 @@ def _colors(edges: list[list[int]], kept: list[int]) -> list[list[int]]:
         groups[free].append(c)
         used[free] |= ends
     return groups
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(-1, keepdim=True)

@@ -1,27 +1,17 @@
 """Throw a body so that it meets a target after its bounce (paper, section 6.5 and appendix "Task protocols").
 
-cube-bounce: A cube of 8 vertices and 6 tets is thrown onto the floor (y = 0). Adam with gradient clipping moves 6
-numbers, an offset of the release and the velocity, until the center of mass passes a target voxel on the way after the
-first contact. The result is judged by the closest distance of the center of mass from the voxel's center after that
-contact, 0.304 m at the start; the paper reaches 0.013 m in 151 iterations, along a path of 1.8 m.
+Adam with gradient clipping moves the throw until the center of mass passes a target voxel. The loss is the squared
+distance of the closest frame after the first contact and nothing else, so the criterion itself falls; a smooth minimum
+over time would also pull at frames that need not be near. A run ends once the loss is 1e-5 of the first one, which is a
+distance of 1 mm. The floor (y = 0) has kappa = 400 N/m and dhat = 5 cm, without friction and damping.
 
-Choices the paper leaves open: a cube of 0.3 m, of 100 kg/m^3 and mu = lam = 2e5 Pa, released at a height of 1 m and
-tilted, so that it lands on a corner and leaves spinning; a floor with kappa = 400 N/m and dhat = 5 cm, without friction
-and damping; 200 steps of 4 ms; K = 20 sweeps, which solve these steps to 0.1 mm in the path of the center. The model
-has the rigid correction, as by default. The loss is the squared distance of the closest frame after the first contact
-and nothing else, so the criterion itself falls; a smooth minimum over time would also pull at frames that need not be
-near. The offset is free. The run ends once the loss is 1e-5 of the first one, which is a distance of 1 mm.
+cube-bounce: A cube of 0.3 m, of 100 kg/m^3 and mu = lam = 2e5 Pa, is released at a height of 1 m and tilted. It starts
+0.304 m from the target; the paper reaches 0.013 m in 151 iterations, along a path of 1.8 m. 200 steps of 4 ms; K = 20
+solves these steps to 0.1 mm in the path of the center. The offset of the release is free.
 
-bunny-bounce: A soft bunny is thrown onto the floor (y = 0). Adam with gradient clipping moves 3 numbers, its first
-velocity, until the center of mass passes a target voxel on the way after the first contact. The result is judged by the
-closest distance of the center of mass from the voxel's center after that contact.
-
-The paper's bunny starts 0.035 m from its target and ends at 0.034 m after 100 iterations, which shows that the gradient
-runs, not that it helps. This one starts 0.304 m away, as the cube does, and shall end within the same 0.034 m.
-
-Choices the paper leaves open: `mesh.bunny`, 0.3 m high, 341 vertices and 1,155 tets (the paper's: 339 and 897), of 1000
-kg/m^3 and mu = lam = 2e4 Pa, released with its feet 0.3 m above the floor; 150 steps of 1/300 s; K = 10 sweeps, 3 mm
-from the path of 40 sweeps (a stiffer bunny needs more); floor, loss and end of the run as for cube-bounce.
+bunny-bounce: `mesh.bunny`, 0.3 m high, 341 vertices and 1,155 tets (the paper's: 339 and 897), of 1000 kg/m^3 and mu =
+lam = 2e4 Pa, released with its feet 0.3 m above the floor. It shall end within the paper's 0.034 m. 150 steps of 1/300
+s; K = 10 is 3 mm from the path of 40 sweeps (a stiffer bunny needs more).
 """
 
 import math
@@ -43,28 +33,17 @@ VOXEL = 0.05  # side of the target in pictures [m]; the distance is that to its 
 
 @dataclass(frozen=True)
 class Bounce:
-    """A soft body that is released above the floor y = 0, and where it shall go.
+    """A soft body that is released above the floor y = 0, and where it shall go."""
 
-    Attributes:
-        mesh: The body where it is released, at rest.
-        target: Where the center of mass shall pass after the first contact [m].
-        density: [kg/m^3].
-        mu, lam: Lame parameters [Pa].
-        time_step: [s].
-        steps, sweeps: Number of steps, and of sweeps in each.
-        kappa, dhat: Stiffness [N/m] and range [m] of the floor's barrier; a vertex below dhat is in contact.
-        device: A torch device.
-    """
-
-    mesh: dv.TetMesh
-    target: tuple[float, float, float]
-    density: float
-    mu: float
+    mesh: dv.TetMesh  # where it is released, at rest
+    target: tuple[float, float, float]  # where the center of mass shall pass after the first contact [m]
+    density: float  # [kg/m^3]
+    mu: float  # [Pa]
     lam: float
-    time_step: float
+    time_step: float  # [s]
     steps: int
-    sweeps: int
-    kappa: float = 400.0
+    sweeps: int  # of a step
+    kappa: float = 400.0  # stiffness [N/m] and range [m] of the floor's barrier; a vertex below dhat is in contact
     dhat: float = 0.05
     device: str = "cpu"
 
@@ -82,12 +61,8 @@ class Bounce:
         return torch.tensor(values, dtype=self.model.dtype, device=self.model.device)
 
     def motion(self, offset: Tensor, velocity: Tensor) -> Tensor:
-        """Positions [m] of all frames, shape [steps + 1, ..., V, 3].
-
-        Args:
-            offset: Of the release [m], shape [..., 3]; leading dimensions are scenes.
-            velocity: Of all vertices at the release [m/s], shape [..., 3].
-        """
+        """Positions [m] of all frames, shape [steps + 1, ..., V, 3], from the offset of the release [m] and the
+        velocity of all vertices [m/s], shape [..., 3]; leading dimensions are scenes."""
         x = self.model.rest_points + offset.unsqueeze(-2)
         v = velocity.unsqueeze(-2).expand_as(x)
         solver = dv.VBD(self.time_step, self.sweeps)
@@ -211,11 +186,7 @@ def scene(settings: Settings, sweeps: int = SWEEPS) -> Bounce:
 
 
 def cube_bounce(settings: Settings, sweeps: int = SWEEPS) -> Problem:
-    """The task cube-bounce; with another number of sweeps per step on request.
-
-    Raises:
-        ValueError: no sweeps.
-    """
+    """The task cube-bounce; with another number of sweeps per step, at least 1, on request."""
     if sweeps < 1:
         raise ValueError(f"sweeps: expected at least 1, got {sweeps}")
     return problem("cube-bounce", scene(settings, sweeps), VELOCITY, moves=("offset", "velocity"),

@@ -1,31 +1,27 @@
 """Throw three soft disks so that together they cover a round target (paper, section 6.5 and appendix "Task protocols").
 
-Three disks of radius r = 0.42 m are released above a target of radius R = 0.45 m that is painted on the floor (y = 0);
-r must exceed R sqrt(3)/2, below which no three disks cover the target. They fall 2.5 m, land on the floor and on one
-another, stack and slide: contact has no friction. Adam with gradient clipping moves 18 numbers, for each disk its
-initial velocity and an offset of where it is released, by the gradient through all 160 steps. The loss is a smooth
-uncovered share of the target after the last step, whose sigmoid is sharpened from 4 / R to 25 / R on the way; the
-result is judged by the share of 4,000 points of the target that lie below no triangle of the disks. This share reaches
-0.0 % well before the last of the 600 evaluations, which are the paper's count, and the rest lowers the smooth loss.
+The disks have a radius r = 0.42 m, the target on the floor (y = 0) has R = 0.45 m; r must exceed R sqrt(3)/2, below
+which no three disks cover the target. The 18 numbers are the initial velocity of each disk and an offset of where it is
+released. The sigmoid of the loss is sharpened from 4 / R to 25 / R; the result is judged by the share of 4,000 points
+of the target that lie below no triangle of the disks. It reaches 0.0 % well before the last of the 600 evaluations,
+which are the paper's count, and the rest lowers the smooth loss.
 
-Choices the paper leaves open: disks are 6 cm thick with three rings of vertices (74 vertices, 162 tets each), of 1000
-kg/m^3 and mu = lam = 2e4 Pa; h = 1/150 s; K = 2 sweeps; one search for pairs per step, up to 10 cm. Disks start 0.35 m
-from the target's axis, 25 cm above one another, and move away from it at 0.4 m/s, to which a seed adds noise: some nine
-tenths of the target stay uncovered. Above one another, because disks that fall side by side meet rim to rim on the
-floor, and no small change lifts one over the other. Offsets are at most 0.1 m along each axis. Lighter disks and longer
-slides cover the target too, but bounce, and their gradient is rough. It still has cliffs: whether a disk bounces off
-another or comes to lie on it hangs on small changes. Adam alone, at half the rate, covered the target from two of three
-seeds, crossed a cliff with the third and ended with 3 % uncovered. The stage is therefore `rough`: Adam goes back to
-its lowest loss, at a lower rate, once a loss is twice as high (`diffvbd/tasks/optimizer.py`). Without clipping, bounces
-on the way may leave Adam with steps that are too short: such a run ended with 1 % uncovered.
+Choices: disks are 6 cm thick with three rings of vertices (74 vertices, 162 tets each), of 1000 kg/m^3 and mu = lam =
+2e4 Pa; h = 1/150 s; K = 2 sweeps; one search for pairs per step, up to 10 cm. Disks start 0.35 m from the target's
+axis, 25 cm above one another, and move away from it at 0.4 m/s, to which a seed adds noise: some nine tenths of the
+target stay uncovered. Above one another, because disks that fall side by side meet rim to rim on the floor, and no
+small change lifts one over the other. Offsets are at most 0.1 m along each axis. Lighter disks and longer slides cover
+the target too, but bounce, and their gradient is rough. Adam alone, at half the rate, covered the target from two of
+three seeds, crossed a cliff with the third and ended with 3 % uncovered, so the stage is `rough`. Without clipping,
+bounces on the way may leave Adam with steps that are too short: such a run ended with 1 % uncovered.
 
-What is solved is the motion of these steps, and few sweeps and long steps bounce less than short ones. So the findings
-say what the same throw leaves uncovered in steps four times as short with four times as many sweeps.
+Few sweeps and long steps bounce less than short ones. So the findings say what the same throw leaves uncovered in steps
+four times as short with four times as many sweeps.
 """
 
 import math
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -68,11 +64,7 @@ FULL, QUICK = Version(3, HEIGHT, 160, SWEEPS, 600), Version(2, 0.5, 75, 4, 30)
 
 
 def problem(settings: Settings, radius: float = RADIUS) -> Problem:
-    """The task; disks of another radius [m] on request.
-
-    Raises:
-        ValueError: radius is at most R sqrt(3)/2.
-    """
+    """The task; disks of another radius [m] on request. ValueError for at most R sqrt(3)/2."""
     least = 0.5 * math.sqrt(3) * TARGET_RADIUS
     if not radius > least:
         raise ValueError(
@@ -89,7 +81,12 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
                   before=fall.anneal, criterion="uncovered", capturable=True)
         ],
         estimates=fall.estimates,
-        protocol=protocol(fall, radius),
+        protocol={"radius": radius, "target_radius": TARGET_RADIUS, "vertices": fall.model.num_vertices,
+                  "tets": fall.model.num_tets, "rings": version.rings, "steps": version.steps, "time_step": TIME_STEP,
+                  "sweeps": version.sweeps, "density": DENSITY, "mu": MU, "lam": LAM, "kappa": KAPPA, "dhat": DHAT,
+                  "damping": DAMPING, "reach": REACH, "detections": 1, "heights": fall.centers[:, 1].tolist(),
+                  "sharpness": SHARPNESS, "clip": CLIP, "offset": OFFSET, "noise": NOISE,
+                  "samples": (SAMPLES, FINE_SAMPLES)},
         findings=None if settings.quick else fall.findings,
         picture=fall.picture,
         animation=fall.animation,
@@ -172,15 +169,6 @@ def model_of(disk: dv.TetMesh, centers: np.ndarray) -> dv.Model:
     return dv.Model(dv.mesh.join([disk.translate(c) for c in centers]), density=DENSITY, energies=energies)
 
 
-def protocol(fall: Fall, radius: float) -> dict[str, Any]:
-    return {"radius": radius, "target_radius": TARGET_RADIUS, "vertices": fall.model.num_vertices,
-            "tets": fall.model.num_tets, "rings": fall.version.rings, "steps": fall.version.steps,
-            "time_step": TIME_STEP, "sweeps": fall.version.sweeps, "density": DENSITY, "mu": MU, "lam": LAM,
-            "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING, "reach": REACH, "detections": 1,
-            "heights": fall.centers[:, 1].tolist(), "sharpness": SHARPNESS, "clip": CLIP, "offset": OFFSET,
-            "noise": NOISE, "samples": (SAMPLES, FINE_SAMPLES)}  # fmt: skip
-
-
 def outline(disk: dv.TetMesh) -> np.ndarray:
     """Vertices of the upper rim of `mesh.disk` [n], clockwise as seen from above."""
     x, y, z = disk.points.T
@@ -202,13 +190,8 @@ def sunflower(count: int, radius: float) -> Tensor:
 
 
 def smooth_uncovered(rims: Tensor, points: Tensor, sharpness: Tensor) -> Tensor:
-    """Mean over points of the product over disks of sigmoid(-sharpness distance), distance to the outline from inside.
-
-    Args:
-        rims: Outlines [m], shape [disks, n, 3], convex, in the order of `outline` or against it.
-        points: (x, z) [m], shape [N, 2].
-        sharpness: Scalar [1/m].
-    """
+    """Mean over points (x, z) [N, 2] [m] of the product over disks of sigmoid(-sharpness distance), distance to the
+    outline from inside; rims [disks, n, 3] [m] are convex, in the order of `outline` or against it."""
     start = rims[..., ::2]
     edge = start.roll(-1, 1) - start
     # a disk that has landed upside down is gone round the other way

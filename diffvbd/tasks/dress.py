@@ -1,36 +1,25 @@
 """Identify both Lame parameters of a dress that falls onto a mannequin (paper, section 6.5).
 
-The tasks dress-mu-lam, which observes vertices, and dress-silhouette, which observes an outline.
+The tasks dress-mu-lam, which observes vertices, and dress-silhouette, which observes an outline. The early window ends
+when the hem has landed, the settled one is the drape. Stage A alone meets the bars of both tasks. Stage B alone, from
+the same start, is run at the end for comparison (findings of a run). It finds the material from vertices, and from
+outlines it comes within a per cent in its five rounds. The paper's ends at a fixed point that is no solution. That is a
+matter of the scene: each window here sees both parameters, since without friction the dress still swings and turns
+about its axis at the end.
 
-A dress of 600 vertices is held at the neck and falls from its rest shape: it drapes over a mannequin, a capsule that
-stands on the floor (y = 0), and its hem lands and slides outwards. Two windows of the motion are observed: every one of
-the first 16 frames (until the hem has landed), and the time average of the last 32 (the drape, called settled). Stage A
-is Adam on the sum of both objectives; stage B alternates between Newton's method for mu on the settled objective and
-for lam on the early one (paper, section 6.5 and appendix "Task protocols"). Stage A alone meets the bars of both tasks.
+Choices: a gown 0.8 m tall whose hem starts 5 cm above the floor, of the mesh's default thickness, and of 100 kg/m^3, so
+that it stretches by a tenth or two at 1500 Pa; a mannequin of 13 cm, 2.5 cm less than the waist's inner layer; 80 steps
+of 1/60 s. No friction, as in the paper's other task with contact, and no self-contact. K = 20 sweeps for target and fit
+alike: with 10 the alternation on outlines no longer contracts at the solution. One search for pairs a step, up to 10
+cm. Both objectives are mean squared distances [m^2], added as they are. Newton's steps are damped by a limit, and a
+solve makes two of them. The sweeps start from the predictor, as in the paper.
 
-Stage B alone, from the same start, is run at the end for comparison (findings of a run). It finds the material from
-vertices, and from outlines it comes within a per cent in its five rounds. The paper's ends at a fixed point that is no
-solution. That is a matter of the scene: each window here sees both parameters, since without friction the dress still
-swings and turns about its axis at the end.
-
-Choices the paper leaves open: a gown 0.8 m tall whose hem starts 5 cm above the floor, of the mesh's default thickness,
-and of 100 kg/m^3, so that it stretches by a tenth or two at 1500 Pa; a mannequin of 13 cm, 2.5 cm less than the waist's
-inner layer; 80 steps of 1/60 s. No friction, as in the paper's other task with contact, and no self-contact. K = 20
-sweeps for target and fit alike: with 10 the alternation on outlines no longer contracts at the solution. One search for
-pairs a step, up to 10 cm. Both objectives are mean squared distances [m^2], added as they are. Newton's steps are
-damped by a limit, and a solve makes two of them. The sweeps start from the predictor, as in the paper.
-
-Of a frame dress-silhouette sees the profile alone: the radius of the outline around the mannequin's axis at 21 heights,
-which says nothing of which vertex is where. It is differentiable: a soft maximum of the vertices' distances from the
-axis, in a window around each height.
-
-Its choices: heights from the floor to the neck, 4.25 cm apart; Gaussian windows of 3 cm, half the distance of rings;
-the weight of a vertex grows by a factor e per cm of its distance from the axis.
+Choices of dress-silhouette: heights from the floor to the neck, 4.25 cm apart; Gaussian windows of 3 cm, half the
+distance of rings; the weight of a vertex grows by a factor e per cm of its distance from the axis.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +31,7 @@ from diffvbd import losses, viz
 from diffvbd.tasks.cloth import few_sweeps, ring_of_vertices
 from diffvbd.tasks.optimizer import Newton
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
+from diffvbd.tasks.report import pictures
 from diffvbd.tasks.runner import solve
 
 TRUTH = {"mu": 1500.0, "lam": 800.0}  # [Pa]
@@ -99,9 +89,14 @@ def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], 
 
     return Problem(name=name, parameters={"log_mu": drape.log_mu, "log_lam": drape.log_lam}, stages=stages,
                    estimates=drape.estimates, truth=TRUTH, units={"mu": "Pa", "lam": "Pa"},
-                   protocol=protocol(drape.model, version, len(stages)),
-                   findings=None if alone or settings.quick else findings, picture=drape.picture,
-                   animation=drape.animation)  # fmt: skip
+                   protocol={"vertices": drape.model.num_vertices, "tets": drape.model.num_tets, "thickness": THICKNESS,
+                             "steps": version.steps, "early": version.early, "settled": version.settled,
+                             "time_step": TIME_STEP, "sweeps": SWEEPS, "density": DENSITY,
+                             "mannequin": [FOOT, HEAD, RADIUS], "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING,
+                             "reach": REACH, "detections": 1, "start": START, "stages": len(stages)},
+                   findings=None if alone or settings.quick else findings,
+                   **pictures(drape.mesh.surface, drape.motions, TIME_STEP, [0, version.early, version.steps], TRUTH,
+                              scenery=scenery()))  # fmt: skip
 
 
 class Drape:
@@ -111,7 +106,12 @@ class Drape:
         self.observe, self.version = observe, version
         self.mesh = dv.mesh.dress(version.segments, version.rings, THICKNESS, NECK, HEM)
         neck = ring_of_vertices(self.mesh, version.segments, version.rings) == 0
-        self.model = model_of(self.mesh, neck).to(settings.device)
+        energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
+                    dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH)
+                    )  # fmt: skip
+        mannequin = dv.colliders.Capsule(FOOT, HEAD, RADIUS)
+        model = dv.Model(self.mesh, density=DENSITY, pinned=neck, energies=energies, colliders=[mannequin])
+        self.model = model.to(settings.device)
         self.still = torch.zeros_like(self.model.rest_points)
         self.start, truth = (self.still.new_tensor(values) for values in (START, list(TRUTH.values())))
         with torch.no_grad():
@@ -122,9 +122,9 @@ class Drape:
     @few_sweeps()
     def fall(self, mu: Tensor, lam: Tensor, steps: int | None = None) -> Tensor:
         """Positions [m] of all frames, shape [steps + 1, V, 3]."""
-        steps = self.version.steps if steps is None else steps
         solver = dv.VBD(TIME_STEP, SWEEPS, start="predictor")
-        return dv.rollout(self.model, self.model.rest_points, self.still, solver, steps=steps, mu=mu, lam=lam).x
+        return dv.rollout(self.model, self.model.rest_points, self.still, solver, steps=steps or self.version.steps,
+                          mu=mu, lam=lam).x  # fmt: skip
 
     def recovered(self, steps: int | None = None) -> Tensor:
         return self.fall(self.log_mu.exp(), self.log_lam.exp(), steps)
@@ -158,29 +158,6 @@ class Drape:
             "recovered": self.recovered(),
         }
 
-    def picture(self, path: Path, history: list[Row]) -> None:
-        shown = [0, self.version.early, self.version.steps]
-        frames = {name: motion[shown] for name, motion in self.motions().items()}
-        viz.comparison(path, self.mesh.surface, frames, [k * TIME_STEP for k in shown], history, TRUTH, scenery())
-
-    def animation(self, path: Path) -> None:
-        viz.animation(path, self.mesh.surface, self.motions(), TIME_STEP, scenery())
-
-
-def model_of(mesh: dv.TetMesh, neck: np.ndarray) -> dv.Model:
-    """The dress, pinned at the neck, above floor and mannequin."""
-    return dv.Model(
-        mesh,
-        density=DENSITY,
-        pinned=neck,
-        energies=(
-            dv.StableNeoHookean(),
-            dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
-            dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
-        ),
-        colliders=[dv.colliders.Capsule(FOOT, HEAD, RADIUS)],
-    )
-
 
 def newton(loss: Callable[[], Tensor], moved: str, name: str) -> Stage:
     """One solve of stage B: Newton's method for one of the two numbers."""
@@ -202,13 +179,6 @@ def scenery() -> list[viz.Scenery]:
     return [viz.floor((-0.5, -0.5), (0.5, 0.5)), *mannequin]
 
 
-def protocol(model: dv.Model, version: Version, stages: int) -> dict[str, Any]:
-    return {"vertices": model.num_vertices, "tets": model.num_tets, "thickness": THICKNESS, "steps": version.steps,
-            "early": version.early, "settled": version.settled, "time_step": TIME_STEP, "sweeps": SWEEPS,
-            "density": DENSITY, "mannequin": [FOOT, HEAD, RADIUS], "kappa": KAPPA, "dhat": DHAT, "damping": DAMPING,
-            "reach": REACH, "detections": 1, "start": START, "stages": stages}  # fmt: skip
-
-
 def dress_mu_lam(settings: Settings) -> Problem:
     """The task dress-mu-lam."""
     return problem("dress-mu-lam", settings, observe=lambda frames: frames)
@@ -221,12 +191,7 @@ def dress_silhouette(settings: Settings) -> Problem:
 
 
 def profile(x: Tensor, heights: Tensor) -> Tensor:
-    """Radius of the outline around the y axis [m] at each height, shape [..., H].
-
-    Args:
-        x: Positions [m], shape [..., V, 3].
-        heights: [m], shape [H].
-    """
+    """Radius [m] of the outline of positions x [..., V, 3] [m] around the y axis at each height [H] [m], [..., H]."""
     radius = x[..., ::2].norm(dim=-1)[..., None, :]
     below = (x[..., None, :, 1] - heights[:, None]) / WINDOW
     return ((radius / SOFTNESS - 0.5 * below.square()).softmax(-1) * radius).sum(-1)

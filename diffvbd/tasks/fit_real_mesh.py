@@ -1,11 +1,9 @@
 """Map the stiffness inside a body from where its surface was seen to move: one unknown for each tet.
 
-A rabbit, 0.3 m high, is held at its lower tenth and pulled at eight places of its surface, one after another, each time
-from rest. Given are the positions of the surface vertices at six times of each pull, simulated with the same mesh and
-solver, with Gaussian noise of 0.1 % of the height. The truth has two regions, a soft one and one four times as stiff,
-but neither their number nor their place is given: every tet has its own log mu, and its lam by a known Poisson's ratio.
-Some tets hardly move the surface, so the total variation of log mu over inner faces is minimised along with the misfit.
-The paper recovers uniform materials only (section 6.5); this is the same gradient, with respect to a field.
+A rabbit, 0.3 m high, is held at its lower tenth and pulled, each time from rest. Its surface is seen at six times of
+each pull, with Gaussian noise of 0.1 % of the height. The stiff region is four times as stiff. Every tet has its own
+log mu, and its lam by a known Poisson's ratio. Some tets hardly move the surface: hence the total variation over inner
+faces. The paper recovers uniform materials only (section 6.5); this is the same gradient, with respect to a field.
 
 How much total variation: the discrepancy principle (Morozov 1966). The misfit is the mean squared residual over the
 variance of the noise; the truth has 1, give or take sqrt(2 / N) for N observed numbers. The weight begins high, where
@@ -14,17 +12,16 @@ that finds it at most 1 goes on at the same weight. The last possible weight, 3.
 the noise happens to be larger than stated. High weights lead the way: with a low one from the start L-BFGS takes
 longer.
 
-Choices the paper leaves open, as it has no such task: the default mesh is `dv.mesh.bunny(10)`, a likeness made of
-ellipsoids that needs no file. A file (option --mesh) holds tets, or a surface that `dv.mesh.tetrahedralize` fills; it
-is scaled to a height of 0.3 m, y up, so that loads, stiffness and time step suit it. A plane through the middle of the
-bounding box, normal to (1, 1, 0), splits the regions: the rabbit's head and ears are stiff. Places to pull at are
-farthest points of the surface above the held part; a pull is a traction on the surface within 3.6 cm, away from the
-middle of the base, so that thin parts are not torn off. No gravity; density 1000 kg/m^3. Steps of 5 ms and 20 sweeps
-relaxed by 1.7 are on average 0.06 mm off converged ones, below the noise; ten sweeps are 1.3 mm off, and the map would
-be one for that solver. Finer meshes need more sweeps, so a surface should be filled with edges of a tenth of its
-diagonal (--edge-length), and larger ones more evaluations (--iterations). Total variation is smoothed below jumps of
-5 % in mu. mu stays within a factor 30 of the first guess, because line searches try wild steps. The sweeps start from
-the predictor, as in the paper's tasks.
+Choices: the default mesh is `dv.mesh.bunny(10)`, a likeness made of ellipsoids that needs no file. A file (option
+--mesh) holds tets, or a surface that `dv.mesh.tetrahedralize` fills; it is scaled to a height of 0.3 m, y up, so that
+loads, stiffness and time step suit it. A plane through the middle of the bounding box, normal to (1, 1, 0), splits the
+regions: the rabbit's head and ears are stiff. Places to pull at are farthest points of the surface above the held part;
+a pull is a traction on the surface within 3.6 cm, away from the middle of the base, so that thin parts are not torn
+off. No gravity; density 1000 kg/m^3. Steps of 5 ms and 20 sweeps relaxed by 1.7 are on average 0.06 mm off converged
+ones, below the noise; ten sweeps are 1.3 mm off, and the map would be one for that solver. Finer meshes need more
+sweeps, so a surface should be filled with edges of a tenth of its diagonal (--edge-length), and larger ones more
+evaluations (--iterations). Total variation is smoothed below jumps of 5 % in mu. mu stays within a factor 30 of the
+first guess, because line searches try wild steps. The sweeps start from the predictor, as in the paper's tasks.
 """
 
 import math
@@ -82,9 +79,9 @@ def problem(
         ImportError: the file holds a surface, and pytetwild is missing.
     """
     version = QUICK if settings.quick else FULL
+    if iterations is not None and iterations < 1:
+        raise ValueError(f"iterations: expected at least 1, got {iterations}")
     if iterations is not None:
-        if iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {iterations}")
         version = version._replace(counts=(version.counts[0], *(iterations for _ in version.counts[1:])))
     if edge_length is not None and (mesh is None or mesh.suffix.lower() not in SURFACES):
         raise ValueError(f"edge_length: expected it with a mesh that is a surface ({', '.join(SURFACES)}), got {mesh}")
@@ -95,7 +92,10 @@ def problem(
         name="fit-real-mesh",
         parameters={"level": fit.level, "exponents": fit.exponents},
         state={"lowered": fit.lowered},
-        stages=[stage_of(fit, k, count) for k, count in enumerate(version.counts)],
+        # L-BFGS on one number for all tets (stage 0), or on one for each
+        stages=[Stage(loss=fit.loss, iterations=count, optimizer=lambda p: lbfgs(p, history=30),
+                      moves=("exponents",) if k else ("level",), before=partial(fit.lower, k), capturable=True,
+                      name=f"field, weight {k}" if k else "uniform") for k, count in enumerate(version.counts)],
         estimates=fit.estimates,
         truth={"mu_soft": SOFT, "mu_stiff": STIFF},
         units={"mu_soft": "Pa", "mu_stiff": "Pa"},
@@ -205,17 +205,9 @@ class Fit:
         viz.animation(path, self.body.surface, motions, TIME_STEP)
 
 
-def stage_of(fit: Fit, number: int, iterations: int) -> Stage:
-    """L-BFGS on one number for all tets (stage 0), or on one for each."""
-    return Stage(loss=fit.loss, iterations=iterations, optimizer=lambda p: lbfgs(p, history=30),
-                 moves=("exponents",) if number else ("level",), before=partial(fit.lower, number), capturable=True,
-                 name=f"field, weight {number}" if number else "uniform")  # fmt: skip
-
-
 def read(path: Path, edge_length: float | None = None) -> dv.TetMesh:
     """Tets of a file, or those that fill the surface in it; edge_length as in `dv.mesh.tetrahedralize`."""
-    surface = path.suffix.lower() in SURFACES
-    if not surface:
+    if path.suffix.lower() not in SURFACES:
         return dv.mesh.load(path)
     with warnings.catch_warnings():  # the unit of the file does not matter: the body is scaled
         warnings.filterwarnings("ignore", message="surface: its largest extent")

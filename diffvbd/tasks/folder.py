@@ -36,12 +36,9 @@ def _make(out: Path) -> None:
 
 @contextlib.contextmanager
 def alone_in(out: Path) -> Iterator[None]:
-    """Makes a folder that one run at a time works in.
+    """Makes a folder that one run at a time works in; ValueError for no folder, or one that another run works in.
 
     The system keeps the lock for as long as the process lives, on the folder itself: no file is left behind by a crash.
-
-    Raises:
-        ValueError: no folder, or one that another run works in.
     """
     _make(out)
     if fcntl is None:
@@ -62,11 +59,8 @@ def alone_in(out: Path) -> Iterator[None]:
 
 
 def prepare(out: Path, task: str) -> None:
-    """Make the folder, or make sure that what lies in it may be replaced.
-
-    Raises:
-        ValueError: no folder, one that cannot be written to, or one with results of another task or of something else.
-    """
+    """Make the folder, or make sure that what lies in it may be replaced: ValueError for no folder, one that cannot be
+    written to, or one with results of another task or of something else."""
     _make(out)
     if not os.access(out, os.W_OK | os.X_OK):
         raise ValueError(f"out: expected a folder that can be written to, got {out}")
@@ -106,12 +100,8 @@ def is_first() -> bool:
 
 @contextlib.contextmanager
 def joined(device: str, splits: bool) -> Iterator[None]:
-    """Inside, the processes that torchrun has started are one group; a process on its own stays so.
-
-    Raises:
-        ValueError: several processes for a task that does not split; a CUDA device by its number, where each rank takes
-            its own.
-    """
+    """Inside, the processes that torchrun has started are one group; a process on its own stays so. ValueError for
+    several processes of a task that does not split, and for a CUDA device by its number: each rank takes its own."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
         return
@@ -153,12 +143,8 @@ _DAMAGED = (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, Attr
 
 
 def read_archive(path: str | Path, expected: str) -> dict[str, Any]:
-    """All arrays of an .npz file.
-
-    Raises:
-        OSError: the file cannot be opened.
-        ValueError: not an .npz file, damaged, or more than MOST_BYTES when unpacked, looked at before it is.
-    """
+    """All arrays of an .npz file. OSError where it cannot be opened; ValueError where it is none, is damaged, or has
+    more than MOST_BYTES when unpacked, looked at before it is."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())

@@ -1,16 +1,14 @@
 """Train a network to drive a soft arm, by gradients through the simulation (a task that the paper does not have).
 
-A soft column of 0.4 m stands on a cart. The cart moves along the ground with an acceleration of at most 6 m/s^2 along
-each axis, which a network with one hidden layer of 32 tanh units chooses at every step from what it sees: tip and cart
-relative to the target, their velocities, and the time. The arm starts with a swing; after 0.75 s its tip must be at a
-target 0.15 to 0.35 m away, and stay there for another 0.25 s. Training runs 64 scenes in one batch, each with its own
-target and swing, and minimises the mean squared distance from tip to target over the last 0.25 s of all scenes. The
-findings report the same for 64 scenes that the training has not seen.
+The column has 0.4 m, the cart an acceleration of at most 6 m/s^2 along each axis. The network sees tip and cart
+relative to the target, their velocities, and the time. The arm starts with a swing; targets are 0.15 to 0.35 m away,
+and the tip must stay for 0.25 s, over which the loss is the mean squared distance of all scenes. The findings report
+the same for 64 scenes that the training has not seen.
 
-The same network from the same start is then trained by CMA-ES, which needs no gradient, for as many seconds as the
-gradient took. A generation is one batch of 21 networks in 64 scenes, without tapes; on a GPU, an iteration with the
-gradient is one CUDA graph, a generation is not. This needs the package cma, and how far it gets depends on the speed of
-the machine, so its part of the findings does not repeat.
+CMA-ES starts from the same network and runs for as many seconds as the gradient took. A generation is one batch of 21
+networks in 64 scenes, without tapes; on a GPU, an iteration with the gradient is one CUDA graph, a generation is not.
+This needs the package cma, and how far it gets depends on the speed of the machine, so its part of the findings does
+not repeat.
 
 Choices: 28 vertices; 1000 kg/m^3; mu = lam = 4e4 Pa, so soft that the column leans far over when the cart speeds up; h
 = 1/60 s; K = 16 sweeps. Targets are as high as the column stands, or a tip would reach them lying down. The cart is the
@@ -157,11 +155,7 @@ class Training:
             return found
 
     def comparison(self, history: list[Row]) -> dict[str, Any]:
-        """CMA-ES for as long as the gradient took.
-
-        Raises:
-            ImportError: the package cma is not installed.
-        """
+        """CMA-ES for as long as the gradient took; ImportError as of `cma_es`."""
         network, like, seconds = self.network, self.arm.like, history[-1]["seconds"]
 
         def losses(candidates: Tensor) -> Tensor:
@@ -241,26 +235,18 @@ def policies(network: nn.Module, vectors: Tensor) -> Policy:
 def cma_es(
     losses: Callable[[Tensor], Tensor], start: Tensor, seconds: float, seed: int
 ) -> tuple[Tensor, list[tuple[float, float]], int]:
-    """Lower a loss without its gradient for some seconds, at least one generation.
+    """Lower a loss, of rows [n, N] on the CPU, without its gradient for some seconds, at least one generation.
 
-    Args:
-        losses: Of each row of a tensor [n, N] on the CPU, shape [n].
-        start: [N].
-
-    Returns:
-        The best row, (seconds, lowest loss so far) after each generation, and how many losses that took.
-
-    Raises:
-        ImportError: the package cma is not installed.
+    Returns the best row, (seconds, lowest loss so far) after each generation, and how many losses that took. Raises
+    ImportError where the package cma is not installed.
     """
     try:
         import cma
     except ImportError:
         raise ImportError("no comparison with CMA-ES: it needs cma: pip install 'diffvbd[tasks]'") from None
     begun = time.perf_counter()
-    search = cma.CMAEvolutionStrategy(
-        start.tolist(), SPREAD, {"seed": seed % (2**32 - 1) + 1, "verbose": -9}
-    )  # 0 is the clock
+    options = {"seed": seed % (2**32 - 1) + 1, "verbose": -9}  # seed 0 is the clock
+    search = cma.CMAEvolutionStrategy(start.tolist(), SPREAD, options)
     course: list[tuple[float, float]] = []
     count = 0
     while not course or course[-1][0] < seconds:

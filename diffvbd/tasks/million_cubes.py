@@ -1,24 +1,23 @@
 """Launch a million soft cubes so that each is at its place in a formation at one moment (paper, section "Scale").
 
 Cubes of 3 mm (8 vertices and 6 tets each) lie in layers on a launch pad, let go from a squeeze by a tenth of their
-height. Each has a place in a ring that stands 1.77 m above the pad, the height of a throw whose apex is reached after
-0.6 s. Adam moves four numbers per body, its initial velocity and, through a sigmoid, its shear modulus, by the gradient
-through 240 steps of 5 ms with K = 5 sweeps; only states between every five steps are kept. The loss is the sum of Huber
+height. The ring stands 1.77 m above the pad, the height of a throw whose apex is reached after 0.6 s. The shear modulus
+passes a sigmoid; 240 steps of 5 ms with K = 5 sweeps, of which every fifth state is kept. The loss is the sum of Huber
 losses of the distances between centers of mass and places at t = 0.6 s. The first stage has no contact; in the second,
 bodies push each other away by a penalty between centers of mass (`diffvbd.contact.center_of_mass_penalty`), and the
 gradient goes through every push.
 
-Choices the paper leaves open: density 1000 kg/m^3, lam = 1e4 Pa, mu in 1e3 .. 1e5 Pa; Huber's delta 1 m; the limit of 5
-is on the gradient of each body's velocity. Pad and ring have a place every 8 mm. Bodies and places are matched in the
-order of x, then z, then y, each place mixed by a seed with its next few: mixed among all, bodies would meet everywhere
-on the way. Bodies overlap below 5.2 mm, the diagonal of a cube, and are pushed with 3e-3 N/m of overlap. That is soft:
-bodies that fly side by side and touch drift apart exponentially, at 0.1 N/m their gradients reach 1e6 and lead nowhere.
-The first guess is 3 m/s upwards for all. After t = 0.6 s bodies fly on without contact, which does not change the loss;
-the paper rolls these steps out, so it is the default (option `steps`). The center of mass of a free body does not
-depend on its material, except through what K = 5 sweeps leave unsolved: the gradient of mu is that of the executed
-solver, and tiny against that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does
-not identify it. The rigid correction is off (`subspace=None`) and the sweeps start from the predictor, as in the paper.
-float32, because a million bodies fill tens of GB; the quick version uses float64.
+Choices: density 1000 kg/m^3, lam = 1e4 Pa, mu in 1e3 .. 1e5 Pa; Huber's delta 1 m; the limit of 5 is on the gradient of
+each body's velocity. Pad and ring have a place every 8 mm. Bodies and places are matched in the order of x, then z,
+then y, each place mixed by a seed with its next few: mixed among all, bodies would meet everywhere on the way. Bodies
+overlap below 5.2 mm, the diagonal of a cube, and are pushed with 3e-3 N/m of overlap. That is soft: bodies that fly
+side by side and touch drift apart exponentially, at 0.1 N/m their gradients reach 1e6 and lead nowhere. The first guess
+is 3 m/s upwards for all. After t = 0.6 s bodies fly on without contact, which does not change the loss; the paper rolls
+these steps out, so it is the default (option `steps`). The center of mass of a free body does not depend on its
+material, except through what K = 5 sweeps leave unsolved: the gradient of mu is that of the executed solver, and tiny
+against that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does not identify it.
+The rigid correction is off (`subspace=None`) and the sweeps start from the predictor, as in the paper. float32, because
+a million bodies fill tens of GB; the quick version uses float64.
 
 That the bar is met says little: the paper does not say where its bodies start and end, so its errors and ours are of
 different scenes, and its times and memory are those of float64, ours of float32. The bar only keeps this task from
@@ -28,7 +27,7 @@ getting worse.
 import math
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -84,16 +83,10 @@ QUICK = Version(QUICK_BODIES, 24, 20, 0.05, 0.6, torch.float64, (15, 10), (0.5, 
 def problem(
     settings: Settings, bodies: int | None = None, steps: int | None = None, iterations: int | None = None
 ) -> Problem:
-    """The task.
+    """The task with so many cubes, steps of a rollout and iterations of each stage; defaults BODIES, STEPS, ITERATIONS.
 
-    Args:
-        settings: As of every task.
-        bodies: Number of cubes; default BODIES, or QUICK_BODIES in the quick version, which takes no more.
-        steps: Steps of a rollout, at least 120; default STEPS. The quick version has its own.
-        iterations: Of each stage; default ITERATIONS.
-
-    Raises:
-        ValueError: no bodies or iterations, too many bodies, or a rollout that ends before t = 0.6 s.
+    The quick version takes at most QUICK_BODIES, and has its own steps. ValueError for no bodies or iterations, too
+    many bodies, or a rollout that ends before t = 0.6 s.
     """
     version = chosen(settings.quick, bodies, steps, iterations)
     cubes = Cubes(settings, version)
@@ -108,7 +101,13 @@ def problem(
         ],
         estimates=lambda: {"mean_error": cubes.error.mean().item()},
         units={"mean_error": "m"},
-        protocol=protocol(cubes.cube, version),
+        protocol={"bodies": version.bodies, "vertices": version.bodies * cubes.cube.num_vertices,
+                  "tets": version.bodies * cubes.cube.num_tets, "steps": version.steps,
+                  "target_step": version.target_step, "iterations": version.counts, "edge": EDGE, "squeeze": SQUEEZE,
+                  "density": DENSITY, "mu": MU, "lam": LAM, "time_step": TIME_STEP, "sweeps": SWEEPS,
+                  "checkpoint_every": CHECKPOINT_EVERY, "radius": RADIUS, "stiffness": STIFFNESS, "huber": HUBER,
+                  "clip": CLIP, "spacing": (PAD_SPACING, RING_SPACING), "height": HEIGHT,
+                  "dtype": str(version.dtype)},
         findings=cubes.findings,
         picture=cubes.picture,
         animation=cubes.animation,
@@ -126,11 +125,9 @@ def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int |
     steps = version.steps if steps is None else steps
     if steps < version.target_step:
         raise ValueError(f"steps: expected at least {version.target_step}, which are 0.6 s, got {steps}")
-    counts = version.counts
-    if iterations is not None:
-        if iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {iterations}")
-        counts = (iterations, iterations)
+    if iterations is not None and iterations < 1:
+        raise ValueError(f"iterations: expected at least 1, got {iterations}")
+    counts = version.counts if iterations is None else (iterations, iterations)
     return version._replace(bodies=bodies, steps=steps, counts=counts)
 
 
@@ -261,15 +258,13 @@ class Cubes:
         return found
 
     @torch.no_grad()
-    def frames(self, every: int) -> Tensor:
-        return self.simulate(save=every)
-
     def picture(self, path: Path, history: list[Row]) -> None:
         every, count = self.version.target_step // 4, 6 if self.version.steps > self.version.target_step else 5
-        viz.cloud(path, self.frames(every)[:count], every * TIME_STEP, history, "mean_error")
+        viz.cloud(path, self.simulate(save=every)[:count], every * TIME_STEP, history, "mean_error")
 
+    @torch.no_grad()
     def animation(self, path: Path) -> None:
-        viz.cloud_animation(path, self.frames(every=4), 4 * TIME_STEP)
+        viz.cloud_animation(path, self.simulate(save=4), 4 * TIME_STEP)
 
 
 def is_near(points: Tensor, others: Tensor) -> Tensor:
@@ -281,15 +276,6 @@ def is_near(points: Tensor, others: Tensor) -> Tensor:
     apart = (others - others.clamp(low, high)).abs().amax(1)  # from the box around the points
     far = (apart > 1.01 * RADIUS) & others.isfinite().all()  # by more than what rounding can move
     return ~far
-
-
-def protocol(cube: dv.TetMesh, version: Version) -> dict[str, Any]:
-    return {"bodies": version.bodies, "vertices": version.bodies * cube.num_vertices,
-            "tets": version.bodies * cube.num_tets, "steps": version.steps, "target_step": version.target_step,
-            "iterations": version.counts, "edge": EDGE, "squeeze": SQUEEZE, "density": DENSITY, "mu": MU, "lam": LAM,
-            "time_step": TIME_STEP, "sweeps": SWEEPS, "checkpoint_every": CHECKPOINT_EVERY, "radius": RADIUS,
-            "stiffness": STIFFNESS, "huber": HUBER, "clip": CLIP, "spacing": (PAD_SPACING, RING_SPACING),
-            "height": HEIGHT, "dtype": str(version.dtype)}  # fmt: skip
 
 
 def launch_pad(bodies: int) -> np.ndarray:

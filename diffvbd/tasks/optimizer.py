@@ -44,11 +44,8 @@ class RetreatingAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float]) -> float:  # type: ignore[override]
-        """A step; ``closure`` evaluates the loss, not negative, and leaves its gradient in the parameters.
-
-        Raises:
-            ValueError: The loss is negative: no multiple of it says what a rise is.
-        """
+        """A step; ``closure`` evaluates the loss and leaves its gradient in the parameters. ValueError for a negative
+        loss: no multiple of it says what a rise is."""
         with torch.enable_grad():
             loss = float(closure())
         if loss < 0:
@@ -77,14 +74,7 @@ class Newton(torch.optim.Optimizer):
 
     A step evaluates at p and at p + probe, takes f'' from the difference of f', goes to p - f' / |f''|, by at most
     `limit`, and goes by `limit` where f'' says nothing. The absolute value makes it go downhill where f bends down.
-
-    Args:
-        parameters: One tensor with one element.
-        probe: Distance to the second gradient.
-        limit: Longest step.
-
-    Raises:
-        ValueError: not one parameter of one element.
+    Raises ValueError for anything but one parameter of one element.
     """
 
     def __init__(self, parameters: Iterable[Tensor], probe: float, limit: float) -> None:
@@ -114,12 +104,8 @@ class Newton(torch.optim.Optimizer):
 
 
 def lbfgs(parameters: Iterable[Tensor], history: int = 100) -> torch.optim.Optimizer:
-    """L-BFGS with steps of five line searches, after each of which the runner can save.
-
-    Args:
-        parameters: Tensors that it moves.
-        history: How many earlier changes of the gradient it remembers.
-    """
+    """L-BFGS with steps of five line searches, after each of which the runner can save; `history`: how many earlier
+    changes of the gradient it remembers."""
     # torch's own max_eval, 6 here, can leave a search too few evaluations: it ends where it began, as do all others.
     return torch.optim.LBFGS(parameters, max_iter=5, max_eval=30, tolerance_grad=0, tolerance_change=0,
                              history_size=history, line_search_fn="strong_wolfe")  # fmt: skip

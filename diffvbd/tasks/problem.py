@@ -152,44 +152,42 @@ def check(problem: Problem) -> None:
     if not isinstance(problem.stages, Sequence) or not problem.stages:
         raise ValueError(f"{name}: stages: expected at least one Stage in a list, got {problem.stages!r}")
     for k, stage in enumerate(problem.stages):
-        where = f"{name}: stages[{k}]"
-        if not isinstance(stage, Stage):
-            raise TypeError(f"{where}: expected a Stage, got {type(stage).__name__}")
-        if isinstance(stage.iterations, bool) or not isinstance(stage.iterations, int) or stage.iterations < 1:
-            raise ValueError(f"{where}.iterations: expected an integer of at least 1, got {stage.iterations!r}")
-        for key in ("loss", "optimizer", "before"):
-            value = getattr(stage, key)
-            if not (callable(value) or (value is None and key != "loss")):
-                raise TypeError(f"{where}.{key}: expected a function, got {value!r}")
-        if not isinstance(stage.rough, bool):
-            raise TypeError(f"{where}.rough: expected a bool, got {stage.rough!r}")
-        if stage.rough and stage.optimizer is not None:
-            raise ValueError(f"{where}.rough: expected False with an optimizer of its own, got {stage.rough!r}")
-        for key in ("learning_rate", "clip"):
-            value = getattr(stage, key)
-            if not (_is_number(value) and value > 0 or (value is None and key == "clip")):
-                raise ValueError(f"{where}.{key}: expected a number above 0, got {value!r}")
-        for key in ("tolerance", "gradient_tolerance"):
-            value = getattr(stage, key)
-            if not (_is_number(value) and value >= 0):
-                raise ValueError(f"{where}.{key}: expected a number of at least 0, got {value!r}")
-        if stage.moves is not None:
-            known = not isinstance(stage.moves, str) and len(stage.moves) > 0 and set(stage.moves) <= set(parameters)
-            if not known:
-                raise ValueError(
-                    f"{where}.moves: expected a list of names among {list(parameters)}, got {stage.moves!r}"
-                )
+        _check_stage(f"{name}: stages[{k}]", stage, parameters)
     if not isinstance(problem.truth, dict):
         raise TypeError(f"{name}: truth: expected numbers by name, got {problem.truth!r}")
     for key, value in problem.truth.items():
         if not _is_number(value) or value == 0:
-            raise ValueError(
-                f"{name}: truth[{key!r}]: expected a number that an error can be relative to, got {value!r}"
-            )
+            expected = "a number that an error can be relative to"
+            raise ValueError(f"{name}: truth[{key!r}]: expected {expected}, got {value!r}")
+
+
+def _check_stage(where: str, stage: Any, parameters: dict[str, Tensor]) -> None:
+    if not isinstance(stage, Stage):
+        raise TypeError(f"{where}: expected a Stage, got {type(stage).__name__}")
+    for key, error, expected, fits in _RULES:
+        value = getattr(stage, key)
+        if not (fits(value) or (value is None and key in ("optimizer", "before", "clip"))):
+            raise error(f"{where}.{key}: expected {expected}, got {value!r}")
+    if stage.rough and stage.optimizer is not None:
+        raise ValueError(f"{where}.rough: expected False with an optimizer of its own, got {stage.rough!r}")
+    moves = stage.moves
+    if moves is not None and (isinstance(moves, str) or not moves or not set(moves) <= set(parameters)):
+        raise ValueError(f"{where}.moves: expected a list of names among {list(parameters)}, got {moves!r}")
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+_RULES: tuple[tuple[str, type[Exception], str, Callable[[Any], bool]], ...] = (  # of the fields of a Stage
+    ("iterations", ValueError, "an integer of at least 1", lambda n: type(n) is int and n >= 1),
+    *((key, TypeError, "a function", callable) for key in ("loss", "optimizer", "before")),
+    ("rough", TypeError, "a bool", lambda rough: isinstance(rough, bool)),
+    *((key, ValueError, "a number above 0", lambda rate: _is_number(rate) and rate > 0)
+      for key in ("learning_rate", "clip")),
+    *((key, ValueError, "a number of at least 0", lambda least: _is_number(least) and least >= 0)
+      for key in ("tolerance", "gradient_tolerance")),
+)  # fmt: skip
 
 
 def check_row(problem: Problem, stage: int, estimates: Row) -> None:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import viz
+from diffvbd import losses, viz
 from diffvbd.results import Refinement
-from diffvbd.tasks.problem import Problem, Result, Row, Settings, estimates_of
+from diffvbd.tasks.problem import Problem, Result, Row, Settings, Stage, estimates_of
+from diffvbd.viz.pictures import VIEW
 
 LOG = logging.getLogger("diffvbd")
 
@@ -87,6 +88,70 @@ def pictures(
         viz.animation(path, surface, motions(), time_step, **options)
 
     return {"picture": picture, "animation": animation}
+
+
+def fitted(
+    name: str,
+    unknown: str,
+    simulate: Callable[[Tensor], Tensor],
+    start: Tensor,
+    true: Tensor,
+    estimates: Callable[[Tensor], Row],
+    stage: dict[str, Any],
+    drawn: tuple[NDArray[np.int64], float, list[int]],
+    observe: Callable[[Tensor], Tensor] = lambda x: x,
+    weight: float = 1.0,
+    target_name: str = "",
+    findings: Callable[[Tensor], dict[str, Any]] | None = None,
+    truth: Row | None = None,
+    view: tuple[float, float] = VIEW,
+    **fields: Any,
+) -> Problem:
+    """Problem of one stage of Adam: the values whose motion looks like that of the true ones.
+
+    Args:
+        name: Of the task.
+        unknown: Name of the parameter; "log_..." is the logarithm of the values.
+        simulate: Positions [m] of all frames [N, V, 3] from the values.
+        start, true: First guess and true values, of one shape.
+        estimates: Quantities to report, from the present values.
+        stage: `iterations`, `learning_rate` and other fields of the Stage.
+        drawn: Surface, time between frames [s] and frames shown, see `pictures`.
+        observe: Points [..., c] [m] that are seen of a motion; the loss is their mean squared distance.
+        weight: Of the loss.
+        target_name: Entry of the protocol for what is seen of the true motion, where that is one number.
+        findings: As in Problem, from the present values.
+        fields: Protocol and units of the Problem.
+    """
+    is_log = unknown.startswith("log_")
+    parameter = (start.log() if is_log else start.clone()).requires_grad_()
+
+    def now() -> Tensor:
+        return parameter.exp() if is_log else parameter
+
+    with torch.no_grad():
+        target_motion = simulate(true)
+        target = observe(target_motion)
+    if target_name:
+        fields["protocol"][target_name] = target.item()
+
+    @torch.no_grad()
+    def motions() -> dict[str, Tensor]:
+        return {"initial": simulate(start), "target": target_motion, "recovered": simulate(now())}
+
+    def loss() -> Tensor:
+        return weight * losses.vertex_distance(observe(simulate(now())), target)
+
+    return Problem(
+        name=name,
+        parameters={unknown: parameter},
+        stages=[Stage(loss=loss, capturable=True, **stage)],
+        estimates=lambda: estimates(now()),
+        truth=truth or {},
+        findings=None if findings is None else lambda history: findings(now()),
+        **fields,
+        **pictures(*drawn[:1], motions, *drawn[1:], truth, view=view),
+    )
 
 
 def table_of(start: Mapping[str, float], estimates: Row, truth: Row, errors: Row, units: Mapping[str, str]) -> str:

@@ -16,22 +16,10 @@ import torch
 from torch import Tensor
 
 from diffvbd.mesh.write import replace
+from diffvbd.tasks import problem as checks
 from diffvbd.tasks.folder import STATE, alone_in, is_first, prepare, put_aside, remove_results, with_own_folder
 from diffvbd.tasks.optimizer import optimizer_of
-from diffvbd.tasks.problem import (
-    OWN_KEYS,
-    Problem,
-    Result,
-    Row,
-    Settings,
-    Stage,
-    check,
-    check_device,
-    check_gradients,
-    check_loss,
-    check_row,
-    estimates_of,
-)
+from diffvbd.tasks.problem import OWN_KEYS, Problem, Result, Row, Settings, Stage, estimates_of
 from diffvbd.tasks.report import Progress, summary, survival, versions
 
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
@@ -58,8 +46,8 @@ def solve(problem: Problem, settings: Settings, watch: Callable[[Row], object] |
         ValueError, TypeError: the problem is not well formed; the device is not there; the folder cannot be written to,
             holds results of another task, or another run works in it.
     """
-    check(problem)
-    check_device(settings.device)
+    checks.check(problem)
+    checks.check_device(settings.device)
     with alone_in(settings.out) if is_first() else nullcontext(), with_own_folder(settings) as own:
         return _solve(problem, own, watch if is_first() else None)
 
@@ -90,11 +78,12 @@ def _minimise(run: "_Run", progress: Progress, begun: float) -> None:
         if stage.before:
             stage.before(len(run.rows))
         loss = gradient()
-        row = {"iteration": float(len(run.history)), "loss": loss.item(), "gradient_norm": _norm(parameters)}
+        norm = math.sqrt(sum(p.grad.square().sum().item() for p in parameters if p.grad is not None))
+        row = {"iteration": float(len(run.history)), "loss": loss.item(), "gradient_norm": norm}
         if len(problem.stages) > 1:
             row["stage"] = float(run.at)
         estimates = problem.estimates()
-        check_row(problem, run.at, estimates)
+        checks.check_row(problem, run.at, estimates)
         row |= estimates | {"seconds": time.perf_counter() - begun}
         if not (math.isfinite(row["loss"]) and math.isfinite(row["gradient_norm"])):
             raise ArithmeticError(f"{problem.name}: the loss or its gradient is not finite: {summary(row)}")
@@ -130,9 +119,9 @@ def _gradient(run: "_Run") -> Callable[[], Tensor]:
         for parameter in run.problem.parameters.values():
             parameter.grad = None
         loss = stage.loss()
-        check_loss(run.problem.name, run.at, loss)
+        checks.check_loss(run.problem.name, run.at, loss)
         loss.backward(inputs=list(run.moved.values()))
-        check_gradients(run.problem, run.at, list(run.moved))
+        checks.check_gradients(run.problem, run.at, list(run.moved))
         return loss.detach()
 
     if not (stage.capturable and run.cuda):
@@ -315,7 +304,9 @@ class _Run:
         problem, best = self.problem, self.history[self.last_best]
         estimates = estimates_of(best)
         errors = {name: abs(estimates[name] / true - 1) for name, true in problem.truth.items()}
-        memory = self._memory()  # before findings, which may run other things
+        memory = {}  # that the run has reserved of a CUDA device, before findings, which may run other things
+        if self.cuda:
+            memory = {"peak_memory_gb": torch.cuda.max_memory_reserved(self.settings.device) / 1e9}
         findings = problem.findings(self.history) if problem.findings else {}
         refined = survival(problem, self.settings, self.history[0]["loss"])
         listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
@@ -323,9 +314,8 @@ class _Run:
                              estimates=estimates, truth=problem.truth, units=problem.units, relative_error=errors,
                              findings=findings, refined=str(refined),
                              variables=sum(p.numel() for p in problem.parameters.values()), **memory)  # fmt: skip
-        result = Result(
-            best, self.history, estimates, errors, self.last_converged, self.last_stalled, [log], findings, refined
-        )
+        result = Result(best, self.history, estimates, errors, self.last_converged, self.last_stalled, [log], findings,
+                        refined)  # fmt: skip
         if listed.keys() != problem.parameters.keys():
             path = self.settings.out / "parameters.pt"
             replace(path, partial(_save, {name: p.detach().cpu() for name, p in problem.parameters.items()}))
@@ -334,19 +324,13 @@ class _Run:
         self.state.unlink(missing_ok=True)
         return result
 
-    def _memory(self) -> dict[str, float]:
-        """Most memory that the run has reserved of a CUDA device."""
-        return {"peak_memory_gb": torch.cuda.max_memory_reserved(self.settings.device) / 1e9} if self.cuda else {}
-
     def _draw(self, result: Result) -> None:
         """Pictures come last, and what goes wrong with them costs no result."""
-        problem, draw = self.problem, {}
-        if picture := problem.picture:
+        draw: dict[str, Callable[[Path], object]] = {}
+        if picture := self.problem.picture:
             draw["picture.png"] = lambda path: picture(path, self.history)
-        if problem.animation:
-            draw["motion.npz"] = problem.animation
-        if problem.animation and not self.settings.quick:
-            draw["animation.gif"] = problem.animation
+        if animation := self.problem.animation:
+            draw |= {"motion.npz": animation} | ({} if self.settings.quick else {"animation.gif": animation})
         for name, function in draw.items():
             try:
                 replace(self.settings.out / name, function)
@@ -361,10 +345,6 @@ def _save(state: dict[str, Any], path: Path) -> None:
     content = io.BytesIO()  # torch.save into a file turns the system's errors into others
     torch.save(state, content)
     path.write_bytes(content.getbuffer())
-
-
-def _norm(parameters: list[Tensor]) -> float:
-    return math.sqrt(sum(p.grad.square().sum().item() for p in parameters if p.grad is not None))
 
 
 @torch.no_grad()

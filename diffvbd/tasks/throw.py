@@ -1,18 +1,17 @@
 """Throw a soft ball into a box with a stretched sheet (a task that the paper does not have).
 
-A soft sheet of 1 x 0.7 m is clamped between two bars, 1 m above the floor, and a soft ball lies on it. Each of the four
-ends of the bars moves up and down along a cubic spline with four control points. L-BFGS moves these 16 numbers by the
-gradient through sheet, contact and flight. The loss is the squared distance, 0.9 s after the start, from the ball's
-center of mass to the middle of the opening of a box, 1.1 m ahead and 0.3 m aside, and a little of the mean squared
-acceleration of the ends, which is what remains of it. The first motion misses by 1.4 m. At the end the throw is
-simulated for twice the time with the walls of the box and the floor; the ball is caught if all of it is inside then.
+A sheet of 1 x 0.7 m is clamped 1 m above the floor; each spline has four control points. The loss is the squared
+distance, 0.9 s after the start, from the ball's center of mass to the middle of the opening of a box, 1.1 m ahead and
+0.3 m aside, and a little of the mean squared acceleration of the ends, which is what remains of it. At the end the
+throw is simulated for twice the time with the walls of the box and the floor; the ball is caught if all of it is inside
+then.
 
 Choices: the sheet is 3 cm thick, of 1e5 Pa, and stretched by 15 % along x: without that the ball sinks 3 cm deeper, and
 where it lands depends three times as strongly on the motion. The ball has a radius of 0.12 m and 3e4 Pa; both have 200
-kg/m^3. h = 1/200 s; K = 10 sweeps. dhat is 5 cm, more than contact itself needs. The throw
-begins at once: where the ball first rests on the sheet for 0.3 s, without damping, 2 mm of the control points move the
-landing by 6 cm, and Adam gets no closer than 0.8 m. Walls are left out of the optimisation: the loss does not ask what
-comes after the opening. The sweeps start from the predictor, as in the paper's tasks.
+kg/m^3. h = 1/200 s; K = 10 sweeps. dhat is 5 cm, more than contact itself needs. The throw begins at once: where the
+ball first rests on the sheet for 0.3 s, without damping, 2 mm of the control points move the landing by 6 cm, and Adam
+gets no closer than 0.8 m. Walls are left out of the optimisation: the loss does not ask what comes after the opening.
+The sweeps start from the predictor, as in the paper's tasks.
 """
 
 from pathlib import Path

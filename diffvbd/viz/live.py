@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +12,11 @@ import numpy as np
 import torch
 
 from .._common.checks import check_bool, check_count, fail
+from ..inspect.gradcheck import check_names
 from ..model.model import Model
-from .drawing import Scenery
-from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of
-from .values import Values
+from .motion import Mesh, mesh_of, motions_of, opened, scenery_of
+from .scenery import Scenery
+from .values import Values, values_of
 from .viewer import Slider, Viewer
 
 
@@ -74,25 +74,26 @@ def live(
         course = opened(Path(source), time_step)
         motions, mesh = course.motions, course.mesh if mesh is None else mesh
     elif callable(source) and not isinstance(source, (Model, torch.Tensor)):
-        simulate = _simulation(source, ranges)
+        if not ranges:
+            fail("sliders", "ranges of the function's parameters by name", "none")
+        check_names("source", source, ranges)
+        simulate = torch.no_grad()(source)
         motions = motions_of(simulate(**{name: first for name, (_, _, first) in ranges.items()}), mesh, time_step)
     else:
         mesh = source if mesh is None and isinstance(source, Model) else mesh
         motions = motions_of(source, mesh, time_step)
     if ranges and simulate is None:
         raise TypeError(f"source: expected a function of {', '.join(ranges)} for sliders, got {type(source).__name__}")
-    body, model = mesh_of(mesh), mesh if isinstance(mesh, Model) else None
-    if model is None and body is not None and mu is not None and lam is not None:
-        model = Model(body)  # for stresses
-    values = Values(model, mu, lam, colliders)
+    body, values = mesh_of(mesh), values_of(mesh, mu, lam, colliders)
     if simulate is not None:
         simulate = _with_material(simulate, values)
-        values.mu, values.lam = (_first(ranges, name, value) for name, value in (("mu", mu), ("lam", lam)))
+        values.mu, values.lam = (ranges[n][2] if n in ranges else value for n, value in (("mu", mu), ("lam", lam)))
     if not isinstance(scenery, Sequence) or not all(isinstance(thing, Scenery) for thing in scenery):
         raise TypeError(f"scenery: expected a sequence of dv.viz.Scenery, got {type(scenery).__name__}")
     things = tuple(scenery)
     if isinstance(mesh, Model):
-        things += scenery_of(mesh, *_bounds(motions), colliders)
+        corners = np.stack([motion.bounds for motion in motions.values()])
+        things += scenery_of(mesh, corners[:, 0].min(0), corners[:, 1].max(0), colliders)
     elif colliders is not None:
         fail("mesh", "a dv.Model with colliders", type(mesh).__name__)
     viewer = Viewer(motions, body if mesh is None else mesh, values, color=color, time_step=time_step, scenery=things,
@@ -104,15 +105,6 @@ def live(
     if browser:
         webbrowser.open(viewer.url)
     return viewer
-
-
-def _bounds(motions: Mapping[str, Motion]) -> tuple[np.ndarray, np.ndarray]:
-    corners = [motion.bounds for motion in motions.values()]
-    return np.min([low for low, _ in corners], 0), np.max([high for _, high in corners], 0)
-
-
-def _first(ranges: Mapping[str, Slider], name: str, otherwise: Any) -> Any:
-    return ranges[name][2] if name in ranges else otherwise
 
 
 def _ranges(sliders: Mapping[str, Sequence[float]]) -> dict[str, Slider]:
@@ -130,24 +122,6 @@ def _ranges(sliders: Mapping[str, Sequence[float]]) -> dict[str, Slider]:
             fail(f"sliders[{name!r}]", "(lowest, highest) or (lowest, highest, first), ascending", repr(given))
         found[name] = (low, high, first)
     return found
-
-
-def _simulation(function: Callable[..., Any], ranges: Mapping[str, Slider]) -> Callable[..., Any]:
-    """A user's function without gradients; raises for one that does not take the sliders' names."""
-    if not ranges:
-        fail("sliders", "ranges of the function's parameters by name", "none")
-    try:
-        inspect.signature(function).bind(**dict.fromkeys(ranges))
-    except TypeError as error:
-        raise TypeError(f"source: expected a function of {', '.join(ranges)}: {error}") from None
-    except ValueError:
-        pass  # a builtin without a signature
-
-    def simulate(**values: float) -> Any:
-        with torch.no_grad():
-            return function(**values)
-
-    return simulate
 
 
 def _with_material(simulate: Callable[..., Any], values: Values) -> Callable[..., Any]:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -24,44 +24,32 @@ from ..mesh.tet_mesh import TetMesh, boundary_faces
 from ..mesh.write import replace
 from ..model.model import Model
 from ..rollout.trajectory import Trajectory
-from .drawing import SCENERY, Scenery, as_array, capsule, check_surface
+from .scenery import SCENERY, Scenery, as_array, capsule, check_surface
 
 Mesh = Model | TetMesh
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of a surface over time.
+    """Positions of a surface over time."""
 
-    Attributes:
-        points: Positions [m], shape [N, V, 3].
-        triangles: Boundary triangles, outward oriented, shape [F, 3].
-        times: Of each frame [s], shape [N]; None: not known.
-        body: Label of each vertex, shape [V].
-        tets: Tet that each triangle bounds, shape [F]; None for a bare surface.
-        velocities: [m/s], shape [N, V, 3]; None: those between frames.
-        steps: Step number of each frame, shape [N]; None: not known.
-        scene: Which of several scenes it is, for values [B, T].
-        scenery: What else is there; points may have shape [N, P, 3].
-    """
-
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    times: NDArray[np.float64] | None = None
-    body: NDArray[np.int64] | None = None
-    tets: NDArray[np.int64] | None = None
-    velocities: NDArray[np.float64] | None = None
-    steps: NDArray[np.int64] | None = None
-    scene: int = 0
-    scenery: tuple[Scenery, ...] = field(default=())
+    points: NDArray[np.float64]  # [m] [N, V, 3]
+    triangles: NDArray[np.int64]  # of the boundary, outward oriented [F, 3]
+    times: NDArray[np.float64] | None = None  # of each frame [s] [N]; None: not known
+    body: NDArray[np.int64] | None = None  # label of each vertex [V]
+    tets: NDArray[np.int64] | None = None  # tet that each triangle bounds [F]; None for a bare surface
+    velocities: NDArray[np.float64] | None = None  # [m/s] [N, V, 3]; None: those between frames
+    steps: NDArray[np.int64] | None = None  # step number of each frame [N]; None: not known
+    scene: int = 0  # which of several scenes it is, for values [B, T]
+    scenery: tuple[Scenery, ...] = ()  # what else is there; points may have shape [N, P, 3]
 
     def __len__(self) -> int:
         return len(self.points)
 
     @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowest and highest corner [m] of all frames."""
-        return self.points.min((0, 1)), self.points.max((0, 1))
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [m] of all frames, shape [2, 3]."""
+        return np.stack([self.points.min((0, 1)), self.points.max((0, 1))])
 
 
 def mesh_of(mesh: Any) -> TetMesh | None:
@@ -74,11 +62,8 @@ def mesh_of(mesh: Any) -> TetMesh | None:
 
 
 def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = None) -> dict[str, Motion]:
-    """A trajectory, positions [m] of shape [V, 3], [N, V, 3] or [N, B, V, 3], or a mesh, as motions by name.
-
-    Raises:
-        TypeError, ValueError: something else, a shape that is not the mesh's, positions that are not finite.
-    """
+    """A trajectory, positions [m] of shape [V, 3], [N, V, 3] or [N, B, V, 3], or a mesh, as motions by name. TypeError
+    or ValueError for something else, a shape that is not the mesh's, positions that are not finite."""
     if isinstance(source, Motion):
         return {"motion": source}
     if isinstance(source, Mapping):
@@ -90,9 +75,7 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
             fail("source", "at least one motion", "an empty dict")
         return found
     if isinstance(source, (Model, TetMesh)):
-        body = mesh_of(source)
-        assert body is not None
-        return motions_of(body.points, source, time_step)
+        return motions_of((source if isinstance(source, TetMesh) else source.mesh).points, source, time_step)
     body, step = mesh_of(mesh), None if time_step is None else check_positive("time_step", time_step, "s")
     if body is None:
         raise TypeError(f"mesh: expected a dv.Model or a dv.TetMesh with {type(source).__name__}, got None")
@@ -105,12 +88,10 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
     numbers = np.arange(len(points)) if steps is None else steps
     times = None if step is None else as_array(numbers * step)
     triangles, tets = boundary_faces(body.tets, body.num_vertices)
-    motions = {}
-    for b in range(points.shape[1]):
-        of_scene = None if v is None else v.reshape(points.shape)[:, b]
-        name = "motion" if points.shape[1] == 1 else f"scene {b}"
-        motions[name] = Motion(points[:, b], triangles, times, body.body, tets, of_scene, numbers, b)
-    return motions
+    speeds = None if v is None else v.reshape(points.shape)
+    motions = [Motion(points[:, b], triangles, times, body.body, tets, None if speeds is None else speeds[:, b],
+                      numbers, b) for b in range(points.shape[1])]  # fmt: skip
+    return {"motion" if len(motions) == 1 else f"scene {motion.scene}": motion for motion in motions}
 
 
 def positions(name: str, x: Any, vertices: int) -> NDArray[np.float64]:
@@ -154,6 +135,12 @@ def save_motions(
         arrays[f"scenery_points_{k}"] = as_array(thing.points).astype(np.float32)
         arrays[f"scenery_triangles_{k}"] = np.asarray(thing.triangles, np.int32)
 
+    save_arrays(path, arrays)
+
+
+def save_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
+    """Write an .npz file, which is whole or not there."""
+
     def write(new: Path) -> None:
         with new.open("wb") as file:  # numpy adds .npz to other names
             np.savez_compressed(file, **arrays)
@@ -162,12 +149,7 @@ def save_motions(
 
 
 def load_motions(path: str | PathLike[str]) -> dict[str, Motion]:
-    """Motions by name from a file that :func:`save_motions` wrote.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: another content.
-    """
+    """Motions by name from a file that :func:`save_motions` wrote; ValueError for another content."""
     try:
         with np.load(path, allow_pickle=False) as content:
             arrays = dict(content)
@@ -211,28 +193,23 @@ class Opened(NamedTuple):
 
 
 def opened(path: Path, time_step: float | None = None) -> Opened:
-    """The motions of a .pvd, of a mesh file, of a motion.npz, or of the folder of a run.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file of another kind, or a run that has kept no motion.
-    """
+    """The motions of a .pvd, of a mesh file, of a motion.npz, or of the folder of a run. FileNotFoundError for no such
+    file; ValueError for one of another kind, or a run that has kept no motion."""
+    suffix, expected = path.suffix.lower(), "expected a .pvd, a mesh with tets or the folder of a run"
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist: expected a .pvd, a mesh with tets or the folder of a run")
+        raise FileNotFoundError(f"{path} does not exist: {expected}")
     if path.is_dir():
         return _run(path)
-    if path.suffix.lower() == ".npz":
+    if suffix == ".npz":
         return Opened(load_motions(path))
-    if path.suffix.lower() == ".pvd":
+    if suffix == ".pvd":
         frames = read_frames(path)
         motions = motions_of(frames.points, frames.mesh, time_step)
         if time_step is None:
             motions = {name: _timed(motion, frames.times) for name, motion in motions.items()}
         return Opened(motions, frames.mesh)
-    if path.suffix.lower() in _FOR_OTHERS:
-        raise ValueError(
-            f"{path}: expected a .pvd, a mesh with tets or the folder of a run; {path.suffix} is for other programs"
-        )
+    if suffix in _FOR_OTHERS:
+        raise ValueError(f"{path}: {expected}; {path.suffix} is for other programs")
     mesh = load(path)
     return Opened(motions_of(mesh, time_step=time_step), mesh)
 
@@ -266,16 +243,8 @@ REACH = 2.5  # planes are shown so far around a scene, in its radii
 def scenery_of(
     model: Model, low: NDArray[np.float64], high: NDArray[np.float64], colliders: Any = None
 ) -> tuple[Scenery, ...]:
-    """Floors and colliders around a scene between two corners [m].
-
-    Args:
-        model: The scene.
-        low, high: Its lowest and highest corner [m], shape [3].
-        colliders: Where the corner points of the colliders are in each frame [m], shape [N, Vc, 3]; None: at rest.
-
-    Raises:
-        ValueError: colliders of another shape.
-    """
+    """Floors and colliders around a scene between two corners [m]; colliders: where their corner points are in each
+    frame [m], shape [N, Vc, 3], else at rest. Raises ValueError for another shape."""
     middle, reach = 0.5 * (low + high), REACH * 0.5 * float(np.linalg.norm(high - low))
     things = []
     if model.floor is not None:
@@ -287,21 +256,19 @@ def scenery_of(
     moved = rest if colliders is None else as_array(colliders)
     if moved.shape[-2:] != rest.shape or moved.ndim not in (2, 3):
         fail("colliders", f"shape [N, {len(rest)}, 3]", f"shape {list(moved.shape)}")
-    rows_of = model.collider_rows if model.colliders else ()
-    for collider, rows in zip(model.colliders, rows_of, strict=True):
+    for collider, rows in zip(model.colliders, model.collider_rows if model.colliders else (), strict=True):
         frames = moved[..., rows, :]
         if isinstance(collider, Plane):
-            corners = frames if frames.ndim == 2 else frames[0]
+            corners = frames.reshape(-1, *frames.shape[-2:])[0]
             across = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-            unit = across / np.linalg.norm(across)
-            things.append(plane(corners[0], unit, middle, reach))
+            things.append(plane(corners[0], across / np.linalg.norm(across), middle, reach))
         elif isinstance(collider, (Sphere, Capsule)):
-            ends = frames[None] if frames.ndim == 2 else frames
+            ends = frames.reshape(-1, *frames.shape[-2:])
             shapes = [capsule(each[0], each[-1], collider.radius) for each in ends]
             points = np.stack([shape.points for shape in shapes])
-            things.append(Scenery(points[0] if frames.ndim == 2 else points, shapes[0].triangles, SCENERY))
+            things.append(Scenery(points[0] if frames.ndim == 2 else points, shapes[0].triangles))
         else:
-            things.append(Scenery(frames, collider.corners().triangles, SCENERY))
+            things.append(Scenery(frames, collider.corners().triangles))
     return tuple(things)
 
 

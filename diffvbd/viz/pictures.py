@@ -1,7 +1,7 @@
 """Pictures of results, drawn by matplotlib: motions, clouds of bodies, fields, landings, learning, paths."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,27 +11,18 @@ from numpy.typing import NDArray
 from diffvbd.mesh.arrays import to_path
 from diffvbd.mesh.shapes import cube
 from diffvbd.mesh.tet_mesh import boundary_faces
-from diffvbd.viz.drawing import (
-    BODIES,
-    COLORS,
-    INK,
-    OTHER,
-    VIEW,
-    Scenery,
-    as_array,
-    bounds_of,
-    course,
-    draw,
-    floor,
-    motions_as_arrays,
-    new_figure,
-    save_motion,
-    tidy,
-)
-from diffvbd.viz.motion import save_motions
 
 from .._common.checks import check_positive
+from .motion import save_motions
+from .scenery import Scenery, as_array, check_surface, floor, motions_as_arrays, optional
 
+COLORS = {"initial": "#4c78a8", "target": "#e4704f", "recovered": "#4f9d5b"}
+OTHER = "#8c8c8c"
+BODIES = ("#4c78a8", "#e4704f", "#4f9d5b")
+INK = "#333333"
+# matplotlib's up is its third axis: y goes there by a cyclic exchange, which keeps the handedness.
+CYCLIC = [2, 0, 1]
+VIEW = (16.0, 32.0)  # elevation and azimuth of the eye [degrees]
 FRAMES = 40  # of a longer motion so many are shown
 
 
@@ -49,29 +40,19 @@ def animation(
 
     Args:
         path: The .gif or .npz to write.
-        surface: Boundary triangles, shape [F, 3], as `TetMesh.surface`.
-        motions: Positions [m] of each motion by name, shape [N, V, 3], array or tensor; y points up.
+        surface, motions, scenery, view: As in :func:`comparison`, which also says what raises.
         time_step: Between frames [s].
-        scenery: What else stands in every picture, for example `floor(...)`.
-        view: Elevation and azimuth of the eye [degrees].
         color: Of the body, as in `draw`; default: one for each motion.
-
-    Raises:
-        ImportError: matplotlib is not installed, for a .gif.
-        ValueError: motions or triangles of another shape.
     """
     path, time_step = to_path("path", path), check_positive("time_step", time_step, "s")
     if path.suffix == ".npz":
         save_motions(path, surface, motions_as_arrays(motions, surface), time_step, scenery)
         return
     figure = new_figure(3.4 * len(motions), 3.2, dots=70)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     frames = motions_as_arrays(motions, surface)
     count = min(len(motion) for motion in frames.values())
     shown = np.unique(np.linspace(0, count - 1, min(count, FRAMES)).round().astype(int))
-    bounds = bounds_of([*frames.values(), *(thing.points for thing in scenery)])
+    bounds = bounds_of(frames.values(), scenery)
     panels = [figure.add_subplot(1, len(frames), k + 1, projection="3d") for k in range(len(frames))]
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=0.92, wspace=0.0)
 
@@ -112,28 +93,13 @@ def comparison(
         ValueError: motions or triangles of another shape.
     """
     frames = motions_as_arrays(motions, surface, len(times))
-    low, high = bounds_of([*frames.values(), *(thing.points for thing in scenery)])
-
-    columns = len(times)
-    figure = new_figure(3.0 * columns + (4.2 if history else 0.0), 2.3 * len(frames))
-    shapes, charts = figure, None
-    if history:
-        shapes, charts = figure.subfigures(1, 2, width_ratios=(3.0 * columns, 4.2))
-    for row, (name, shown) in enumerate(frames.items()):
-        for column, points in enumerate(shown):
-            axes = shapes.add_subplot(len(frames), columns, row * columns + column + 1, projection="3d")
-            draw(axes, points, surface, COLORS.get(name, OTHER), (low, high), scenery, view)
-    left, top = 0.06, 0.93
-    shapes.subplots_adjust(left=left, right=1.0, bottom=0.0, top=top, wspace=0.0, hspace=0.0)
-    for row, name in enumerate(frames):
-        height = top * (1.0 - (row + 0.5) / len(frames))
-        style = {"rotation": 90, "ha": "center", "va": "center", "fontsize": 13, "color": COLORS.get(name, OTHER)}
-        shapes.text(0.5 * left, height, name, **style)
-    for column, time in enumerate(times):
-        middle = left + (1.0 - left) * (column + 0.5) / columns
-        shapes.text(middle, 0.96, f"t = {1e3 * time:.0f} ms", ha="center", va="center", fontsize=13)
-    if charts is not None:
-        course(charts, history, truth or {})
+    bounds, width = bounds_of(frames.values(), scenery), 3.0 * len(times)
+    figure = new_figure(width + (4.2 if history else 0.0), 2.3 * len(frames))
+    colors = {name: COLORS.get(name, OTHER) for name in frames}
+    _, panels = grid(figure, width, colors, [f"t = {1e3 * time:.0f} ms" for time in times], history, truth)
+    for row, (name, shown) in zip(panels, frames.items(), strict=True):
+        for axes, points in zip(row, shown, strict=True):
+            draw(axes, points, surface, colors[name], bounds, scenery, view)
     figure.savefig(path)
 
 
@@ -149,20 +115,11 @@ def learning(
     """Picture of shapes, one row per motion and one column per time, with losses over the seconds that they took.
 
     Args:
-        path: The picture to write; the suffix chooses the format.
-        surface: Boundary triangles, shape [F, 3], as `TetMesh.surface`.
-        motions: Positions [m] to show of each motion by name, shape [N, V, 3], array or tensor; y points up.
-        times: Their times [s], length N.
+        path, surface, motions, times, scenery, view: As in :func:`comparison`, which also says what raises.
         curves: (seconds, loss) of each method by name; the lowest loss so far is drawn.
-        scenery: What else stands in every picture.
-        view: Elevation and azimuth of the eye [degrees].
-
-    Raises:
-        ImportError: matplotlib is not installed.
-        ValueError: motions or triangles of another shape.
     """
     frames = motions_as_arrays(motions, surface, len(times))
-    bounds = bounds_of([*frames.values(), *(thing.points for thing in scenery)])
+    bounds = bounds_of(frames.values(), scenery)
     figure = new_figure(3.0 * len(times) + 4.2, 2.6 * len(frames))
     shapes, chart = figure.subfigures(1, 2, width_ratios=(3.0 * len(times), 4.2))
     for row, (name, shown) in enumerate(frames.items()):
@@ -198,16 +155,11 @@ def paths(
     the distance from the target over the iterations of an optimisation.
 
     Args:
-        path: The picture to write; the suffix chooses the format.
-        surface: Boundary triangles, shape [F, 3], as `TetMesh.surface`.
-        frames: Positions [m] to show of each motion by name, shape [N, V, 3], array or tensor; y points up, and the
-            floor is at y = 0.
+        path, surface: As in :func:`comparison`.
+        frames: Its motions; the floor is at y = 0.
         centers: Path of the center [m] in each of these motions, shape [frames, 3], array or tensor.
         target: What the center shall meet.
         history: Rows with "distance" [m].
-
-    Raises:
-        ImportError: matplotlib is not installed.
     """
     figure = new_figure(13.0, 8.0)
     shapes, courses = ({name: as_array(values) for name, values in each.items()} for each in (frames, centers))
@@ -259,15 +211,12 @@ def landing(
     and every frame from the side.
 
     Args:
-        path: The picture to write; the suffix chooses the format.
+        path: As in :func:`comparison`.
         surfaces: Boundary triangles of each body, shape [F, 3], as rows of the frames.
         frames: Positions [m], shape [N, V, 3], array or tensor; y points up, and the floor is at y = 0.
         times: Their times [s], length N.
         radius: Of the target about the y axis [m].
         history: Rows with "loss" and "uncovered", a share.
-
-    Raises:
-        ImportError: matplotlib is not installed.
     """
     shown = as_array(frames)
     figure = new_figure(3.3 * len(times), 8.0)
@@ -332,19 +281,16 @@ def field(
     """Maps of fields side by side, on the surface and on a cut, with one colorbar of logarithmic scale.
 
     Args:
-        path: The picture to write; the suffix chooses the format.
+        path, truth, view: As in :func:`comparison`, with which it shares what raises.
         points: Positions [m], shape [V, 3], array or tensor; y points up.
         tets: Vertex indices of each tet, positively oriented, shape [T, 4].
         values: Positive values of each field by name, shape [T] each; colors span their 1st to 99th percentile.
         label: Of the colorbar, with the unit.
         cut: A point [m] and the normal of a plane; a second row shows the tets with centroids behind it.
         history: Rows with "loss" and the estimates named in truth; draws the course of an optimisation.
-        truth: True values of estimates; their relative error is drawn.
-        view: Elevation and azimuth of the eye [degrees].
 
     Raises:
         ValueError: values are not one positive number for each tet, or no tet lies behind the cut.
-        ImportError: matplotlib is not installed.
     """
     corners, maps = as_array(points), {name: as_array(value) for name, value in values.items()}
     for name, value in maps.items():
@@ -362,37 +308,22 @@ def field(
     low, high = np.percentile(everything, [1, 99])
     # a logarithmic scale needs some extent
     paint = ScalarMappable(LogNorm(low, max(high, 1.01 * low)), COLORMAP)
-    shapes, charts = figure, None
-    if history:
-        shapes, charts = figure.subfigures(1, 2, width_ratios=(width, 4.2))
-    left, right, top = 0.06, 1.0 - 1.3 / width, 0.93
+    right = 1.0 - 1.3 / width
+    shapes, panels = grid(figure, width, dict.fromkeys(rows, "black"), [*maps], history, truth, right)
     bounds = bounds_of([corners])
-    for row, (kind, kept) in enumerate(rows.items()):
+    for row, kept in zip(panels, rows.values(), strict=True):
         triangles, owner = boundary_faces(tets[kept], len(corners))
-        for column, value in enumerate(maps.values()):
-            axes = shapes.add_subplot(len(rows), len(maps), row * len(maps) + column + 1, projection="3d")
+        for axes, value in zip(row, maps.values(), strict=True):
             draw(axes, corners, triangles, paint.to_rgba(value[kept][owner])[:, :3], bounds, view=view)
-        height = top * (1.0 - (row + 0.5) / len(rows))
-        shapes.text(0.5 * left, height, kind, rotation=90, ha="center", va="center", fontsize=13)
-    shapes.subplots_adjust(left=left, right=right, bottom=0.0, top=top, wspace=0.0, hspace=0.0)
-    for column, name in enumerate(maps):
-        middle = left + (right - left) * (column + 0.5) / len(maps)
-        shapes.text(middle, 0.96, name, ha="center", va="center", fontsize=13)
     place = shapes.add_axes((right + 0.02, 0.15, 0.025, 0.65))
     shapes.colorbar(paint, cax=place, extend="both").set_label(label)
-    if charts is not None:
-        course(charts, history, truth or {})
     figure.savefig(path)
 
 
 def behind(
     points: NDArray[np.float64], tets: NDArray[np.int64], origin: Sequence[float], normal: Sequence[float]
 ) -> NDArray[np.int64]:
-    """Tets whose centroids lie on the side of a plane that its normal points away from.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """Tets whose centroids lie on the side of a plane that its normal points away from; ValueError for none."""
     height = (points[tets].mean(1) - np.asarray(origin)) @ np.asarray(normal)
     kept = np.flatnonzero(height <= 0)
     if len(kept) == 0:
@@ -409,14 +340,11 @@ def cloud(
     """Picture of points at several times with the course of an optimisation.
 
     Args:
-        path: The picture to write; the suffix chooses the format.
+        path: As in :func:`comparison`.
         frames: Positions [m], shape [N, bodies, 3], array or tensor; y points up.
         time_step: Between frames [s].
         history: Rows with "loss" and the estimate.
         estimate: Key of the history that is drawn below the loss.
-
-    Raises:
-        ImportError: matplotlib is not installed.
     """
     shown = _chosen(frames)
     bounds, columns = bounds_of([shown]), (len(shown) + 1) // 2
@@ -427,13 +355,7 @@ def cloud(
         _points(axes, points, shown[0], bounds)
         axes.set_title(f"t = {1e3 * k * time_step:.0f} ms", fontsize=12, y=0.95)
     left.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=0.97, wspace=0.0, hspace=0.0)
-    charts = right.subplots(2, 1, sharex=True)
-    for axes, key in zip(charts, ("loss", estimate), strict=True):
-        axes.semilogy([row[key] for row in history], color=INK)
-        axes.set_ylabel(key.replace("_", " ") + (" [m]" if key != "loss" else ""))
-        tidy(axes)
-    charts[1].set_xlabel("iteration")
-    right.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)
+    course(right, history, estimate=estimate)
     figure.savefig(path)
 
 
@@ -444,9 +366,6 @@ def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
         save_motions(path, *_cubes(_chosen(frames)), time_step)
         return
     figure = new_figure(4.5, 4.5, dots=80)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     shown = _chosen(frames)
     bounds = bounds_of([shown])
     axes = figure.add_subplot(projection="3d")
@@ -481,10 +400,148 @@ def _points(axes: Any, points: NDArray[np.float64], first: NDArray[np.float64], 
     # colored by where they started, so that one sees who goes where
     low, high = first.min(0), first.max(0)
     colors = colormaps["viridis"](((first - low) / np.maximum(high - low, 1e-9))[:, 0])
-    z, x, y = points[:, 2], points[:, 0], points[:, 1]
-    axes.scatter(z, x, y, s=4e3 / max(len(points), 1000), c=colors, linewidths=0, depthshade=False)
-    lower, upper = (corner[[2, 0, 1]] for corner in bounds)
-    axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
-    axes.set_box_aspect(np.maximum(upper - lower, 1e-9), zoom=1.2)
-    axes.view_init(elev=VIEW[0], azim=VIEW[1])
+    axes.scatter(*points.T[CYCLIC], s=4e3 / max(len(points), 1000), c=colors, linewidths=0, depthshade=False)
+    frame(axes, *bounds, VIEW, zoom=1.2)
+
+
+# --- parts of pictures ------------------------------------------------------------------------------------------------
+
+
+def draw(
+    axes: Any,
+    points: Any,
+    surface: NDArray[np.int64],
+    color: Any,
+    bounds: tuple[Any, Any] | None = None,
+    scenery: Sequence[Scenery] = (),
+    view: tuple[float, float] = VIEW,
+) -> None:
+    """One shape, drawn into a matplotlib 3D axes.
+
+    Args:
+        axes: Axes with projection "3d".
+        points: Positions [m], shape [V, 3], array or tensor; y points up.
+        surface: Boundary triangles, outward oriented, shape [F, 3].
+        color: Any matplotlib color, or one RGB for each triangle, shape [F, 3].
+        bounds: Lowest and highest corner [m] of the box to show; default: that of the points.
+        scenery: What else is there.
+        view: Elevation and azimuth of the eye [degrees].
+
+    Raises:
+        ValueError: no triangles of the points.
+    """
+    from matplotlib.colors import to_rgb
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    vertices = as_array(points)
+    check_surface(surface, len(vertices))
+    body = vertices[surface][..., CYCLIC]
+    parts, colors = [body], [np.broadcast_to(to_rgb(color) if isinstance(color, str) else color, (len(body), 3))]
+    for thing in scenery:
+        parts.append(as_array(thing.points)[thing.triangles][..., CYCLIC])
+        colors.append(np.broadcast_to(to_rgb(thing.color), (len(parts[-1]), 3)))
+    # One collection: matplotlib sorts the triangles of one by depth, but not those of several.
+    triangles, rgb = np.concatenate(parts), np.concatenate(colors)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    light = np.array([0.6, 0.3, 0.8])
+    # Half-Lambert shading: faces turned away from the light stay readable.
+    brightness = 0.35 + 0.65 * (0.5 + 0.5 * normals @ (light / np.linalg.norm(light)))
+    faces = np.clip(brightness[:, None] * (0.25 + 0.85 * rgb), 0.0, 1.0)
+    axes.add_collection3d(
+        Poly3DCollection(triangles, facecolors=faces, edgecolors=0.8 * faces, linewidths=0.25, clip_on=False)
+    )
+    frame(axes, *(bounds or bounds_of([vertices[surface]])), view, zoom=1.15)
+
+
+def frame(axes: Any, low: Any, high: Any, view: tuple[float, float], zoom: float) -> None:
+    """3D axes that show the box between two corners [m], and nothing else."""
+    low, high = as_array(low)[CYCLIC], as_array(high)[CYCLIC]
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(np.maximum(high - low, 1e-9), zoom=zoom)
+    axes.view_init(elev=view[0], azim=view[1])
     axes.set_axis_off()
+
+
+def tidy(axes: Any) -> None:
+    """A faint grid, and no frame at the top and on the right."""
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def course(
+    figure: Any, history: Sequence[Mapping[str, float]], truth: Mapping[str, float] | None = None, estimate: str = ""
+) -> None:
+    """Charts of the loss over iterations and, below it, of relative errors or of an estimate [m]."""
+    charts = figure.subplots(2 if truth or estimate else 1, 1, sharex=True, squeeze=False)[:, 0]
+    charts[0].semilogy([row["loss"] for row in history], color=INK)
+    charts[0].set_ylabel("loss")
+    charts[-1].set_xlabel("iteration")
+    if truth:
+        for name, true in truth.items():
+            charts[1].semilogy([abs(row[name] / true - 1) for row in history], label=name)
+        charts[1].set_ylabel("relative error")
+        charts[1].legend(frameon=False)
+    elif estimate:
+        charts[1].semilogy([row[estimate] for row in history], color=INK)
+        charts[1].set_ylabel(estimate.replace("_", " ") + " [m]")
+    for axes in charts:
+        tidy(axes)
+    figure.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)
+
+
+def grid(
+    figure: Any,
+    width: float,
+    rows: Mapping[str, str],
+    columns: Sequence[str],
+    history: Sequence[Mapping[str, float]],
+    truth: Mapping[str, float] | None,
+    right: float = 1.0,
+) -> tuple[Any, list[list[Any]]]:
+    """3D axes [rows, columns] with names at the left, each in a color, and titles above, up to ``right`` of a part
+    ``width`` inches wide; with a history the course of an optimisation stands beside it. Returns that part and axes."""
+    shapes = figure
+    if history:
+        shapes, charts = figure.subfigures(1, 2, width_ratios=(width, 4.2))
+        course(charts, history, truth)
+    left, top = 0.06, 0.93
+    axes = [
+        [shapes.add_subplot(len(rows), len(columns), row * len(columns) + column + 1, projection="3d")
+         for column in range(len(columns))]
+        for row in range(len(rows))
+    ]  # fmt: skip
+    shapes.subplots_adjust(left=left, right=right, bottom=0.0, top=top, wspace=0.0, hspace=0.0)
+    style = {"ha": "center", "va": "center", "fontsize": 13}
+    for row, (name, color) in enumerate(rows.items()):
+        shapes.text(0.5 * left, top * (1.0 - (row + 0.5) / len(rows)), name, rotation=90, color=color, **style)
+    for column, title in enumerate(columns):
+        shapes.text(left + (right - left) * (column + 0.5) / len(columns), 0.96, title, **style)
+    return shapes, axes
+
+
+def new_figure(width: float, height: float, dots: int = 130) -> Any:
+    """A figure [inches]; an ImportError that says what is missing."""
+    # Not pyplot: it would choose a window system, and pictures are only written to files.
+    return optional("matplotlib.figure", "pictures need").Figure(figsize=(width, height), dpi=dots)
+
+
+def save_motion(
+    path: str | Path, figure: Any, show: Callable[[int], None], frames: Sequence[int], seconds: float
+) -> None:
+    """Write a .gif of `show(k)` for these k; it runs for the time given [s], or 2 s where that is less."""
+    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    rate = max(1, round(len(frames) / max(2.0, seconds)))
+    FuncAnimation(figure, show, frames=frames).save(path, PillowWriter(fps=rate))
+
+
+def bounds_of(
+    shapes: Iterable[Any], scenery: Sequence[Scenery] = ()
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest corner [m] of arrays of positions, shape [..., 3], and of scenery."""
+    points = [*shapes, *(thing.points for thing in scenery)]
+    everything = np.concatenate([as_array(shape).reshape(-1, 3) for shape in points])
+    return everything.min(0), everything.max(0)

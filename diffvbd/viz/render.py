@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from .._common.checks import check_positive, fail
 from ..mesh.write import replace
 from ..model.model import Model
-from .drawing import Scenery, as_array
 from .motion import Mesh, Motion, mesh_of, motions_of, opened, scenery_of
-from .values import Values, rgb
+from .scenery import Scenery, as_array, optional
+from .values import rgb, values_of
 
 ANIMATED = (".webp", ".gif")
 STILL = (".png", ".jpg")
@@ -67,7 +67,7 @@ def render(
         ImportError: pyvista is not installed.
         ValueError, TypeError: as :func:`live`, or another suffix.
     """
-    path, pyvista = Path(path), _pyvista()
+    path, pyvista = Path(path), optional("pyvista", "rendering needs")
     if path.suffix.lower() not in ANIMATED + STILL:
         fail("path", f"a name that ends in {', '.join(ANIMATED + STILL)}", repr(path.name))
     offset = as_array(apart)
@@ -78,14 +78,12 @@ def render(
         motions, mesh = [*found.motions.values()], found.mesh if mesh is None else mesh
     else:
         motions = [*motions_of(source, mesh, time_step).values()]
-    things = [*scenery, *(thing for thing in motions[0].scenery)]
-    body, model = mesh_of(mesh), mesh if isinstance(mesh, Model) else None
-    if model is None and body is not None and mu is not None and lam is not None:
-        model = Model(body)
-    values = Values(model, mu, lam, colliders)
+    things = [*scenery, *motions[0].scenery]
+    mesh_of(mesh)  # raises for anything else
+    values = values_of(mesh, mu, lam, colliders)
     places = [k * offset for k in range(len(motions))]
-    low = np.min([motion.bounds[0] + place for motion, place in zip(motions, places, strict=True)], 0)
-    high = np.max([motion.bounds[1] + place for motion, place in zip(motions, places, strict=True)], 0)
+    corners = np.stack([motion.bounds + place for motion, place in zip(motions, places, strict=True)])
+    low, high = corners[:, 0].min(0), corners[:, 1].max(0)
     height = None if ground is None or ground == "auto" else float(ground)
     things += scenery_of(mesh, low, high, colliders) if isinstance(mesh, Model) else ()
     level = [thing for thing in things if np.ptp(as_array(thing.points)[..., 1]) == 0]
@@ -125,14 +123,6 @@ def render(
         _save(path, [picture(k) for k in shown], lasts, quality)
     finally:
         stage.plotter.close()
-
-
-def _pyvista() -> Any:
-    try:
-        import pyvista
-    except ImportError:
-        raise ImportError("rendering needs pyvista: pip install 'diffvbd[viz]'") from None
-    return pyvista
 
 
 def _shift(motions: Sequence[Motion]) -> list[int]:

@@ -13,28 +13,19 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from .._common.checks import fail
+from .scenery import optional
 
 TRIED = 1000  # ports
 _REPLACING = threading.Lock()
 
 
-def require_viser() -> Any:
-    """The module viser; an ImportError names the extra."""
-    try:
-        import viser
-    except ImportError:
-        raise ImportError("the viewer needs viser: pip install 'diffvbd[viz]'") from None
-    return viser
-
-
 def open_server(host: str, port: int) -> Any:
     """A viser server on the first free port from `port` on, which refuses what other sites' pages ask for.
 
-    Raises:
-        ValueError: an address that this machine does not have; no free port.
-        ImportError: viser is missing, or does not let its requests be checked.
+    ValueError for an address that this machine does not have, or no free port; ImportError where viser is missing, or
+    does not let its requests be checked.
     """
-    viser = require_viser()
+    viser = optional("viser", "the viewer needs")
     port = _free_port(host, port)
     with _checked_requests(host) as checked, contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
         server = viser.ViserServer(host=host, port=port, label="diffvbd", verbose=False)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from .._common.checks import fail, is_word
 from ..inspect.forces import forces, stress
+from ..mesh.tet_mesh import TetMesh
 from ..model.model import Model
 from ..model.solver import VBD
-from .drawing import as_array
-from .motion import Motion
+from .motion import Mesh, Motion
+from .scenery import as_array
 
 # What each name means, and its unit.
 QUANTITIES = {
@@ -44,18 +45,12 @@ def palette() -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Colors:
-    """Colors of the triangles of a motion.
+    """Colors of the triangles of a motion."""
 
-    Attributes:
-        palette: Colors, shape [K, 3].
-        levels: Row of the palette of each triangle, shape [F], or [N, F] where it changes.
-        low, high, unit, title: Of the legend; a unit of "" is a color that means no number.
-    """
-
-    palette: NDArray[np.uint8]
-    levels: NDArray[np.int64]
-    title: str
-    unit: str = ""
+    palette: NDArray[np.uint8]  # [K, 3]
+    levels: NDArray[np.int64]  # row of the palette of each triangle [F], or [N, F] where it changes
+    title: str  # of the legend, as are the others
+    unit: str = ""  # "" is a color that means no number
     low: float = 0.0
     high: float = 0.0
 
@@ -66,26 +61,16 @@ class Colors:
 
 @dataclass
 class Values:
-    """The quantities of motions, computed when they are asked for.
+    """The quantities of motions, computed when they are asked for."""
 
-    Attributes:
-        model: Scene of the motions; None: there is no stress and no contact.
-        mu, lam: Material [Pa], a number or [T] or [B, T]; None: there is no stress and no stiffness.
-        colliders: Where the corner points of the colliders are in each frame [m], shape [N, Vc, 3]; None: at rest.
-    """
-
-    model: Model | None = None
-    mu: Any = None
+    model: Model | None = None  # scene of the motions; None: there is no stress and no contact
+    mu: Any = None  # [Pa], a number or [T] or [B, T]; None: there is no stress and no stiffness
     lam: Any = None
-    colliders: Any = None
+    colliders: Any = None  # where their corner points are in each frame [m] [N, Vc, 3]; None: at rest
     _kept: dict[tuple[int, str], tuple[Motion, Colors]] = field(default_factory=dict, repr=False)
 
     def colors(self, name: str, motion: Motion) -> Colors:
-        """Colors of a motion.
-
-        Raises:
-            ValueError: an unknown name, or a quantity that these arguments do not tell.
-        """
+        """Colors of a motion; ValueError for an unknown name, or a quantity that these arguments do not tell."""
         if not is_word(name, *QUANTITIES):
             fail("color", f"one of {', '.join(QUANTITIES)}", repr(name))
         kept = self._kept.get((id(motion), name))
@@ -157,12 +142,11 @@ class Values:
 
     def _stress(self, motion: Motion) -> NDArray[np.float64]:
         model, tets = self._needed("stress"), self._tets_of(motion, "stress")
-        mu, lam = (self._material(name, motion, "stress") for name in ("mu", "lam"))
-        given = [torch.as_tensor(values, dtype=model.dtype, device=model.device) for values in (mu, lam)]
+        mu, lam = (_like(model, self._material(name, motion, "stress")) for name in ("mu", "lam"))
         rows, out = max(1, _CHUNK // max(1, model.num_tets)), []
         for k in range(0, len(motion), rows):
             with torch.no_grad():
-                found = stress(model, _like(model, motion.points[k : k + rows]), mu=given[0], lam=given[1])
+                found = stress(model, _like(model, motion.points[k : k + rows]), mu=mu, lam=lam)
             out.append(as_array(found.von_mises)[:, tets])
         return np.concatenate(out)
 
@@ -180,9 +164,15 @@ class Values:
                 given |= {"previous": (x[k - 1], x[k - 1]), "solver": VBD(step, 1)}
                 given |= {} if places is None else {"colliders_before": places[k - 1]}
             with torch.no_grad():
-                total = forces(model, x[k], **given).vertices.total
-            found[k] = as_array(total.norm(dim=-1))
+                found[k] = as_array(forces(model, x[k], **given).vertices.total.norm(dim=-1))
         return found[:, motion.triangles].mean(-1)
+
+
+def values_of(mesh: Mesh | None, mu: Any, lam: Any, colliders: Any) -> Values:
+    """Quantities of motions of a mesh; with a material it becomes a Model, for stresses."""
+    if isinstance(mesh, TetMesh) and mu is not None and lam is not None:
+        mesh = Model(mesh)
+    return Values(mesh if isinstance(mesh, Model) else None, mu, lam, colliders)
 
 
 def _like(model: Model, points: NDArray[np.float64]) -> torch.Tensor:

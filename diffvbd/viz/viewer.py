@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from .._common.checks import check_count, fail, is_word
 from .._common.context import record_to
 from ..rollout.trajectory import Trajectory
-from .drawing import Scenery, as_array
 from .motion import Mesh, Motion, motions_of, smooth_parts
+from .scenery import Scenery, as_array
 from .server import open_server
 from .values import QUANTITIES, Colors, Values, legend, rgb
 
@@ -77,58 +77,43 @@ class Clock:
 
 
 class Rerun:
-    """Runs a function in a thread of its own once its arguments have stood still for a while.
-
-    Args:
-        function: Called with the latest arguments; never twice at a time.
-        done: Called with its result.
-        failed: Called with the exception that it raised.
-        delay: [s] without another request before it runs.
-    """
+    """Runs a function in another thread once its arguments have stood still for a while."""
 
     def __init__(
         self,
-        function: Callable[..., Any],
-        done: Callable[[Any], object],
-        failed: Callable[[Exception], object],
-        delay: float = DELAY,
+        function: Callable[..., Any],  # gets the latest arguments; never called twice at a time
+        done: Callable[[Any], object],  # gets its result
+        failed: Callable[[Exception], object],  # gets the exception that it raised
+        delay: float = DELAY,  # [s] without another request before it runs
     ) -> None:
         self.function, self.done, self.failed, self.delay = function, done, failed, delay
         self.runs = 0
-        self._asked: tuple[float, dict[str, Any]] | None = None
-        self._stopped = False
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._work, name="diffvbd-rerun", daemon=True)
-        self._thread.start()
+        self._latest: threading.Timer | None = None
+        self._changing, self._running = threading.Lock(), threading.RLock()
 
     def request(self, **arguments: Any) -> None:
         """Asks for a run with these arguments, in place of what was asked for before and has not begun."""
-        with self._changed:
-            self._asked = (time.monotonic() + self.delay, arguments)
-            self._changed.notify()
+        timer = threading.Timer(self.delay, self._run, (arguments,))
+        timer.daemon = True
+        self._replace(timer)
+        timer.start()
 
     def stop(self, wait: float = 2.0) -> None:
-        """Ends the thread, after a run that is under way."""
-        with self._changed:
-            self._stopped = True
-            self._changed.notify()
-        if self._thread is not threading.current_thread():
-            self._thread.join(wait)
+        """No more runs; returns after one that is under way."""
+        self._replace(None)
+        if self._running.acquire(timeout=wait):
+            self._running.release()
 
-    def _next(self) -> dict[str, Any] | None:
-        with self._changed:
-            while not self._stopped:
-                if self._asked is None:
-                    self._changed.wait()
-                elif (left := self._asked[0] - time.monotonic()) > 0:
-                    self._changed.wait(left)
-                else:
-                    arguments, self._asked = self._asked[1], None
-                    return arguments
-        return None
+    def _replace(self, timer: threading.Timer | None) -> None:
+        with self._changing:
+            if self._latest is not None:
+                self._latest.cancel()
+            self._latest = timer
 
-    def _work(self) -> None:
-        while (arguments := self._next()) is not None:
+    def _run(self, arguments: dict[str, Any]) -> None:
+        with self._running:
+            if self._latest is not threading.current_thread():  # asked for again meanwhile
+                return
             try:
                 self.runs += 1
                 self.done(self.function(**arguments))
@@ -205,14 +190,12 @@ class Stage:
             handle.remove()
         self._bins, self._layers, self._shown = [], [], (motion.triangles, colors)
         start, none = motion.points[0], (np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]))
-        part = smooth_parts(start, motion.triangles)[:, None]
+        part, add = smooth_parts(start, motion.triangles)[:, None], self.server.scene.add_mesh_simple
         for k, color in enumerate(colors.palette):
             tint = tuple(int(c) for c in color)
             if colors.unit:
                 self._bins.append(
-                    self.server.scene.add_mesh_simple(
-                        f"/level/{k}", *none, color=tint, flat_shading=True, side="double", visible=False
-                    )
+                    add(f"/level/{k}", *none, color=tint, flat_shading=True, side="double", visible=False)
                 )
                 continue
             rows = colors.levels == k
@@ -221,9 +204,7 @@ class Stage:
             # a vertex on a sharp edge is one for each side, lest it be shaded as if it were round
             of_parts, faces = np.unique(part[rows] * len(start) + motion.triangles[rows], return_inverse=True)
             vertices = of_parts % len(start)
-            handle = self.server.scene.add_mesh_simple(
-                f"/body/{k}", start[vertices], faces.reshape(-1, 3), color=tint, side="double"
-            )
+            handle = add(f"/body/{k}", start[vertices], faces.reshape(-1, 3), color=tint, side="double")
             self._layers.append((handle, vertices))
 
     def _show_levels(self, corners: NDArray[np.float32], levels: NDArray[np.int64]) -> None:
@@ -232,15 +213,15 @@ class Stage:
         ends = np.searchsorted(levels[order], np.arange(len(self._bins) + 1))
         for k, handle in enumerate(self._bins):
             mine = corners[order[ends[k] : ends[k + 1]]].reshape(-1, 3)
-            if handle.visible != bool(len(mine)):
-                handle.visible = bool(len(mine))
-            if len(mine):
-                # a mesh may never have faces beyond its vertices, not even between two messages
-                faces = np.arange(len(mine)).reshape(-1, 3)
-                if len(mine) >= len(handle.vertices):
-                    handle.vertices, handle.faces = mine, faces
-                else:
-                    handle.faces, handle.vertices = faces, mine
+            _set(handle, "visible", bool(len(mine)))
+            if not len(mine):
+                continue
+            # a mesh may never have faces beyond its vertices, not even between two messages
+            faces = np.arange(len(mine)).reshape(-1, 3)
+            if len(mine) >= len(handle.vertices):
+                handle.vertices, handle.faces = mine, faces
+            else:
+                handle.faces, handle.vertices = faces, mine
 
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
@@ -250,24 +231,16 @@ Slider = tuple[float, float, float]  # lowest, highest, first value
 
 
 class Panel:
-    """Controls of a viser server. What the user does is told to functions; what is shown is set by methods.
-
-    Args:
-        server: The viser server.
-        names: Of the motions.
-        tell: Called as tell(what, value) with "play", "frame", "loop", "speed", "color", "motion" or "camera".
-        sliders: Lowest, highest and first value of each parameter.
-        moved: Called with all parameters once a slider has moved.
-    """
+    """Controls of a viser server. What the user does is told to functions; what is shown is set by methods."""
 
     def __init__(
         self,
         server: Any,
-        names: Sequence[str],
+        names: Sequence[str],  # of the motions
         color: str,
-        tell: Callable[[str, Any], None],
+        tell: Callable[[str, Any], None],  # what ("play", "frame", "loop", "speed", "color", "motion", "camera"), value
         sliders: Mapping[str, Slider],
-        moved: Callable[[dict[str, float]], None],
+        moved: Callable[[dict[str, float]], None],  # gets all parameters once a slider has moved
     ) -> None:
         self.gui = server.gui
         self.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 111, 159))
@@ -344,31 +317,26 @@ class Panel:
         self.message.content = f"**{error}**" if error else ""
         self.message.visible = bool(error)
 
-    def set(self, handle: Any, value: Any) -> None:
-        """Sets a control without telling of it."""
-        if handle.value != value:
-            handle.value = value
+    def show_colors(self, name: str, legend: str) -> None:
+        """The quantity that is shown, and its legend as HTML."""
+        _set(self.color, "value", name)
+        _set(self.legend, "content", legend)
 
     def show_frame(self, frame: int, frames: int, seconds: float | None, playing: bool) -> None:
         """The frame that is shown, of so many, and its time [s]."""
         self._last = max(1, frames - 1)
-        if self.frame.max != self._last:
-            self.frame.max = self._last
-        self.set(self.frame, frame)
+        _set(self.frame, "max", self._last)
+        _set(self.frame, "value", frame)
         when = "" if seconds is None else f", {seconds:.3f} s"
-        text = f"frame {frame} of {frames - 1}{when}"
-        if self.time.content != text:
-            self.time.content = text
-        label = "Pause" if playing and frames > 1 else "Play"
-        if self.play.label != label:
-            self.play.label = label
+        _set(self.time, "content", f"frame {frame} of {frames - 1}{when}")
+        _set(self.play, "label", "Pause" if playing and frames > 1 else "Play")
 
     def show_names(self, names: Sequence[str], chosen: str) -> None:
         """The motions that there are."""
         self._names = tuple(names)
         if tuple(self.motion.options) != self._names:
             self.motion.options = self._names
-        self.set(self.motion, chosen)
+        _set(self.motion, "value", chosen)
         self.motion.visible = len(names) > 1
 
     def show_course(self, losses: Sequence[float], parameters: Mapping[str, float]) -> None:
@@ -402,6 +370,12 @@ class Panel:
         scales = {"x": uplot.Scale(time=False)}
         with self.gui.add_folder("Loss", order=0):
             self._chart = self.gui.add_uplot((iterations, losses), series, scales=scales, aspect=1.6)
+
+
+def _set(handle: Any, name: str, value: Any) -> None:
+    """An attribute of a control, sent to the page only where it changes."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
 
 
 def _within(value: float, low: float, high: float) -> float | None:
@@ -610,16 +584,19 @@ class Viewer:
         self._name = name
         self.clock.set_times(motion.times, len(motion))
 
+    def _take(self, found: dict[str, Motion]) -> None:
+        """Other motions in place of those shown."""
+        with self._changed:
+            self.motions = found
+            self._choose(self._name if self._name in found else next(iter(found)))
+
     def _moved(self, values: dict[str, float]) -> None:
         assert self._rerun is not None
         self._panel.say_state("simulating ...")
         self._rerun.request(**values)
 
     def _simulated(self, result: Any) -> None:
-        found = motions_of(result, self.mesh, self._time_step)
-        with self._changed:
-            self.motions = found
-            self._choose(self._name if self._name in found else next(iter(found)))
+        self._take(motions_of(result, self.mesh, self._time_step))
         self._panel.say_state("up to date")
         self._wake()
 
@@ -666,11 +643,8 @@ class Viewer:
         self._stage.show(motion, colors, frame)
         seconds = None if motion.times is None else float(motion.times[frame])
         bodies = 1 if motion.body is None else len(set(motion.body.tolist()))
-        text = legend(colors, bodies)
-        if self._panel.legend.content != text:
-            self._panel.legend.content = text
+        self._panel.show_colors(name, legend(colors, bodies))
         self._panel.show_names([*self.motions], self._name)
-        self._panel.set(self._panel.color, name)
         self._panel.show_frame(frame, len(motion), seconds, self.clock.playing)
         self._panel.show_course(self._losses, self._parameters)
         self._panel.say(error)
@@ -689,8 +663,7 @@ class Viewer:
         with self._changed:
             self._reframe |= not self._followed
             self._followed = True
-            self.motions = found
-            self._choose(self._name if self._name in found else next(iter(found)))
+            self._take(found)
 
 
 def _kept(x: Any) -> Any:

@@ -15,12 +15,10 @@ from helpers.task_checks import check_fall, check_gradient, quick, timeless
 import diffvbd as dv
 from diffvbd import losses
 from diffvbd.tasks import TASKS, Settings, beam, fit_real_mesh, million_cubes, solve, table
-from diffvbd.tasks.cape_wind import TRUE_WIND
+from diffvbd.tasks.cloth import TRUE_WIND, cut, reference_wind
 from diffvbd.tasks.cover_the_spot import faces_up, outline, smooth_uncovered, sunflower, uncovered
 from diffvbd.tasks.dress import SOFTNESS, profile
-from diffvbd.tasks.dress_size import cut
 from diffvbd.tasks.fit_real_mesh import HEIGHT, scaled
-from diffvbd.tasks.flag_wind import reference_wind
 from diffvbd.tasks.learn_controller import cma_es
 from diffvbd.tasks.million_cubes import RADIUS, is_near
 from diffvbd.tasks.throw import inside
