@@ -377,6 +377,7 @@ def _setting_messages(model: System, mu: Tensor, lam: Tensor, edge: Tensor) -> l
             found[f"{size}: it never limits an update of this mesh"] = ratio > SATURATION_TOO_LARGE
             found[f"{size}: sweeps move by that little"] = ratio < SATURATION_TOO_SMALL
         lightest = float(model.mass[model.color_vertices].min())
-        size = f"regularization {model.regularization:g} kg is {model.regularization / lightest:.3g} of the"
-        found[f"{size} lightest vertex: it slows every update"] = model.regularization > HEAVY_REGULARIZATION * lightest
+        if model.regularization > HEAVY_REGULARIZATION * lightest:
+            size = f"regularization {model.regularization:g} kg is {model.regularization / lightest:.3g} of the"
+            found[f"{size} lightest vertex: it slows every update"] = True
     return [message for message, applies in found.items() if applies]

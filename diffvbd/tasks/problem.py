@@ -180,7 +180,7 @@ def _is_number(value: Any) -> bool:
 
 
 _RULES: tuple[tuple[str, type[Exception], str, Callable[[Any], bool]], ...] = (  # of the fields of a Stage
-    ("iterations", ValueError, "an integer of at least 1", lambda n: type(n) is int and n >= 1),
+    ("iterations", ValueError, "an integer of at least 1", lambda n: isinstance(n, int) and n is not True and n >= 1),
     *((key, TypeError, "a function", callable) for key in ("loss", "optimizer", "before")),
     ("rough", TypeError, "a bool", lambda rough: isinstance(rough, bool)),
     *((key, ValueError, "a number above 0", lambda rate: _is_number(rate) and rate > 0)
