@@ -1,4 +1,5 @@
 // Trust-region radii of the sweeps (contact/trust_region.h).
+#include "bodies.cuh"
 #include "common.cuh"
 #include "contact.h"
 

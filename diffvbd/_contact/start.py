@@ -47,9 +47,8 @@ def start_between(x: Tensor, move: Tensor, was: Tensor, now: Tensor, planes: Ten
         u, at, displacement = detection.u[:, body], x.detach(), move.detach()
         trust_radius = detection.trust_radius[:, body]
         relative = displacement - u
-        ratio = trust_radius / _length(relative)
+        ratio, deformation_radius = trust_radius / _length(relative), detection.deformation_radius[:, body]
         if own_pairs:
-            deformation_radius = detection.deformation_radius[:, body]
             ratio = torch.minimum(ratio, deformation_radius / _length(displacement - rigid))
         within = _of_units(_fraction(ratio), pinned, unit)
         above = _of_units(_fraction(_above(planes, at + u, relative, origin)), pinned, unit)
