@@ -88,7 +88,7 @@ def march(model: dv.Model, h: float, sweeps: int, steps: int, way: str = "plain"
 def settled(model: dv.Model, steps: int = 40, sweeps: int = 100, mu: float = MODULUS, gravity: Any = None) -> Tensor:
     """Where the bodies of a Model rest without friction: long steps of many sweeps, each begun without velocity."""
     x, still = model.rest_points, torch.zeros_like(model.rest_points)
-    free = {} if model.friction is None else {"friction": 0.0}
+    free: dict[str, Any] = {} if model.friction is None else {"friction": 0.0}
     down = (0.0, -GRAVITY, 0.0) if gravity is None else gravity
     for _ in range(steps):
         x, _ = dv.step(model, x, still, dv.VBD(0.05, sweeps), mu=mu, lam=2 * mu, gravity=down, **free)
@@ -133,10 +133,10 @@ def model_of(bodies: dv.TetMesh | Sequence[dv.TetMesh], *energies: Any, **option
 
 # --- violent scenes: gradients, crossings, energy, descent ------------------------------------------------------------
 
-SEED, FLIGHT = 2911, 8  # steps of a rollout
+SEED, FLIGHT = 2911, 6  # steps of a rollout
 
 
-def drawn(number: int, device: str) -> tuple[dv.Model, Tensor, Tensor, dict[str, float], dv.VBD]:
+def drawn(number: int, device: str) -> tuple[dv.Model, Tensor, Tensor, dict[str, Any], dv.VBD]:
     """Two to four cubes, thrown at each other and at a floor or Plane that they nearly touch."""
     rng = np.random.default_rng((SEED, number))
     count, size, n = int(rng.integers(2, 5)), float(rng.uniform(0.1, 0.2)), int(rng.integers(2, 4))

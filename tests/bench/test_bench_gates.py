@@ -64,7 +64,9 @@ def raising(device: str) -> None:
 
 
 def test_a_gate_is_not_met_by_an_error() -> None:
-    (row,), _ = contact_gates.measured((0, raising, {}), "cpu")
+    rows, _ = contact_gates.measured((0, raising, {}), "cpu")
+    assert isinstance(rows, list)
+    (row,) = rows
     assert not row["met"] and "not today" in row["note"]
     found = contact_gates.over([3], raising, "cpu")
     assert found["ends"] == {} and "scene 3" in found["raised"][0]
