@@ -261,19 +261,27 @@ PARTS = ("start", "first rigid correction", "sweeps", "coarse correction", "corr
 
 
 def risen(number: int, device: str) -> dict[str, float]:
-    """By part of a step the largest rise of the potential of a set of touching bodies, over the sizes of all terms at
-    the start of the step, in four steps. It looks between the parts of diffvbd.step.contact, and sums up its terms."""
-    from diffvbd.step import contact
+    """By part of a step the largest rise of the scene's potential over its value at the start of the step, in four
+    steps. It looks between the parts of diffvbd.step.contact; pairs and lagged friction are that module's own terms."""
+    from diffvbd.step import contact, contact_corrections
 
     model, x, v, material, solver = drawn(number, device)
-    worst: dict[str, float] = {}
-    step = contact.ContactStep
+    floor, h = [energy for energy in model.energies if isinstance(energy, dv.FloorBarrier)], solver.time_step
+    body, worst, step = model_of(model.mesh, *floor, device=device), {}, contact.ContactStep
     now: dict[str, Any] = {}
 
+    def potential(x: Tensor) -> float:
+        terms = contact_corrections
+        total = reference.incremental_potential(body, x, now["y"], **material, time_step=h).sum()
+        for listed, values in ((now["terms"].listed, terms.barrier_values), (now["terms"].lagged, terms.lagged_values)):
+            total = total + values(now["terms"], x).sum() if len(listed.pairs) else total
+        rubs = now["terms"].fields.floor_lag.numel() > 0
+        return float(total + terms.floor_friction_values(now["terms"], x).sum() if rubs else total)
+
     def note(part: str, x: Tensor, to: Tensor) -> None:
-        rise, size = now["trials"].rise(x.detach(), to.detach()).unbind(-1)
-        now["size"] = now["size"] or float(size.sum())  # in single flight the terms that change may be roundings
-        worst[part] = max(worst.get(part, -math.inf), float(rise.max()) / now["size"])
+        before, after = potential(x.detach()), potential(to.detach())
+        now["size"] = now["size"] or before
+        worst[part] = max(worst.get(part, -math.inf), (after - before) / now["size"])
 
     def watched(owner: Any, name: str, part: str, read: Callable[[Any], Tensor]) -> Any:
         work = getattr(owner, name)
@@ -294,7 +302,7 @@ def risen(number: int, device: str) -> dict[str, float]:
     def started(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, at: Tensor, floor: Any,
                 origin: Tensor, detection: Any, *rest: Any) -> Any:  # fmt: skip
         end = start(x, move, fall, mass, was, at, floor, origin, detection, *rest)
-        now["trials"] = contact._trials(now["step"], end, at, detection.listed)
+        now["terms"] = contact._scenes(now["step"], end, at, detection.listed)
         note("start", x, end.x)
         return end
 
@@ -307,7 +315,7 @@ def risen(number: int, device: str) -> dict[str, float]:
                       watched(contact, "corrected_after", PARTS[4], lambda end: end.x)):  # fmt: skip
             patches.enter_context(patch)
         for _ in range(4):
-            now["size"] = 0.0
+            now |= {"size": 0.0, "y": x + h * v + h * h * torch.tensor([0.0, -GRAVITY, 0.0]).to(x)}
             x, v = dv.step(model, x, v, solver, gravity=(0.0, -GRAVITY, 0.0), **material)
     return worst
 
