@@ -302,8 +302,8 @@ def stack(count: int, sweeps: int, way: str, device: str, height: float = 0.2, m
     sway = float((centers - centers[0])[..., [0, 2]].norm(dim=-1).max())
     top = float(centers[-1, -1, 1] / centers[0, -1, 1])
     case = f"{count} boxes of {height:g} m, K = {sweeps}, {way}" + ", 1:10:100" * bool(densities)
-    # what barriers bear of each body, summed up from the top
-    up = course.forces(20, lambda found: found.vertices.normal[:, 1].reshape(count, -1).sum(1))
+    # what contact bears of each body, summed up from the top
+    up = course.forces(20, lambda found: found.vertices.total[:, 1].reshape(count, -1).sum(1))
     weight = GRAVITY * model.mass.cpu().reshape(count, -1).sum(1).numpy()
     off = up[::-1].cumsum()[::-1] / weight[::-1].cumsum()[::-1] - 1
     worst = int(np.abs(off).argmax())
@@ -356,7 +356,7 @@ def rings(sweeps: int, way: str, device: str) -> Row:
     model = model_of([upper, dv.TetMesh(low, upper.tets, orient=True)], pairs(), dv.Friction(0.3),
                      pinned=np.concatenate([upper.points[:, 1] > 0.05, low[:, 1] > np.inf]), device=device)  # fmt: skip
     course = march(model, 1 / 100, sweeps, 150, way, mu=10 * MODULUS)
-    force = course.forces(30, lambda found: found.vertices.normal[upper.num_vertices :].sum(0))[1]
+    force = course.forces(30, lambda found: found.vertices.total[upper.num_vertices :].sum(0))[1]
     weight = GRAVITY * float(model.mass[upper.num_vertices :].sum())
     return near("rings", f"force between, K = {sweeps}, {way}", float(force), weight, 0.05, "", course)
 
@@ -416,7 +416,9 @@ def gaps(support: str, sizes: Sequence[int], sweeps: int, device: str) -> Row:
             bodies.append(mesh.box((5, 2, 5), (0.3, 0.1, 0.3), split="kuhn").translate((-0.053, -0.1, -0.047)))
             colliders = ()
         tets = mesh.join(bodies)
-        model = model_of(tets, pairs(), pinned=np.arange(tets.num_vertices) >= n**3, colliders=colliders, device=device)
+        # soft enough for a gap of a third of dhat
+        model = model_of(tets, pairs(kappa=200.0), pinned=np.arange(tets.num_vertices) >= n**3, colliders=colliders,
+                         device=device)  # fmt: skip
         x = settled(model, steps=12, sweeps=sweeps, mu=10 * MODULUS)[: n**3]
         found.append(float(x[model.rest_points[: n**3, 1] < 0.5 * DHAT + 1e-9, 1].mean()))
     value = max(found) / min(found) - 1

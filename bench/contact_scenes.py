@@ -52,9 +52,11 @@ class Course(NamedTuple):
         return self.mean(self.v[last] - self.v[first]) / ((last - first) * self.time_step)
 
     def forces(self, steps: int, read: Callable[[dv.contact.Forces], Tensor]) -> Array:
-        """What is read from the barriers' forces at the ends of the last steps, on average."""
-        at = self.x[-steps:].to(self.model.device)
-        return np.mean([read(dv.contact.forces(self.model, x)).cpu().numpy() for x in at], 0)
+        """What is read from the forces of contact at the ends of the last steps, on average."""
+        x, v = (t[-steps - 1 :].to(self.model.device) for t in (self.x, self.v))
+        solver = dv.VBD(self.time_step, 1)
+        found = (dv.contact.forces(self.model, x[k + 1], solver, previous=(x[k], v[k])) for k in range(steps))
+        return np.mean([read(one).cpu().numpy() for one in found], 0)
 
 
 def crossings(model: dv.Model, x: Tensor) -> int:
