@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -191,6 +193,36 @@ def forward_reverse(scene: Scene, sweeps: int, steps: int, tape: Any = "auto") -
 
 def milliseconds(seconds: float | None, steps: int = 1) -> float | None:
     return None if seconds is None else 1e3 * seconds / steps
+
+
+# --- what a call enters, and what it leaves to autograd ---------------------------------------------------------------
+
+
+def calls_of(work: Callable[[], Any]) -> tuple[int, int]:
+    """Python calls within the package, and how many of its files they enter."""
+    files: Counter[str] = Counter()
+
+    def seen(frame: Any, event: str, _: Any) -> None:
+        if event == "call" and "/diffvbd/" in frame.f_code.co_filename:
+            files[frame.f_code.co_filename] += 1
+
+    sys.setprofile(seen)
+    try:
+        work()
+    finally:
+        sys.setprofile(None)
+    return sum(files.values()), len(files)
+
+
+def nodes_of(outputs: Iterable[Tensor]) -> int:
+    """Nodes of autograd's graph, without leaves."""
+    found, left = set(), [t.grad_fn for t in outputs]
+    while left:
+        node = left.pop()
+        if node is not None and node not in found and type(node).__name__ != "AccumulateGrad":
+            found.add(node)
+            left += [after for after, _ in node.next_functions]
+    return len(found)
 
 
 # --- time and memory of this process ---------------------------------------------------------------------------------

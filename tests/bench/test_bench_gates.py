@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import diffvbd as dv
-from bench import extremes, tables
+from bench import contact_gates, extremes, tables
 from bench.__main__ import main
 from diffvbd.testing import tolerance
 
@@ -48,6 +48,32 @@ def test_nothing_crosses_in_scenes_that_are_drawn(tmp_path: Path) -> None:
     assert sum(row["scene_steps"] for row in rows) >= 150
     assert all(row["crossings"] == row["nonfinite"] == 0 for row in rows)
     assert max(row["cut"] for row in rows) > 0.05
+
+
+def test_gates_of_contact_that_are_met(tmp_path: Path) -> None:
+    results = results_of("contact_gates", tmp_path, "--only", "gradient,violent")
+    for group in ("gradient", "violent"):
+        for row in results[group]["rows"]:
+            assert {"gate", "case", "value", "reference", "bar", "seconds", "note"} <= set(row)
+            assert row["met"] and row["seconds"] > 0, row
+
+
+def raising(device: str) -> None:
+    raise RuntimeError("not today")
+
+
+def test_a_gate_is_not_met_by_an_error() -> None:
+    rows, _ = contact_gates.measured((0, raising, {}), "cpu")
+    assert isinstance(rows, list)
+    (row,) = rows
+    assert not row["met"] and "not today" in row["note"]
+    found = contact_gates.over([3], raising, "cpu")
+    assert found["ends"] == {} and "scene 3" in found["raised"][0]
+    for rows in (contact_gates.contact_scenes.flight_rows({}, found["raised"]),
+                 contact_gates.contact_scenes.descent_rows({}, found["raised"]),
+                 contact_gates.contact_scenes.gradient_rows({}, found["raised"], 1),
+                 contact_gates.lost_rows({}, found["raised"], 8)):  # fmt: skip
+        assert not any(row["met"] for row in rows)
 
 
 def test_integrators_of_second_order_and_impacts_that_gain_nothing(tmp_path: Path) -> None:
