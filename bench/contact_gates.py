@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench import common, contact_scenes, floors
+from bench import common, contact_scenes, converged_floor
 from bench.contact import turned
 
 from bench.contact_scenes import DHAT, GRAVITY, KAPPA, MODULUS, NONE, RISE, SEED, UP, WAYS, Array, Found, Row  # isort: skip
@@ -54,7 +54,7 @@ RADIUS, SPACING, BALL_DHAT = 0.1, 0.036, 5e-3
 
 
 def the_ball(gap: float) -> dv.TetMesh:
-    body = floors.ball(RADIUS, SPACING)
+    body = converged_floor.ball(RADIUS, SPACING)
     return body.translate((0.0, gap - body.points[:, 1].min(), 0.0))
 
 
@@ -68,7 +68,7 @@ def on(surface: str, tets: dv.TetMesh, kappa: float, **options: Any) -> dv.Model
 def ball(young: float, time_step: float, sweeps: int, device: str) -> list[Row]:
     """Rebound of a ball, over its speed of 2 m/s, once the converged one has left the floor."""
     tets, kappa, steps, out = the_ball(8e-3), max(1e5, 3 * young * SPACING), 0, []
-    body = floors.Body(tets.points, tets.tets, young, 0.3, time_step, kappa, BALL_DHAT)
+    body = converged_floor.Body(tets.points, tets.tets, young, 0.3, time_step, kappa, BALL_DHAT)
     x, v, share = tets.points, np.zeros_like(tets.points) - (0.0, 2.0, 0.0), body.mass / body.mass.sum()
     while (share @ v[:, 1] < 0 or x[:, 1].min() < BALL_DHAT) and steps < 600:
         x, v = body.step(x, v)
@@ -88,7 +88,7 @@ def pressed(ways: Sequence[float], sweeps: int, device: str) -> list[Row]:
     """Force on the floor of a ball whose top is pinned to a plate that comes down by so much in each step."""
     tets, h, kappa, out = the_ball(BALL_DHAT), 5e-3, 2e5, []
     plate = tets.points[:, 1] > BALL_DHAT + 1.6 * RADIUS
-    body = floors.Body(tets.points, tets.tets, 1e5, 0.3, h, kappa, BALL_DHAT, pinned=plate)
+    body = converged_floor.Body(tets.points, tets.tets, 1e5, 0.3, h, kappa, BALL_DHAT, pinned=plate)
     down = tets.points - np.cumsum(ways)[:, None, None] * plate[:, None] * np.array(UP)
     goal = body.floor_force(body.rollout(tets.points, 0 * tets.points, len(ways), down)[0][-1])
     for surface, way in product(SURFACES[:2], WAYS):

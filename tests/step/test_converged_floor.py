@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.converged_floor import Body, apart, ball
 
 import diffvbd as dv
+from bench.converged_floor import Body, apart, ball
 from diffvbd.testing import tolerance
 
 STEPS = 12
