@@ -144,48 +144,5 @@ DIFFVBD_OPERATOR(Out<2>, contact_lag_backward, In bar, In x, In origin, In colli
   });
 }
 
-// friction, damping [1 | B], or empty.
-template <class T>
-contact::LagCoefficients<T> lag_coefficients(const Tensor& friction, const Tensor& damping, const Reader<T>& read) {
-  return {read.batch_or_null("friction", friction, 1), read.batch_or_null("damping", damping, 1)};
-}
-
-// Friction, damping, normal and weights of each pair [pairs, 9], by the coefficients of its scene, which may be empty,
-// and the forces of pairs on corner points [B, N, 3]; the adjoint, of which either bar may be empty.
-DIFFVBD_OPERATOR(Out<2>, contact_friction_lag, In x, In origin, In collider, In kappa, In friction, In damping,
-                 In pairs, In constants, In ptr, In entry) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
-    const auto by = lag_coefficients(friction, damping, Reader<T>(x));
-    Tensor lag = device.empty({pairs.size(0), contact::kLagScalars}), push = device.empty({x.size(0), in.corners, 3});
-    DIFFVBD_ON_CUDA(const Tensor slots = device.empty({pairs.size(0), cuda::kLagSlots});)
-    DIFFVBD_RUN(device, lagged_friction<T>, in, by, data<const T>(x), x.size(0), pairs.size(0), data<T>(lag),
-                DIFFVBD_ON_CUDA(data<T>(slots), ) data<T>(push));
-    return Out<2>(lag, push);
-  });
-}
-DIFFVBD_OPERATOR(Out<4>, contact_friction_lag_backward, In lag_bar, In push_bar, In x, In origin, In collider, In kappa,
-                 In friction, In damping, In pairs, In constants, In ptr, In entry) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
-    const Reader<T> read(x);
-    const auto by = lag_coefficients(friction, damping, read);
-    const int64_t b = x.size(0), rows = pairs.size(0) * contact::kLagScalars;
-    const contact::LaggedFrictionBars<T> given{
-        lag_bar.numel() ? read.like("lag_bar", lag_bar, rows) : nullptr,
-        push_bar.numel() ? read.like("push_bar", push_bar, 3 * b * in.corners) : nullptr, in.corners};
-    Tensor points = device.empty({b, in.corners, 3}), kappa_bar = device.empty({b});
-    Tensor friction_bar = device.empty({friction.numel() ? b : 0});
-    Tensor damping_bar = device.empty({damping.numel() ? b : 0});
-    DIFFVBD_ON_CUDA(const Tensor slots = device.empty({pairs.size(0), cuda::kLagSlots});)
-    DIFFVBD_RUN(device, lagged_friction_backward<T>, in, by, given, data<const T>(x), b,
-                DIFFVBD_ON_CUDA(pairs.size(0), data<T>(slots), ) data<T>(points), data<T>(kappa_bar),
-                data_or_null<T>(friction_bar), data_or_null<T>(damping_bar));
-    return Out<4>(points, kappa_bar, friction_bar, damping_bar);
-  });
-}
-
 }  // namespace
 }  // namespace diffvbd

@@ -121,36 +121,6 @@ DIFFVBD_FN void store_lag(const LagState<T>& a, T* to) {
   for (int i = 0; i < kLagScalars; ++i) to[i] = values[i];
 }
 
-// A pair's damping fraction by its normal force (diffvbd/energies.py, damped_fraction), and its derivatives.
-template <class T>
-struct DampingFraction {
-  T value = T(0), by_force = T(0), by_kappa = T(0);
-  DIFFVBD_FN DampingFraction(T force, T kappa, T dhat) {
-    const T half = T(fade()) * dhat, whole = force + half * kappa;
-    if (!(T(0) < whole)) return;  // without a barrier there is no damping
-    value = force / whole;        // squares of `whole` would vanish in single precision
-    by_force = half * kappa / whole / whole, by_kappa = -value * (half / whole);
-  }
-};
-
-// Coefficients of friction and damping of each scene; null without.
-template <class T>
-struct LagCoefficients {
-  Batched<const T> friction, damping;  // [B]
-  DIFFVBD_FN T friction_of(int64_t scene) const { return friction.data ? friction.data[scene * friction.scene] : T(0); }
-  DIFFVBD_FN T damping_of(int64_t scene) const { return damping.data ? damping.data[scene * damping.scene] : T(0); }
-};
-
-// Stores the inputs of Lag: friction and damping by their coefficients, normal and weights.
-template <class T>
-DIFFVBD_FN void store_lagged_friction(const LagState<T>& a, T friction, T damping, T kappa, T dhat, T* to) {
-  const LagState<T> friction_load{friction * a.force,
-                                  damping * DampingFraction<T>(a.force, kappa, dhat).value,
-                                  a.n,
-                                  {a.w[0], a.w[1], a.w[2], a.w[3]}};
-  store_lag(friction_load, to);
-}
-
 // bar: adjoint of what store_lag wrote. Twelve Dual evaluations, once a step.
 template <class T>
 DIFFVBD_FN void reverse_lag(int kind, const Corners<T>& c, const PairConstants<T>& a, T kappa, const T* bar,
@@ -174,52 +144,5 @@ DIFFVBD_FN void reverse_lag(int kind, const Corners<T>& c, const PairConstants<T
     }
   }
 }
-
-// The same with the adjoints of the coefficients.
-template <class T>
-struct LaggedFrictionAdjoint {
-  PairAdjoint<T> pair;
-  T friction = T(0), damping = T(0);
-};
-
-// bar: adjoint of what store_lagged_friction() wrote. push: of the pair's force on each corner.
-template <class T>
-DIFFVBD_FN void reverse_lagged_friction(int kind, const Corners<T>& c, const PairConstants<T>& a, T kappa, T friction,
-                                        T damping, const T* bar, const Vec3<T> (&push)[4],
-                                        LaggedFrictionAdjoint<T>& out) {
-  const LagState<T> now = lag_state(kind, c, a, kappa);
-  const DampingFraction<T> fraction(now.force, kappa, a.dhat);
-  T own[kLagScalars] = {friction * bar[0] + damping * bar[1] * fraction.by_force, T(0)};
-  for (int i = 2; i < kLagScalars; ++i) own[i] = bar[i];
-  for (int k = 0; k < 4; ++k) {
-    const T along = dot(now.n, push[k]);
-    const Vec3<T> by_n = now.force * now.w[k] * push[k];
-    own[0] += now.w[k] * along, own[5 + k] += now.force * along;
-    add_to(own + 2, by_n);
-  }
-  reverse_lag(kind, c, a, kappa, own, out.pair);
-  if (!(now.active > T(0))) return;
-  out.pair.kappa += damping * bar[1] * fraction.by_kappa;
-  out.friction = bar[0] * now.force, out.damping = bar[1] * fraction.value;
-}
-
-// These adjoints of all pairs; null where there are none.
-template <class T>
-struct LaggedFrictionBars {
-  const T *lag, *push;  // [pairs, 9], [B, corners, 3]
-  int64_t corners;
-  DIFFVBD_FN void reverse(const LagCoefficients<T>& by, int64_t pair, const int32_t* record, const Corners<T>& c,
-                          const PairConstants<T>& a, T kappa, LaggedFrictionAdjoint<T>& out) const {
-    const int64_t scene = record[5];
-    T bar[kLagScalars] = {};
-    Vec3<T> push_bar[4] = {};
-    for (int i = 0; i < kLagScalars && lag; ++i) bar[i] = lag[kLagScalars * pair + i];
-    for (int k = 0; k < 4 && push; ++k) {
-      const T* own = push + 3 * (scene * corners + record[k]);
-      push_bar[k] = {own[0], own[1], own[2]};
-    }
-    reverse_lagged_friction(record[4], c, a, kappa, by.friction_of(scene), by.damping_of(scene), bar, push_bar, out);
-  }
-};
 
 }  // namespace diffvbd::contact

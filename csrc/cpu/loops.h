@@ -200,39 +200,6 @@ void pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t 
     kappa[record[5]] += out.kappa;
   });
 }
-template <class T>
-void lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
-                     int64_t scenes, int64_t pairs, T* values, T* push) {
-  std::fill_n(values, pairs * contact::kLagScalars, T(0)), std::fill_n(push, 3 * scenes * in.corners, T(0));
-  for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
-    const auto state = contact::lag_state(record[4], corners, a, stiffness);
-    contact::store_lagged_friction(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
-                                   values + contact::kLagScalars * pair);
-    Vec3<T> force[4];
-    for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
-    add_at_corners(in, record, force, push);
-  });
-}
-// friction and damping may be null
-template <class T>
-void lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                              const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes, T* points,
-                              T* kappa, T* friction, T* damping) {
-  std::fill_n(points, 3 * scenes * in.corners, T(0));
-  for (T* bars : {kappa, friction, damping}) {
-    if (bars) std::fill_n(bars, scenes, T(0));
-  }
-  for_pairs(in, x, scenes, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
-    const int64_t scene = record[5];
-    contact::LaggedFrictionAdjoint<T> out;
-    given.reverse(by, pair, record, corners, a, stiffness, out);
-    add_at_corners(in, record, out.pair.x, points);
-    kappa[scene] += out.pair.kappa;
-    if (friction) friction[scene] += out.friction;
-    if (damping) damping[scene] += out.damping;
-  });
-}
-
 // --- sums over a mesh
 // -------------------------------------------------------------------------------------------------
 

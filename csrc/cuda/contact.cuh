@@ -268,35 +268,6 @@ __global__ void lag_reverse(const __grid_constant__ ContactInputs<T> in, const T
   store_slots(out.x, {out.kappa}, slots + kLagSlots * pair);
 }
 
-template <class T>
-__global__ void friction_forward(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
-                                 const T* x, int64_t scenes, int64_t pairs, T* values, T* slots) {
-  const int64_t pair = own_item();
-  const int64_t count = in.listed.ptr[scenes * in.corners] / 4;
-  clear_rows(values, contact::kLagScalars, count, pairs);
-  if (pair >= count) return;
-  const LagPair<T> at(in, x, pair);
-  const int64_t scene = at.record[5];
-  const auto state = contact::lag_state(at.record[4], at.corners, at.constants, at.kappa);
-  contact::store_lagged_friction(state, by.friction_of(scene), by.damping_of(scene), at.kappa, at.constants.dhat,
-                                 values + contact::kLagScalars * pair);
-  Vec3<T> force[4];
-  for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
-  store_slots(force, {}, slots + kLagSlots * pair);
-}
-
-template <class T>
-__global__ void friction_reverse(const __grid_constant__ ContactInputs<T> in, const contact::LagCoefficients<T> by,
-                                 const contact::LaggedFrictionBars<T> given, const T* x, int64_t scenes, int64_t pairs,
-                                 T* slots) {
-  const int64_t pair = own_item();
-  if (pair >= pairs || 4 * pair >= in.listed.ptr[scenes * in.corners]) return;
-  const LagPair<T> at(in, x, pair);
-  contact::LaggedFrictionAdjoint<T> out;
-  given.reverse(by, pair, at.record, at.corners, at.constants, at.kappa, out);
-  store_slots(out.pair.x, {out.pair.kappa, out.friction, out.damping}, slots + kLagSlots * pair);
-}
-
 // Sum for each corner point over the corners of its pairs [B, N, 3], a warp each.
 template <class T>
 __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t scenes, const T* slots, T* out) {
@@ -388,26 +359,6 @@ cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t sc
                               T* slots, T* points, T* kappa, cudaStream_t stream) {
   if (auto error = launch_contact(lag_reverse<T>, pairs, stream, in, x, scenes, pairs, bar, slots)) return error;
   return sum_slots(in, scenes, slots, points, {kappa}, stream);
-}
-
-template <class T>
-cudaError_t lagged_friction(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
-                            int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream) {
-  if (auto error = launch_contact(friction_forward<T>, pairs, stream, in, by, x, scenes, pairs, values, slots)) {
-    return error;
-  }
-  return sum_slots(in, scenes, slots, push, {}, stream);
-}
-
-template <class T>
-cudaError_t lagged_friction_backward(const ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                                     const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes,
-                                     int64_t pairs, T* slots, T* points, T* kappa, T* friction, T* damping,
-                                     cudaStream_t stream) {
-  if (auto error = launch_contact(friction_reverse<T>, pairs, stream, in, by, given, x, scenes, pairs, slots)) {
-    return error;
-  }
-  return sum_slots(in, scenes, slots, points, {kappa, friction, damping}, stream);
 }
 
 }  // namespace diffvbd::cuda

@@ -32,16 +32,6 @@ cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t sc
 template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
                               const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
-// As the CPU operator contact_friction_lag; friction and damping may be null.
-template <class T>
-cudaError_t lagged_friction(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
-                            int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
-template <class T>
-cudaError_t lagged_friction_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
-                                     const contact::LaggedFrictionBars<T>& given, const T* x, int64_t scenes,
-                                     int64_t pairs, T* slots, T* points, T* kappa, T* friction, T* damping,
-                                     cudaStream_t stream);
-
 // Bytes of workspace.
 template <class T>
 size_t detect_workspace_bytes(const contact::Surfaces<T>& in, int64_t capacity);

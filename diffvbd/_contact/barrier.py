@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -114,13 +115,14 @@ class Friction:
     fraction of it.
 
     Args:
-        coefficient: mu_f >= 0.
+        coefficient: mu_f >= 0, one number or a matrix [n, n] of each two of: the bodies of the mesh, the colliders, the
+            floor if there is one. It counts in either order, with the mean of both entries.
         velocity: eps_v > 0 [m/s].
 
-    Input: ``friction`` (scalar), the coefficient.
+    Input: ``friction``, the coefficient: scalar, or [n, n] where the energy has a matrix.
 
     Raises:
-        ValueError: A coefficient < 0 or not finite, a velocity below 1e-12 m/s.
+        ValueError: A coefficient < 0 or not finite, a matrix of another size, a velocity below 1e-12 m/s.
         TypeError: What is no number, or a tensor that requires grad.
 
     Source: Li et al. (2020), section 5; docs/method.md, section 12.
@@ -131,12 +133,22 @@ class Friction:
     parameters: ClassVar[dict[str, int]] = {"coefficient": 0}
     units: ClassVar[dict[str, str]] = {"coefficient": "-"}
 
-    coefficient: float = 0.5
+    coefficient: Any = 0.5
     velocity: float = 1e-3
 
     def __post_init__(self) -> None:
         refuse_gradients(self)
-        object.__setattr__(self, "coefficient", check_number("coefficient", self.coefficient))
+        if np.ndim(self.coefficient) == 0:
+            object.__setattr__(self, "coefficient", check_number("coefficient", self.coefficient))
+        else:
+            matrix = torch.as_tensor(self.coefficient, dtype=torch.float64).detach().cpu()
+            if matrix.dim() != 2 or matrix.shape[0] != matrix.shape[1]:
+                fail("coefficient", "a number or a matrix [n, n]", f"shape {list(matrix.shape)}")
+            if not bool((torch.isfinite(matrix) & (matrix >= 0)).all()):
+                wrong = matrix[~((matrix >= 0) & matrix.isfinite())][0]
+                fail("coefficient", "finite numbers >= 0", f"{float(wrong):g}")
+            object.__setattr__(self, "coefficient", matrix)
+            object.__setattr__(self, "parameters", {"coefficient": 2})
         object.__setattr__(self, "velocity", check_positive("velocity", self.velocity, "m/s"))
         if self.velocity < LEAST_VELOCITY:
             fail("velocity", f"at least {LEAST_VELOCITY:g} m/s", self.velocity)

@@ -152,7 +152,7 @@ def lagged_forces(
     """Damping of approach and friction on each corner of the lagged pairs [N], both [Q, 4, 3].
 
     Args:
-        points: Corner points at the state [B, N, 3].  damping: [1 | B] [N s/m].  coefficient: [1 | B].
+        points: Corner points at the state [B, N, 3].  damping: [1 | B] [N s/m].  coefficient: [Q], of friction.
         reach: Slip in a step from which friction is full [m].
     """
     along, slip, size = _slips(lag, points, coefficient, reach)
@@ -165,7 +165,7 @@ def _slips(lag: Lag, points: Tensor, coefficient: Tensor, reach: float) -> tuple
     moved = (lag.weights[..., None] * lag.pairs.positions(points - lag.start)).sum(1)
     along = (lag.normal * moved).sum(-1)
     slip = moved - along[:, None] * lag.normal
-    return along, slip, lag.pairs.of_scene(coefficient) * lag.size * smoothed(slip.T, reach)[1]
+    return along, slip, coefficient * lag.size * smoothed(slip.T, reach)[1]
 
 
 def lagged_stiffness(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,11 +20,12 @@ from .._contact.pair_forces import (
     lagged_stiffness,
     near_pairs,
 )
+from ..energies import damped_fraction
 from ..model.inputs import parameter_of
 from ..model.system import System
 from ..ops import contact as ops_contact
 from ..ops.fields import CONSTANTS
-from ..ops.sums import segment_sum
+from ..ops.sums import segment_sum, sum_by
 from ..reference.energies import smoothed
 from .potential import IncrementalPotential
 
@@ -104,17 +106,43 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
     return ops_contact.pair_lag(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, *listed)
 
 
-def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
-                 listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
+def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor | None, damping: Tensor | None,
+                 origin: Tensor, body: Tensor, listed: Pairs) -> Tensor:  # fmt: skip
     """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_fraction), normal (3),
-    weights (4); and the forces of pairs on corner points [B, N, 3] [N]. Differentiable in the first five.
+    weights (4). Differentiable in the first five.
 
     Args:
-        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  friction, damping: [1 | B], or empty.
-        origin: [B, V, 3] or empty.
+        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa, damping: [1 | B].  origin: [B, V, 3] or empty.
+        friction: [1 | B], or [1 | B, n, n] of each two bodies and colliders.  body: [N], of the corner points.
     """
-    given = (t.contiguous() for t in (x, collider, kappa, friction, damping))
-    return ops_contact.pair_friction_lag(*given, origin, *listed)
+    state, scenes = pair_lag(x, collider, kappa, origin, listed), x.shape[0]
+    force, load, rate = state[:, 0], state.new_zeros((len(state),)), state.new_zeros((len(state),))
+    if friction is not None:
+        load = force * coefficients(friction, listed, body, scenes)
+    if damping is not None:
+        stiffness, own = (of_scene(ops.broadcast(t, (scenes,)), listed) for t in (kappa, damping))
+        dhat = torch.where(state[:, 1] > 0, listed.constants[:, 0], 1.0)  # rows that no pair fills hold anything
+        rate = own * damped_fraction(force, stiffness, dhat)
+    return torch.cat([torch.stack([load, rate], 1), state[:, 2:]], 1)
+
+
+def coefficients(friction: Tensor, listed: Pairs, body: Tensor, scenes: int) -> Tensor:
+    """Friction coefficient of each pair [pairs]; arguments as of friction_lag()."""
+    if friction.dim() == 1:
+        return of_scene(ops.broadcast(friction, (scenes,)), listed)
+    table = ops.broadcast(of_two(friction), (scenes, *friction.shape[1:]))
+    rows = listed.pairs.clamp(min=0).long()
+    first, second = (body.long()[rows[:, k]] for k in (0, 3))  # the last corner is of the second side
+    return _entries(table, (rows[:, 5] * table.shape[1] + first) * table.shape[1] + second)
+
+
+def of_two(friction: Tensor) -> Tensor:
+    """Coefficients of two bodies [..., n, n], in either order."""
+    return (friction + friction.mT) / 2
+
+
+_entries = ops.Linear(lambda table, index: table.flatten()[index],
+                      lambda bar, shape, index: sum_by(bar, index, math.prod(shape)).reshape(shape), 2)  # fmt: skip
 
 
 # --- contact of a step at one state -----------------------------------------------------------------------------------
@@ -176,6 +204,17 @@ class StepContact:
         value = parameter_of(self.model, self.parameters, name)
         return self.colliders.new_zeros((1,), dtype=torch.float64) if value is None else value.double()
 
+    @cached_property
+    def coefficients(self) -> Tensor:
+        """Friction coefficient of each lagged pair [Q]."""
+        surface, friction = self.model.surface_of_contact, self._number("friction")
+        assert self.lag is not None and surface is not None
+        pairs = self.lag.pairs
+        if friction.dim() == 1:
+            return pairs.of_scene(friction)
+        a, b = (side.long() for side in pairs.sides(surface.body))
+        return of_two(friction).expand(len(self.colliders), *friction.shape[1:])[pairs.scene, a, b]
+
     def at(self, x: Tensor) -> ContactState:
         """Forces at x [B, V, 3].
 
@@ -192,7 +231,7 @@ class StepContact:
         damping = friction = points.new_zeros((0, 4, 3))
         if self.lag is not None:
             damping, friction = lagged_forces(self.lag, points, self._number("pair_damping"),
-                                              self._number("friction"), self.h, self.reach)  # fmt: skip
+                                              self.coefficients, self.h, self.reach)  # fmt: skip
         lagged = None if self.lag is None else self.lag.pairs
         return ContactState(points, pairs, pushes, lagged, damping, friction, *self._floor(points[:, : x.shape[1]]))
 
@@ -217,7 +256,7 @@ class StepContact:
         assert floor is not None and start is not None and self.planes is not None
         start = start[:, : x.shape[1]]
         force, normal = floor.normal_force(start, self.planes, None)
-        lagged = self._number("friction")[:, None, None] * force
+        lagged = floor_coefficients(self._number("friction"), self.model.body) * force
         travel = (x - start)[:, :, None]
         slip = travel - (travel * normal).sum(-1, keepdim=True) * normal
         return lagged, slip, smoothed(slip.movedim(-1, -2), self.reach)[1]
@@ -228,12 +267,17 @@ class StepContact:
         total = barrier_stiffness(forces.pairs, points, self._number("pair_kappa"))
         if self.lag is not None:
             total = total + lagged_stiffness(self.lag, points, self._number("pair_damping"),
-                                             self._number("friction"), self.h, self.reach)  # fmt: skip
+                                             self.coefficients, self.h, self.reach)  # fmt: skip
         total = total[:, :count]
         if self.model.friction is not None and self.start is not None and self.planes is not None:
             lagged, _, factor = self._floor_slip(points[:, :count])
             total = total + 2 * (lagged * factor).sum(-1)
         return total
+
+
+def floor_coefficients(friction: Tensor, body: Tensor) -> Tensor:
+    """Friction coefficient of each vertex on a floor [1 | B, 1 | V, 1]; friction as of friction_lag(), body: [V]."""
+    return friction[:, None, None] if friction.dim() == 1 else of_two(friction)[:, body, -1, None]
 
 
 def _no_pairs(points: Tensor) -> NearPairs:

@@ -101,6 +101,7 @@ class Model:
         # those of the default solver: other solvers derive theirs (system.py)
         self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.may_correct, self.floor is not None)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
+        self._check_friction()
         device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
@@ -127,6 +128,15 @@ class Model:
                 fail("energies", "a FloorBarrier or a PairBarrier for Friction to act on", "none")
             return None
         return build_surface(self.mesh, self._pinned, self.contact, colliders)
+
+    def _check_friction(self) -> None:
+        """Raises where a matrix of friction has another size than there are bodies, colliders and floors."""
+        given = None if self.friction is None else np.shape(self.friction.coefficient)
+        wanted = self.mesh.num_bodies + len(self.colliders) + (self.floor is not None)
+        if given and given[0] != wanted:
+            fail("energies: Friction: coefficient", f"a matrix [{wanted}, {wanted}] of {self.mesh.num_bodies} bodies, "
+                 f"{len(self.colliders)} colliders{' and a floor' if self.floor is not None else ''}",
+                 f"shape {list(given)}")  # fmt: skip
 
     @property
     def may_correct(self) -> bool:

@@ -414,20 +414,3 @@ pair_lag = Differentiable(
     lambda x, collider, kappa, origin, *listed: raw.contact_lag(x, origin, collider, kappa, *listed), _lag_reverse,
     arguments=8, inputs=3, tensors=4,
 )  # fmt: skip
-
-
-def _friction_lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    x, collider, kappa, friction, damping, origin = saved
-    given = (x.new_empty((0,)) if bar is None else bar for bar in bars)
-    points, *others = raw.contact_friction_lag_backward(*given, x, origin, collider, kappa, friction, damping, *rest)
-    return *_split(points, x), *others
-
-
-# Friction coefficient times normal force [N], damping [N s/m], normal and weights of each pair [pairs, 9], and the
-# forces of pairs on corner points [B, N, 3] [N], of x, collider, kappa, friction, damping, origin; pairs, constants,
-# ptr, entry. friction, damping: [1 | B], or empty without.
-pair_friction_lag = Differentiable(
-    lambda x, collider, kappa, friction, damping, origin, *listed: raw.contact_friction_lag(x, origin, collider, kappa,
-                                                                                       friction, damping, *listed),
-    _friction_lag_reverse, arguments=10, inputs=5, outputs=2, tensors=6,
-)  # fmt: skip

@@ -250,9 +250,6 @@ TABLE: dict[str, Row] = {
     "contact_compact": _contact_compact,
     "contact_lag": lambda a: new(a.x, a.pairs.shape[0], LAG_SCALARS),
     "contact_lag_backward": lambda a: (_points(a.x, a.collider), new(a.x, a.x.shape[0])),
-    "contact_friction_lag": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), _points(a.x, a.collider)),
-    "contact_friction_lag_backward": lambda a: (_points(a.x, a.collider), *(new(a.x, a.x.shape[0] if t.numel() else 0)
-                                                                       for t in (a.kappa, a.friction, a.damping))),
     "contact_rigid_system": _contact_rigid_system,
     "contact_rigid_move": _contact_rigid_move,
     "contact_rigid_backward": _contact_rigid_backward,

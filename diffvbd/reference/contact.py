@@ -69,6 +69,14 @@ class Pairs:
         """A parameter, one number or one for each scene, as one for each pair."""
         return value.expand(self.lead).reshape(-1)[self.batch]
 
+    def of_two(self, value: Tensor, body: Tensor) -> Tensor:
+        """A parameter of each two bodies [..., n, n], or as of per_pair(), for each pair; body: [N]."""
+        if value.dim() < 2 or value.shape[-1] != value.shape[-2]:
+            return self.per_pair(value)
+        a, b = (body.long()[self.corners[:, k]] for k in (0, 3))
+        table = value.expand(*self.lead, *value.shape[-2:]).reshape(-1, *value.shape[-2:])
+        return (table[self.batch, a, b] + table[self.batch, b, a]) / 2
+
     def positions(self, points: Tensor, pairs: Tensor) -> Tensor:
         """Corners [n, 4, 3] of some pairs in corner points [B, N, 3]."""
         return points[self.batch[pairs, None], self.corners[pairs]]
@@ -153,7 +161,8 @@ class LaggedPairForces:
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
-            self.largest = -pairs.per_pair(scene.parameter(friction, "coefficient")) * e * first
+            body = model.surface_of_contact.body
+            self.largest = -pairs.of_two(scene.parameter(friction, "coefficient"), body) * e * first
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -320,28 +320,34 @@ class FloorFriction:
     def __init__(self, scene: Scene, floor: FloorBarrier) -> None:
         friction = scene.model.friction
         self.scene, self.floor = scene, floor
-        self.coefficient = scene.parameter(friction, "coefficient")[..., None, None]
+        given = scene.parameter(friction, "coefficient")
+        if isinstance(friction.coefficient, Tensor):  # of each two bodies; the floor is the last
+            given = ((given + given.mT) / 2)[..., -1, scene.model.body]
+        else:
+            given = given[..., None].expand(*given.shape, len(scene.model.body))
+        self.coefficient = given[..., None, :]
         self.reach = scene.time_step * friction.velocity
 
-    def _full(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
-        """h^2 times the friction that full slip meets [..., planes, n], and the slip [..., planes, 3, n]."""
-        floor, x_prev = self.floor, x_prev.unsqueeze(-3)
+    def _full(self, x: Tensor, x_prev: Tensor, vertices: Any = slice(None)) -> tuple[Tensor, Tensor]:
+        """h^2 times the friction that full slip meets [..., planes, n], and the slip [..., planes, 3, n], of some
+        vertices."""
+        floor, x, x_prev = self.floor, x[..., vertices], x_prev[..., vertices].unsqueeze(-3)
         gap = dot(floor.normal, x_prev) - floor.height
         _, first, _ = log_barrier(gap, floor.kappa, floor.dhat)
         travel = x.unsqueeze(-3) - x_prev
         slip = travel - floor.normal * dot(floor.normal, travel).unsqueeze(-2)
-        return -(self.scene.time_step**2) * self.coefficient * first, slip
+        return -(self.scene.time_step**2) * self.coefficient[..., vertices] * first, slip
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices
-        weight, slip = self._full(take(x, vertices), take(x_prev, vertices))
+        weight, slip = self._full(x, x_prev, vertices)
         weight = (weight * smoothed(slip, self.reach)[1]).unsqueeze(-2)
         across = tangential6(self.floor.normal)
         return torch.cat(((weight * slip).sum(-3), (weight * across).sum(-3)), -2)
 
-    def on_vertices(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient [..., 3, V] and its exact derivative [..., 6, V]."""
-        weight, slip = self._full(x, x_prev)
+    def on_vertices(self, x: Tensor, x_prev: Tensor, vertices: Any = slice(None)) -> tuple[Tensor, Tensor]:
+        """Gradient [..., 3, V] and its exact derivative [..., 6, V], of some vertices."""
+        weight, slip = self._full(x, x_prev, vertices)
         _, rate, bend = smoothed(slip, self.reach)
         across, along = tangential6(self.floor.normal), outer6(slip)
         rate, bend = (weight * rate).unsqueeze(-2), (weight * bend).unsqueeze(-2)
@@ -350,14 +356,14 @@ class FloorFriction:
     def exact_block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         """As block, with that derivative, which corrections take."""
         vertices = self.scene.layout.colors[k].vertices
-        return torch.cat(self.on_vertices(take(x, vertices), take(x_prev, vertices)), -2)
+        return torch.cat(self.on_vertices(x, x_prev, vertices), -2)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         return self.terms(x, x_prev)[0].sum(-1)
 
     def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         free = ~self.scene.model.pinned
-        weight, slip = self._full(x[..., free], x_prev[..., free])
+        weight, slip = self._full(x, x_prev, free)
         total = weight * smoothed(slip, self.reach)[0]
         return total.flatten(-2), free.nonzero()[:, 0].repeat(total.shape[-2])
 

@@ -21,7 +21,7 @@ from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
 from .._contact.start import SubstepStart, start_above, start_between
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
-from ..adjoint.contact import Pairs, friction_lag, no_pairs, some_of
+from ..adjoint.contact import Pairs, floor_coefficients, friction_lag, no_pairs, some_of
 from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
 from ..model.inputs import parameter_of
 from ..model.material import inside_out
@@ -94,7 +94,7 @@ class ContactStep:
         if floor is None or self.floor_data is None or self.model.friction is None:
             return x.new_zeros((0,))
         force, normal = floor.normal_force(x, of_vertices(self.floor_data, x), self.begun.origin)
-        size = broadcast(self._parameter("friction")[:, None, None], force.shape) * force
+        size = broadcast(floor_coefficients(self._parameter("friction"), self.model.body), force.shape) * force
         normal = broadcast(normal, (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
@@ -102,11 +102,12 @@ class ContactStep:
         """Lags friction and damping of the pairs at the start of the step, where there are any."""
         if not self._has_lag:
             return
-        none = self.kappa.new_empty
-        friction = self._parameter("friction") if self.model.friction is not None else none((0,))
-        damping = self._parameter("pair_damping") if self._damps else none((0,))
-        self.lag, _ = friction_lag(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
+        assert self.surface is not None
+        friction = None if self.model.friction is None else self._parameter("friction")
+        damping = self._parameter("pair_damping") if self._damps else None
         self.lagged = listed
+        self.lag = friction_lag(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin,
+                                self.surface.body, listed)  # fmt: skip
 
     @property
     def _damps(self) -> bool:

@@ -128,7 +128,8 @@ def friction_left_over(at: IncrementalPotential) -> Tensor:
     size = normal.norm(dim=-1, keepdim=True)
     along = (left * normal).sum(-1, keepdim=True) / torch.where(size > 0, size.square(), 1.0)
     force = sums.index_add(1, labels, left - along * normal).norm(dim=-1)
-    most = at.step_contact._number("friction")[:, None] * (acts * size)[..., 0]
+    friction = at.step_contact._number("friction")  # of two bodies the largest
+    most = friction.reshape(len(friction), -1).amax(1)[:, None] * (acts * size)[..., 0]
     return share(force, torch.zeros_like(force).index_add(1, labels, most))
 
 
