@@ -3,7 +3,7 @@ pass is written down in torch."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -95,10 +95,10 @@ def planes_of(g: Given) -> Tensor:
     return torch.cat(out, 1)
 
 
-def boxes(at: Tensor, groups: Tensor, count: int, grown: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Corners [count, 3] of the boxes around the points [n, 3] of each group, grown."""
+def boxes(at: Tensor, groups: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Corners [count, 3] of the boxes around the points [n, 3] of each group."""
     index, far = groups[:, None].expand_as(at), at.new_full((count, 3), torch.inf)
-    return (far.scatter_reduce(0, index, at, "amin") - grown, (-far).scatter_reduce(0, index, at, "amax") + grown)
+    return (far.scatter_reduce(0, index, at, "amin"), (-far).scatter_reduce(0, index, at, "amax"))
 
 
 def overlap(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
@@ -106,51 +106,68 @@ def overlap(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
     return (a[0][:, None] <= b[1]).all(-1) & (b[0] <= a[1][:, None]).all(-1)
 
 
+class Swept(NamedTuple):
+    """One scene, and the mass and momentum of its bodies."""
+
+    bodies: int
+    mass: Tensor  # [bodies, 1]
+    momentum: Tensor  # [bodies, 3]
+    rest: tuple[Tensor, Tensor]  # boxes of bodies
+    margin: Tensor  # [bodies, 1]
+    things: tuple[Tensor, Tensor]  # boxes of colliders
+    planes: Tensor  # [P, 4]
+
+    def sweep(self, label: Tensor, stays: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Box of each body while its island translates, and the bodies that must stay."""
+        same = label[:, None] == label
+        blocked = (same & stays).any(1)
+        u = (same.to(self.mass) @ self.momentum) / (same.to(self.mass) @ self.mass).clamp(min=1e-300)
+        u = torch.where(blocked[:, None], 0.0, u)
+        lo, hi = self.rest
+        box = (torch.minimum(lo, lo + u) - self.margin, torch.maximum(hi, hi + u) + self.margin)
+        reached = overlap(box, self.things).any(1)
+        for n, height in zip(self.planes[:, :3], self.planes[:, 3], strict=True):
+            reached = reached | ((torch.where(n < 0, box[1], box[0]) * n).sum(-1) < height)
+        return box, stays | reached
+
+    def join(self, label: Tensor, box: tuple[Tensor, Tensor]) -> Tensor:
+        near = overlap(box, box) | (label[:, None] == label)
+        for _ in range(self.bodies):
+            label = torch.where(near, label, self.bodies).amin(1)
+        return label
+
+    def islands(self, stays: Tensor) -> Tensor:
+        label = torch.arange(self.bodies, device=stays.device)
+        for _ in range(4):
+            box, stays = self.sweep(label, stays)
+            label = self.join(label, box)
+        box, stays = self.sweep(label, stays)
+        if not torch.equal(self.join(label, box), label):
+            label = torch.zeros_like(label)
+            _, stays = self.sweep(label, stays)
+        return torch.where(((label[:, None] == label) & stays).any(1), -1, label)
+
+
 def islands_of(g: Given, trust_radius: Tensor) -> Tensor:
     """Islands of bodies [B, bodies], by their definition: the smallest body of each; -1: it must stay."""
     s, bodies, vertices = g.surface, g.surface.bodies, g.x.shape[1]
     body, pinned, planes = s.body[:vertices].long(), s.pinned[:vertices], planes_of(g)
-    flat = s.body[s.planes.long()].flatten().long() - bodies  # no point of a plane has a box
+    flat = s.body[s.planes.long()].flatten().long() - bodies  # points of a plane span it and bound nothing
+    of, reach = s.body[vertices:].long() - bodies, s.radius[vertices:, None] + DHAT / 2
     out = []
     for b in range(len(g.x)):
-        x, margin = g.x[b], (trust_radius[b] + DHAT / 2)[:, None]
-        at = x if g.origin.numel() == 0 else x + g.origin[b]
+        at = g.x[b] if g.origin.numel() == 0 else g.x[b] + g.origin[b]
         weight = torch.where(pinned, 0.0, g.mass[b % len(g.mass)])[:, None]
-        mass, momentum = (x.new_zeros((bodies, m.shape[1])).index_add(0, body, m) for m in (weight, weight * g.move[b]))
-        stays = x.new_zeros(bodies).index_add(0, body, (pinned | ~(at + g.move[b]).isfinite().all(-1)).to(x)) > 0
-        rest = boxes(at, body, bodies, 0.0)
-        of, reach = s.body[vertices:].long() - bodies, s.radius[vertices:, None] + DHAT / 2
+        mass, momentum = (
+            at.new_zeros((bodies, m.shape[1])).index_add(0, body, m) for m in (weight, weight * g.move[b])
+        )
+        stays = at.new_zeros(bodies).index_add(0, body, (pinned | ~(at + g.move[b]).isfinite().all(-1)).to(at)) > 0
         path = torch.cat([g.was[b] - reach, g.was[b] + reach, g.now[b] - reach, g.now[b] + reach])
-        things = boxes(path, of.repeat(4), int(of.max()) + 1, 0.0)
-        things = (things[0].index_fill(0, flat, torch.inf), things[1].index_fill(0, flat, -torch.inf))
-        label = torch.arange(bodies, device=x.device)
-
-        def swept(label: Tensor, stays: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
-            """Box of each body while its island translates, and the bodies that must stay."""
-            same = label[:, None] == label
-            blocked = (same & stays).any(1)
-            u = (same.to(x) @ momentum) / (same.to(x) @ mass).clamp(min=1e-300)
-            u = torch.where(blocked[:, None], 0.0, u)
-            box = (torch.minimum(rest[0], rest[0] + u) - margin, torch.maximum(rest[1], rest[1] + u) + margin)
-            meets = overlap(box, things).any(1)
-            for n, height in zip(planes[b, :, :3], planes[b, :, 3], strict=True):
-                meets = meets | ((torch.where(n < 0, box[1], box[0]) * n).sum(-1) < height)
-            return box, stays | meets
-
-        def joined(label: Tensor, box: tuple[Tensor, Tensor]) -> Tensor:
-            near = overlap(box, box) | (label[:, None] == label)
-            for _ in range(bodies):
-                label = torch.where(near, label, bodies).amin(1)
-            return label
-
-        for _ in range(4):
-            box, stays = swept(label, stays)
-            label = joined(label, box)
-        box, stays = swept(label, stays)
-        if not torch.equal(joined(label, box), label):
-            label = torch.zeros_like(label)
-            box, stays = swept(label, stays)
-        out.append(torch.where(((label[:, None] == label) & stays).any(1), -1, label))
+        lo, hi = boxes(path, of.repeat(4), int(of.max()) + 1)
+        things = (lo.index_fill(0, flat, torch.inf), hi.index_fill(0, flat, -torch.inf))
+        margin = (trust_radius[b] + DHAT / 2)[:, None]
+        scene = Swept(bodies, mass, momentum, boxes(at, body, bodies), margin, things, planes[b])
+        out.append(scene.islands(stays))
     return torch.stack(out)
 
 
@@ -230,3 +247,42 @@ def test_a_body_that_is_not_finite_has_no_radius(device: str) -> None:
     found = g._replace(move=move).found()
     assert found.trust_radius[0].isfinite().all() and found.island[1, 3] == -1
     assert found.trust_radius[1, 3:].isnan().all() and found.over[1, 3].isnan()
+
+
+def placed(places: list[tuple[float, float, float]], colliders: Any = (), fall: float = 1.0) -> Given:
+    """Unit cubes with these lower corners that fall together."""
+    mesh = dv.mesh.join([dv.mesh.cube(2, 1.0).translate(place) for place in places])
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, DHAT, self_contact=False))
+    model = dv.Model(mesh, energies=energies, colliders=colliders)
+    surface, barrier = model.surface_of_contact, model.contact
+    assert surface is not None and barrier is not None
+    x, points = model.rest_points[None], surface.collider_points[None]
+    move = x.new_tensor([0.0, -fall, 0.0]).expand_as(x).contiguous()
+    return Given(surface, barrier, x, x.new_empty((0,)), model.mass[None], move, 0 * x, points, points, None)
+
+
+def test_bodies_that_fall_side_by_side_are_one_island() -> None:
+    found = placed([(0, 0, 0), (1.001, 0, 0), (5, 0, 0), (6.001, 0.5, 0), (0, 3, 0)]).found()
+    assert found.island.tolist() == [[0, 0, 2, 2, 4]]
+    down = found.u.new_tensor([0.0, -1.0, 0.0])
+    assert (found.u - down).abs().max() < GRID * DHAT and (found.u[..., 1] >= -1.0).all()  # toward zero
+
+
+@pytest.mark.parametrize("collider", ["plane", "sphere", "capsule", "obstacle"])
+@pytest.mark.parametrize(("gap", "expected"), [(0.05, -1), (0.2, 0)])
+def test_what_reaches_a_collider_stays(collider: str, gap: float, expected: int) -> None:
+    """A body that falls by 1 m toward one that is 1 m and a gap below it, with a radius of about 3 dhat."""
+    top = -1.0 - gap
+    slab = dv.mesh.box(2, (1.0, 1.0, 1.0)).translate((0.0, top - 1.0, 0.0))
+    things = {
+        "plane": dv.colliders.Plane((0.0, top, 0.0)),
+        "sphere": dv.colliders.Sphere((0.5, top - 0.3, 0.5), 0.3),
+        "capsule": dv.colliders.Capsule((-2.0, top - 0.1, 0.3), (2.0, top - 0.1, 0.4), 0.1),
+        "obstacle": dv.colliders.Obstacle(slab.points, slab.surface),
+    }
+    g = placed([(0, 0, 0)], [things[collider]])
+    found = g.found()
+    assert found.island.tolist() == [[expected]] and bool((found.u == 0).all()) == (expected < 0)
+    above = g.was + g.was.new_tensor([0.0, 7.0, 0.0])
+    passing = g._replace(was=g.was - above.new_tensor([0.0, 7.0, 0.0]))  # a collider on its way up
+    assert passing.found().island.tolist() == [[-1]] or collider == "plane"

@@ -1,5 +1,5 @@
-"""Claim: the rigid motion with the momentum of the wanted displacements, and the longest displacements of each body, are
-those of plain torch."""
+"""Claim: the rigid motion with the momentum of the wanted displacements, and the longest displacements of each body,
+are those of plain torch."""
 
 from __future__ import annotations
 

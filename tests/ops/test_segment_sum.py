@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffvbd.ops import contact as ops_contact
+from diffvbd.ops import sums
 from diffvbd.testing import generator, tolerance
 
 
@@ -15,9 +15,9 @@ def test_segment_sum(device: str, sizes: list[int], dtype: torch.dtype) -> None:
     values = torch.as_tensor(rng.standard_normal((2, sum(sizes), 3)), dtype=dtype, device=device)
     order = torch.as_tensor(rng.permutation(sum(sizes)).astype(np.int32), device=device)
     ptr = torch.as_tensor(np.cumsum([0, *sizes]).astype(np.int32), device=device)
-    got = ops_contact.segment_sum(values, order, ptr)
+    got = sums.segment_sum(values, order, ptr)
     rows = values.double().cpu()[:, order.cpu().long()].split(sizes, 1)
     expected = torch.stack([r.sum(1) for r in rows], 1)
     atol = tolerance("long_sum" if dtype == torch.float64 else "long_sum_float32")
     torch.testing.assert_close(got.double().cpu(), expected, rtol=0, atol=atol)
-    assert torch.equal(got, ops_contact.segment_sum(values, order, ptr))
+    assert torch.equal(got, sums.segment_sum(values, order, ptr))
