@@ -93,7 +93,9 @@ def test_boxes_side_by_side_fall_freely(device: str, sweeps: int, detections: in
         status = dv.contact.status(model)
         assert status.truncated == [0] and status.smallest_gap[0] > 5e-4  # dhat; some parts do not look as far as 1 mm
     gravity = torch.tensor([0.0, -GRAVITY, 0.0], dtype=torch.float64, device=device)
-    assert relative_error(x, start + n * h * velocity + gravity * h**2 * n * (n + 1) / 2) <= tolerance("free_fall")
+    # without sweeps there is one correction, which adds the least inertia to each body's mass
+    allowed = tolerance("free_fall" if sweeps else "least_inertia")
+    assert relative_error(x, start + n * h * velocity + gravity * h**2 * n * (n + 1) / 2) <= allowed
 
 
 @pytest.mark.parametrize("detections", (1, 2, 4))
@@ -190,7 +192,7 @@ def test_prescribed_motion_above_a_bound(device: str, value_checks: None, detect
     up = torch.tensor([0.0, height, 0.0], dtype=torch.float64, device=device) * model.pinned[:, None]
     end, _ = dv.step(model, x, v, prescribed=x + up, **step)
     assert dv.contact.status(model).infeasible == 0 and apart(model, end)
-    with pytest.raises(ValueError, match=r"prescribed or colliders: expected motion that leaves .* got \d+ pairs .*"
+    with pytest.raises(ValueError, match=r"prescribed or colliders: expected feasible motion, got \d+ pairs .*"
                                          rf"in substep \d of {detections} .*detections"):  # fmt: skip
         dv.step(model, x, v, prescribed=x + 2 * up, **step)
     assert dv.contact.status(model).infeasible > 0
@@ -285,6 +287,6 @@ def test_a_plane_moved_through_a_body_raises() -> None:
     plane = colliders.Plane((0.0, -0.05, 0.0))
     model = dv.Model(box(2, 0.2), energies=(dv.StableNeoHookean(), barrier()), colliders=[plane])
     x, up = model.rest_points, torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64)
-    with pytest.raises(ValueError, match="colliders: expected motion that leaves bodies a way, .* a larger number of"):
+    with pytest.raises(ValueError, match="colliders: expected feasible motion, got .* a larger number of"):
         dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 1), colliders=model.collider_points + up,
                 colliders_before=model.collider_points, **MATERIAL)  # fmt: skip

@@ -1,8 +1,9 @@
-"""Claim: the rooms of bodies, compiled, are those that follow when every pass is written down in torch."""
+"""Claim: islands, their translations and the trust-region radii of bodies, compiled, are those that follow when every
+pass is written down in torch."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -10,14 +11,13 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd._contact.surface import ContactSurface
-from diffvbd.ops import contact as ops_detect
 from diffvbd.ops.contact import TrustRadii
 from diffvbd.ops.fields import DISPLACEMENTS
 from diffvbd.step.contact import LEAST_RADIUS, RADIUS_FACTOR, Motion, motion_of, trust_radii
 from diffvbd.testing import generator, tolerance
 
 DHAT = 0.02
-KEPT, KEPT_DEEP, DEEP = 0.9, 0.1, 0.1  # of a gap above a plane, see csrc/contact/above_floor.h
+GRID, SPARE = 0.125, 2.0  # of dhat, see csrc/contact/trust_region.h
 
 
 class Given(NamedTuple):
@@ -38,7 +38,7 @@ class Given(NamedTuple):
     def found(self) -> TrustRadii:
         s, barrier, *rest, floor = self
         x, origin, mass, _, _, was, now = rest
-        return trust_radii(self.motion(), s, barrier, x, origin, mass, was, now, floor, False)
+        return trust_radii(self.motion(), s, barrier, x, origin, mass, was, now, floor)
 
 
 def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact: bool, floor: bool = True,
@@ -78,31 +78,97 @@ def longest(g: Given, displacement: Tensor) -> Tensor:
     return of_bodies(g, torch.where(free, displacement.norm(dim=-1), 0.0), 0.0, "amax")
 
 
-def left_by(g: Given, planes: Tensor, displacement: Tensor) -> Tensor:
-    """What planes [B, P, 7] leave of the ways of bodies that go as wholes."""
-    body, pinned = g.surface.body[: g.x.shape[1]].long(), g.surface.pinned[: g.x.shape[1]]
-    shift, least = (
-        torch.zeros((2, g.surface.bodies, 3)).to(displacement),
-        torch.ones((2, g.surface.bodies)).to(displacement),
-    )
-    for normal, height, dhat in zip(planes[..., :3].unbind(1), planes[..., 3].T, planes[..., 5].T, strict=True):
-        gap = ((g.x * normal[:, None]).sum(-1) - height[:, None]).clamp(min=0)
-        deep, toward = DEEP * dhat[:, None], -(displacement * normal[:, None]).sum(-1)
-        trust_radius = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-        closes = (toward > trust_radius) & ~pinned
-        excess = of_bodies(g, torch.where(closes, toward - trust_radius, 0.0), 0.0, "amax")
-        shift = shift + excess[..., None] * normal[:, None]
-        fraction = torch.where(closes, trust_radius / torch.where(closes, toward, 1.0), 1.0)
-        least = torch.minimum(least, of_bodies(g, fraction, 1.0, "amin"))
-    good = torch.ones_like(least, dtype=torch.bool)
-    for normal, height, dhat in zip(planes[..., :3].unbind(1), planes[..., 3].T, planes[..., 5].T, strict=True):
-        gap = ((g.x * normal[:, None]).sum(-1) - height[:, None]).clamp(min=0)
-        deep, toward = DEEP * dhat[:, None], -(displacement * normal[:, None]).sum(-1)
-        trust_radius = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-        over = toward - (shift[:, body] * normal[:, None]).sum(-1) - trust_radius
-        good &= of_bodies(g, torch.where(pinned, -1.0, over), -1.0, "amax") <= tolerance("sums_of_bodies")
-    good = good[:, body, None]
-    return torch.where(good, 1.0, least[:, body, None]) * displacement + torch.where(good, shift[:, body], 0.0)
+def planes_of(g: Given) -> Tensor:
+    """Planes of the colliders, as they are during the sweeps, and of the floor [B, P, 4]: normal, height that a body's
+    box reaches."""
+    scenes, first = len(g.x), g.surface.planes.long() - g.x.shape[1]
+    out = [g.x.new_zeros((scenes, 0, 4))]
+    for corners in first:
+        a, b, c = g.now[:, corners].unbind(1)
+        n = torch.linalg.cross(b - a, c - a)
+        n = n / n.norm(dim=-1, keepdim=True)
+        out.append(torch.cat([n, (n * a).sum(-1, keepdim=True) + DHAT / 2], -1)[:, None])
+    if g.floor is not None:
+        rows = g.floor.reshape(len(g.floor), -1, 7)
+        height = rows[..., 3] + rows[..., 5] / 2
+        out.append(torch.cat([rows[..., :3], height[..., None]], -1).expand(scenes, -1, -1))
+    return torch.cat(out, 1)
+
+
+def boxes(at: Tensor, groups: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Corners [count, 3] of the boxes around the points [n, 3] of each group."""
+    index, far = groups[:, None].expand_as(at), at.new_full((count, 3), torch.inf)
+    return (far.scatter_reduce(0, index, at, "amin"), (-far).scatter_reduce(0, index, at, "amax"))
+
+
+def overlap(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
+    """Which boxes overlap which others, bool [n, m]."""
+    return (a[0][:, None] <= b[1]).all(-1) & (b[0] <= a[1][:, None]).all(-1)
+
+
+class Swept(NamedTuple):
+    """One scene, and the mass and momentum of its bodies."""
+
+    bodies: int
+    mass: Tensor  # [bodies, 1]
+    momentum: Tensor  # [bodies, 3]
+    rest: tuple[Tensor, Tensor]  # boxes of bodies
+    margin: Tensor  # [bodies, 1]
+    things: tuple[Tensor, Tensor]  # boxes of colliders
+    planes: Tensor  # [P, 4]
+
+    def sweep(self, label: Tensor, stays: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Box of each body while its island translates, and the bodies that must stay."""
+        same = label[:, None] == label
+        blocked = (same & stays).any(1)
+        u = (same.to(self.mass) @ self.momentum) / (same.to(self.mass) @ self.mass).clamp(min=1e-300)
+        u = torch.where(blocked[:, None], 0.0, u)
+        lo, hi = self.rest
+        box = (torch.minimum(lo, lo + u) - self.margin, torch.maximum(hi, hi + u) + self.margin)
+        reached = overlap(box, self.things).any(1)
+        for n, height in zip(self.planes[:, :3], self.planes[:, 3], strict=True):
+            reached = reached | ((torch.where(n < 0, box[1], box[0]) * n).sum(-1) < height)
+        return box, stays | reached
+
+    def join(self, label: Tensor, box: tuple[Tensor, Tensor]) -> Tensor:
+        near = overlap(box, box) | (label[:, None] == label)
+        for _ in range(self.bodies):
+            label = torch.where(near, label, self.bodies).amin(1)
+        return label
+
+    def islands(self, stays: Tensor) -> Tensor:
+        label = torch.arange(self.bodies, device=stays.device)
+        for _ in range(4):
+            box, stays = self.sweep(label, stays)
+            label = self.join(label, box)
+        box, stays = self.sweep(label, stays)
+        if not torch.equal(self.join(label, box), label):
+            label = torch.zeros_like(label)
+            _, stays = self.sweep(label, stays)
+        return torch.where(((label[:, None] == label) & stays).any(1), -1, label)
+
+
+def islands_of(g: Given, trust_radius: Tensor) -> Tensor:
+    """Islands of bodies [B, bodies], by their definition: the smallest body of each; -1: it must stay."""
+    s, bodies, vertices = g.surface, g.surface.bodies, g.x.shape[1]
+    body, pinned, planes = s.body[:vertices].long(), s.pinned[:vertices], planes_of(g)
+    flat = s.body[s.planes.long()].flatten().long() - bodies  # points of a plane span it and bound nothing
+    of, reach = s.body[vertices:].long() - bodies, s.radius[vertices:, None] + DHAT / 2
+    out = []
+    for b in range(len(g.x)):
+        at = g.x[b] if g.origin.numel() == 0 else g.x[b] + g.origin[b]
+        weight = torch.where(pinned, 0.0, g.mass[b % len(g.mass)])[:, None]
+        mass, momentum = (
+            at.new_zeros((bodies, m.shape[1])).index_add(0, body, m) for m in (weight, weight * g.move[b])
+        )
+        stays = at.new_zeros(bodies).index_add(0, body, (pinned | ~(at + g.move[b]).isfinite().all(-1)).to(at)) > 0
+        path = torch.cat([g.was[b] - reach, g.was[b] + reach, g.now[b] - reach, g.now[b] + reach])
+        lo, hi = boxes(path, of.repeat(4), int(of.max()) + 1)
+        things = (lo.index_fill(0, flat, torch.inf), hi.index_fill(0, flat, -torch.inf))
+        margin = (trust_radius[b] + DHAT / 2)[:, None]
+        scene = Swept(bodies, mass, momentum, boxes(at, body, bodies), margin, things, planes[b])
+        out.append(scene.islands(stays))
+    return torch.stack(out)
 
 
 def by_torch(g: Given) -> TrustRadii:
@@ -112,60 +178,47 @@ def by_torch(g: Given) -> TrustRadii:
     displacement = dict(zip(DISPLACEMENTS, motion.displacements.longest, strict=True))
     gravity_moves = 2 * displacement["gravity"] + LEAST_RADIUS * DHAT
     pushed = (g.now - g.was).norm(dim=-1).amax(1, keepdim=True)
-    first = s.planes.long() - g.x.shape[1]
-    planes = []
-    for a, b, c in (g.now[:, corners].unbind(1) for corners in first):
-        n = torch.linalg.cross(b - a, c - a)
-        n = n / n.norm(dim=-1, keepdim=True)
-        height, rest = (n * a).sum(-1, keepdim=True), torch.zeros_like(n[:, :1])
-        planes.append(torch.cat([n, height, rest, rest + DHAT, rest], -1))
-    floors = [] if g.floor is None else [g.floor.reshape(1, -1, 7).expand(2, -1, -1)]
-    every = torch.cat([*(p[:, None] for p in planes), *floors], 1) if planes or floors else g.x.new_zeros((2, 0, 7))
-    stopped = torch.minimum(longest(g, g.move - left_by(g, every, g.move)), s.max_deformation_radius)
-    bent = longest(g, g.move - left_by(g, every, motion.rigid))
 
-    def radius_of(beside: Tensor, most: Tensor) -> Tensor:
-        asked = RADIUS_FACTOR * beside + displacement["bends"] + gravity_moves + stopped + 2 * DHAT
-        return torch.maximum(torch.minimum(asked, most), displacement["driven"]) + pushed
+    def asked(relative: Tensor) -> Tensor:
+        return RADIUS_FACTOR * relative + displacement["bends"] + gravity_moves
+
+    def radius_of(relative: Tensor, most: Tensor) -> Tensor:
+        return torch.maximum(torch.minimum(asked(relative) + SPARE * DHAT, most), displacement["driven"]) + pushed
 
     def last(trust_radius: Tensor) -> Tensor:
         return torch.cat([trust_radius, trust_radius.amax(1, keepdim=True)], 1)
 
-    def islands(trust_radius: Tensor) -> Tensor:
-        return ops_detect.contact_islands(g.x, g.origin, g.move, g.mass, g.was, g.now, s.planes, s.body, s.body_order,
-                                          s.body_ptr, s.pinned, s.radius, last(trust_radius), s.bodies,
-                                          DHAT)  # fmt: skip
-
-    island = islands(radius_of(displacement["bends"], s.max_trust_radius_alone)).long()
-    alone = (island >= 0) & ((island[:, :, None] == island[:, None]).sum(-1) == 1)
-    most = torch.where(alone, s.max_trust_radius_alone, s.max_trust_radius.expand(2, -1))
-    trust_radius = radius_of(displacement["bends"], most)
-    for _ in range(3):  # whom a body meets gets room as well
-        island = islands(trust_radius).long()
+    def translations(island: Tensor) -> Tensor:
         same = ((island[:, :, None] == island[:, None]) & (island >= 0)[:, None]).to(g.x)
         joined = same @ motion.displacements.sums
-        u = torch.where((island >= 0)[..., None], joined[..., :3] / joined[..., 3:].clamp(min=1e-300), 0.0)
-        beside = longest(g, g.move - u[:, body])
-        trust_radius = torch.maximum(trust_radius, radius_of(beside, most))
-    wanted = beside + RADIUS_FACTOR * displacement["stretched"]
-    pending = wanted + (RADIUS_FACTOR - 1) * beside + displacement["bends"] + gravity_moves + stopped
-    over = torch.maximum(wanted / most, (pending / most).clamp(max=2))
+        cells = joined[..., :3] / joined[..., 3:].clamp(min=1e-300) / (GRID * DHAT)
+        return torch.where((island >= 0)[..., None], GRID * DHAT * cells.trunc(), 0.0)
+
+    stretched = RADIUS_FACTOR * displacement["stretched"]
+    island = islands_of(g, radius_of(displacement["bends"], s.max_trust_radius_alone))
+    looked = ~(asked(displacement["bends"]) + stretched <= s.max_trust_radius).all()
+    alone = looked & (island >= 0) & ((island[:, :, None] == island[:, None]).sum(-1) == 1)
+    most = torch.where(alone, s.max_trust_radius_alone, s.max_trust_radius.expand(2, -1))
+    trust_radius = radius_of(displacement["bends"], most)
+    island = islands_of(g, trust_radius)
+    for _ in range(3):  # bodies that an island reaches get a radius relative to it as well
+        relative = longest(g, g.move - translations(island)[:, body])
+        trust_radius = torch.maximum(trust_radius, radius_of(relative, most))
+        island = islands_of(g, trust_radius)
+    over = torch.maximum((relative + stretched) / most, ((asked(relative) + stretched) / most).clamp(max=2))
     own = torch.zeros_like(trust_radius)
     if g.barrier.self_contact:
-        own = torch.minimum((RADIUS_FACTOR + 1) * (bent + displacement["stretched"]) + gravity_moves,
-                            s.max_deformation_radius)  # fmt: skip
-        own = torch.maximum(torch.maximum(own, torch.minimum(trust_radius, s.min_deformation_radius)),
-                            displacement["driven"])  # fmt: skip
-    island = islands(trust_radius)
-    trust_radius = torch.where(island >= 0, trust_radius - pushed, trust_radius)  # which no collider comes near
-    return TrustRadii(island, last(trust_radius), last(own), over)
+        own = (RADIUS_FACTOR + 1) * (displacement["apart"] + displacement["stretched"]) + gravity_moves
+        own = torch.maximum(torch.minimum(own, s.max_deformation_radius),
+                            torch.minimum(trust_radius, s.min_deformation_radius))  # fmt: skip
+        own = torch.maximum(own, displacement["driven"])
+    trust_radius = torch.where(island >= 0, trust_radius - pushed, trust_radius)  # no collider reaches these
+    return TrustRadii(island.to(torch.int32), translations(island), last(trust_radius), last(own), over)
 
 
 def check(g: Given) -> None:
     got, again = g.found(), g.found()
     for name, one, expected, same in zip(got._fields, got, by_torch(g), again, strict=True):
-        if name == "over":  # up to 1 it makes no difference, and the CPU does not look whether a body is alone
-            one, expected, same = (value.clamp(min=1) for value in (one, expected, same))
         torch.testing.assert_close(one, expected, rtol=tolerance("sums_of_bodies"), atol=0.0,
                                    msg=lambda text, name=name: f"{name}: {text}")  # fmt: skip
         assert torch.equal(one, same)
@@ -187,10 +240,49 @@ def test_in_scenes_of_other_sizes(device: str, bodies: int, points: int) -> None
     check(given(device, speed=0.5, pinned=True, plane=True, self_contact=True, bodies=bodies, points=points))
 
 
-def test_what_is_not_finite_does_not_pass_for_a_room(device: str) -> None:
+def test_a_body_that_is_not_finite_has_no_radius(device: str) -> None:
     g = given(device, speed=0.03, pinned=False, plane=True, self_contact=True)
     move = g.move.clone()
     move[1, -1, 0] = torch.nan
     found = g._replace(move=move).found()
     assert found.trust_radius[0].isfinite().all() and found.island[1, 3] == -1
     assert found.trust_radius[1, 3:].isnan().all() and found.over[1, 3].isnan()
+
+
+def placed(places: list[tuple[float, float, float]], colliders: Any = (), fall: float = 1.0) -> Given:
+    """Unit cubes with these lower corners that fall together."""
+    mesh = dv.mesh.join([dv.mesh.cube(2, 1.0).translate(place) for place in places])
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, DHAT, self_contact=False))
+    model = dv.Model(mesh, energies=energies, colliders=colliders)
+    surface, barrier = model.surface_of_contact, model.contact
+    assert surface is not None and barrier is not None
+    x, points = model.rest_points[None], surface.collider_points[None]
+    move = x.new_tensor([0.0, -fall, 0.0]).expand_as(x).contiguous()
+    return Given(surface, barrier, x, x.new_empty((0,)), model.mass[None], move, 0 * x, points, points, None)
+
+
+def test_bodies_that_fall_side_by_side_are_one_island() -> None:
+    found = placed([(0, 0, 0), (1.001, 0, 0), (5, 0, 0), (6.001, 0.5, 0), (0, 3, 0)]).found()
+    assert found.island.tolist() == [[0, 0, 2, 2, 4]]
+    down = found.u.new_tensor([0.0, -1.0, 0.0])
+    assert (found.u - down).abs().max() < GRID * DHAT and (found.u[..., 1] >= -1.0).all()  # toward zero
+
+
+@pytest.mark.parametrize("collider", ["plane", "sphere", "capsule", "obstacle"])
+@pytest.mark.parametrize(("gap", "expected"), [(0.05, -1), (0.2, 0)])
+def test_what_reaches_a_collider_stays(collider: str, gap: float, expected: int) -> None:
+    """A body that falls by 1 m toward one that is 1 m and a gap below it, with a radius of about 3 dhat."""
+    top = -1.0 - gap
+    slab = dv.mesh.box(2, (1.0, 1.0, 1.0)).translate((0.0, top - 1.0, 0.0))
+    things = {
+        "plane": dv.colliders.Plane((0.0, top, 0.0)),
+        "sphere": dv.colliders.Sphere((0.5, top - 0.3, 0.5), 0.3),
+        "capsule": dv.colliders.Capsule((-2.0, top - 0.1, 0.3), (2.0, top - 0.1, 0.4), 0.1),
+        "obstacle": dv.colliders.Obstacle(slab.points, slab.surface),
+    }
+    g = placed([(0, 0, 0)], [things[collider]])
+    found = g.found()
+    assert found.island.tolist() == [[expected]] and bool((found.u == 0).all()) == (expected < 0)
+    above = g.was + g.was.new_tensor([0.0, 7.0, 0.0])
+    passing = g._replace(was=g.was - above.new_tensor([0.0, 7.0, 0.0]))  # a collider on its way up
+    assert passing.found().island.tolist() == [[-1]] or collider == "plane"

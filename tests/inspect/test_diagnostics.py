@@ -180,7 +180,7 @@ def grip() -> dv.Model:
 
 
 def test_friction_that_has_not_converged_is_named() -> None:
-    model, solver = grip(), dv.VBD(1 / 240, 1)
+    model, solver = grip(), dv.VBD(1 / 240, 8)
     x = model.rest_points
     v = torch.zeros_like(x)
     few, _ = dv.step(model, x, v, solver, **SOFT)

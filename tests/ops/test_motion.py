@@ -1,5 +1,5 @@
-"""How bodies want to move: the rigid motion with their momentum, its derivative and the longest ways, against plain
-torch."""
+"""Claim: the rigid motion with the momentum of the wanted displacements, and the longest displacements of each body,
+are those of plain torch."""
 
 from __future__ import annotations
 
@@ -40,11 +40,6 @@ class Case(NamedTuple):
         of = torch.repeat_interleave(torch.arange(len(self.ptr) - 1, device=self.ptr.device), self.ptr.diff())
         body[self.order.long()] = of
         return body
-
-    def backward(self, bar: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of x, mass and move."""
-        given = (self.x, self.origin, self.mass, self.move, self.pinned, self.pinned_bodies, self.order, self.ptr)
-        return ops_motion.contact_motion_backward(bar, *given)
 
 
 def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, pinned: float = 0.0,
@@ -118,16 +113,3 @@ def test_as_plain_torch_says(device: str, sizes: list[int], dtype: torch.dtype) 
         sizes = [n if n > 3 else 4 * n for n in sizes]  # of a point the inertia is rounding
     for scenes, pinned, origin in ((0, 0.0, True), (1, 0.3, False), (3, 0.0, True)):
         check(case(sizes, device, dtype, scenes, pinned, origin))
-
-
-@pytest.mark.parametrize("pinned", [0.0, 0.02])
-def test_adjoint_is_that_of_autograd(device: str, pinned: float) -> None:
-    c = case([5, 40, 12, 1, 0], device, scenes=3, pinned=pinned)
-    bar = torch.randn(c.x.shape, dtype=c.x.dtype, generator=torch.Generator().manual_seed(0)).to(device)
-    x, mass, move = (t.clone().requires_grad_() for t in (c.x, c.mass.expand(3, -1).contiguous(), c.move))
-    given = c.changed(x=x, mass=mass, move=move)
-    expected = torch.autograd.grad((by_torch(given).rigid * bar).sum(), (x, mass, move))
-    detached = c.changed(mass=mass.detach())
-    for got, want, again in zip(detached.backward(bar), expected, detached.backward(bar), strict=True):
-        torch.testing.assert_close(got, want, rtol=tolerance("sums_of_bodies"), atol=tolerance("sums_of_bodies"))
-        assert torch.equal(got, again) and float(want.abs().max()) > 0

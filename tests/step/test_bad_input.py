@@ -5,6 +5,7 @@ waits for the device: `value_checks` opens it there.
 """
 
 import re
+import warnings
 from typing import Any
 
 import numpy as np
@@ -340,10 +341,21 @@ def test_a_start_on_the_wrong_side_of_a_floor(more: tuple, sweeps: int) -> None:
         dv.step(model, x, x * 0, dv.VBD(0.01, sweeps), mu=1e4, lam=1e4)
 
 
-def test_a_step_on_a_floor_with_friction_that_leaves_all_bounds_raises() -> None:
+@pytest.mark.parametrize("speed", (1e10, 1e100, 1e300))
+@pytest.mark.parametrize("sweeps", (0, 1, 8))
+def test_a_step_on_a_floor_with_friction_that_leaves_all_bounds_raises_or_is_finite(speed: float, sweeps: int) -> None:
+    """Positions that are spread over kilometers are warned of."""
     floor = dv.FloorBarrier(normal=[0.6, 0.8, 0], height=-1e-9, kappa=1e3, dhat=0.01)
     model = dv.Model(CUBE, energies=(dv.StableNeoHookean(), floor, dv.Friction(0.3)))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    v[:, 1], v[0, 0] = -1e10, -1e10 / 3
-    with pytest.raises(RuntimeError, match="positions became non-finite in the step"):
-        dv.step(model, x, v, dv.VBD(0.01, 1), mu=1e4, lam=1e4)
+    v[:, 1], v[0, 0] = -speed, -speed / 3
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            end, after = dv.step(model, x, v, dv.VBD(0.01, sweeps), mu=1e4, lam=1e4)
+        except RuntimeError as error:
+            assert "positions became non-finite in the step" in str(error)
+            return
+    assert torch.isfinite(end).all() and torch.isfinite(after).all()
+    spread = bool((end - x).abs().max() > 1e3)
+    assert spread == any("positions that are spread over" in str(w.message) for w in told)

