@@ -14,7 +14,7 @@ from diffvbd.testing.tolerances import tolerance
 STEP, SPIN = 0.01, 19.0  # 0.19 rad a step
 EULER = dv.ImplicitEuler()
 # beside the kinetic energy at the start: the centrifugal forces' own, and what few sweeps leave
-CHANGED = 0.05  # where a scheme has just given way to another, whose velocities are others; 0.4 with their chord
+CHANGED = 5e-3  # where a scheme has just given way to another, whose velocities are others
 ELASTIC = {(1e5, 1): 2e-3, (1e5, 2): 2e-3, (4.4e6, 1): 1e-3, (4.4e6, 2): 2e-4}
 IN_CONTACT = 8  # sweeps with contact, where a start goes straight on and sweeps take the stretch back
 ELASTIC_IN_CONTACT = {1e5: 2e-3, 4.4e6: 4e-4}
@@ -70,7 +70,7 @@ def test_implicit_euler(device: str, contact: bool, young: float) -> None:
 
 
 def test_implicit_euler_within_a_step_of_bdf2(device: str) -> None:
-    """A body that contact has just made take implicit Euler moves by chords, whatever the scheme of the step."""
+    """A body that contact has just made take implicit Euler is not stretched, whatever the scheme of the step."""
     one, _, _ = scene(device, True)
     both = dv.mesh.replicate(one.mesh, np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]))
     model = dv.Model(both, energies=one.energies, colliders=one.colliders, density=1000.0, device=device)
