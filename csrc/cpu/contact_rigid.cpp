@@ -237,7 +237,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
     std::copy_n(g6, kUnknowns, gradient + kUnknowns * k);
     for (int i = 0; i < kUnknowns; ++i) {
       for (int j = 0; j < kUnknowns; ++j) own(i, j) = block[rigid::at6(std::max(i, j), std::min(i, j))];
-      own(i, i) += free ? kLeastInertia * (i < 3 ? spread : mass) : 1;
+      own(i, i) += !free ? 1 : i < 3 ? kLeastInertia * spread : 0;
     }
   }
   for (const PairForce& term : terms) {

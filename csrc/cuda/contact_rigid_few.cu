@@ -137,7 +137,7 @@ struct System {
     });
 #pragma unroll
     for (int i = 0; i < kUnknowns; ++i) {
-      total[kUnknowns + rigid::at6(i, i)] += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
+      total[kUnknowns + rigid::at6(i, i)] += !free ? 1 : i < 3 ? kLeastInertia * total[kOwn] : 0;
     }
     put_own(total, b, base, gradient, by.number());
   }

@@ -111,8 +111,8 @@ struct GroupSystem {
     put_own(mine, b, base, gradient);
     __syncwarp();
     if (warp.lane < kUnknowns) {
-      const double inertia = warp.lane < 3 ? turning : whole.mass;
-      at(base, b, warp.lane, b, warp.lane) += free ? kLeastInertia * inertia : 1;
+      const double inertia = warp.lane < 3 ? kLeastInertia * turning : 0;
+      at(base, b, warp.lane, b, warp.lane) += free ? inertia : 1;
     }
     int32_t found = 0;
     const int32_t places = in.free[own.body] ? own.size() * in.planes : 0;

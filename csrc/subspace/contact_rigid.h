@@ -52,7 +52,7 @@ struct Groups {
 
 using rigid::Vector;
 
-constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2: keeps its system definite
+constexpr double kLeastInertia = 1e-11;  // of a body's sum of m r^2, added to its turn: a rod has none about itself
 
 template <class T>
 struct RigidInputs {
@@ -579,7 +579,7 @@ DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, do
 constexpr int kTrials = 6;          // of motions, each reduced for some bodies
 constexpr int kShorter = 3;         // of these: reductions of a blocked body before it stays
 constexpr int kSpreads = 4;         // how often a reduction spreads to touching bodies
-constexpr double kIncrease = 1e-12; // of the potential: counts as no increase
+constexpr double kIncrease = 1e-12;  // of the potential: counts as no increase
 constexpr double kRounded = 1e-6;   // of a length, that rounding cannot reach
 
 // The body that a pair counts for: the first of those that it moves with, or -1.

@@ -371,9 +371,9 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
     for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
   }
   const Vector turn_p = {p[0], p[1], p[2]}, turn_q = {q[0], q[1], q[2]};
-  const double turns = dot(turn_p, turn_q), shifts = p[3] * q[3] + p[4] * q[4] + p[5] * q[5];
+  const double turns = dot(turn_p, turn_q);
   out.arm = -cross(g + H * Q + by_p, turn_p) - cross(H * P + by_q, turn_q) - (2 * kLeastInertia * turns * mass) * r;
-  out.mass -= kLeastInertia * (turns * dot(r, r) + shifts);
+  out.mass -= kLeastInertia * turns * dot(r, r);
   return out;
 }
 

@@ -10,7 +10,7 @@ from .distance import EDGE_EDGE
 from .energies import FloorFriction, StableNeoHookean
 from .scene import Scene
 
-LEAST_INERTIA = 1e-11  # of its mass and sum of m r^2, that keeps the system of a body definite
+LEAST_INERTIA = 1e-11  # of its sum of m r^2, that keeps the turn of a body definite
 ITERATIONS, HALVINGS = 200, 40  # at most, of Newton's method, and of its steps
 SETTLED = 1e-9  # a step over the whole motion, which the next one squares
 
@@ -56,7 +56,7 @@ class Correction:
             force, stiffness = term.damping_on_corners(x) if lagged else term.on_corners(x)
             g, matrix = self._add(term.pairs, lagged, force, stiffness, jacobian, g, matrix)
         spread = torch.zeros_like(total).index_add(1, self.body, mass * arm.square().sum(-1))
-        least = torch.stack([spread] * 3 + [total] * 3, -1)  # turn, shift
+        least = torch.stack([spread] * 3 + [torch.zeros_like(total)] * 3, -1)  # turn, shift
 
         def system(motion: Tensor) -> tuple[Tensor, Tensor]:
             """Gradient and matrix [B, bodies 6, bodies 6] after a motion [B, bodies, 6]."""

@@ -25,7 +25,6 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "property_factor": (100.0, "two samples of rounding in a scene of a few tets: ten times what spread_factor allows"),
     "property_subset": (1e-12, "the same sweeps in a leaner variant; a given rest shape rounds its metric anew"),
     "invariance": (1e-12, "rotation and translation change every rounding in the sweep"),
-    "least_inertia": (2e-11, "a fall by one rigid correction, which adds 1e-11 of its mass to each body"),
     "momentum": (1e-12, "converged step, relative to sum m |v|; sweeps stop at rounding level"),
     "rigid_momentum": (1e-14, "60 steps of one body, relative: each rounds its positions once, 1e-16"),
     "rigid_momentum_float32": (1e-5, "the same in float32"),

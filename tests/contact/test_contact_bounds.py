@@ -93,9 +93,7 @@ def test_boxes_side_by_side_fall_freely(device: str, sweeps: int, detections: in
         status = dv.contact.status(model)
         assert status.truncated == [0] and status.smallest_gap[0] > 5e-4  # dhat; some parts do not look as far as 1 mm
     gravity = torch.tensor([0.0, -GRAVITY, 0.0], dtype=torch.float64, device=device)
-    # without sweeps there is one correction, which adds the least inertia to each body's mass
-    allowed = tolerance("free_fall" if sweeps else "least_inertia")
-    assert relative_error(x, start + n * h * velocity + gravity * h**2 * n * (n + 1) / 2) <= allowed
+    assert relative_error(x, start + n * h * velocity + gravity * h**2 * n * (n + 1) / 2) <= tolerance("free_fall")
 
 
 @pytest.mark.parametrize("detections", (1, 2, 4))

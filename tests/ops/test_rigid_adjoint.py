@@ -143,7 +143,7 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     if blocks is not None:
         own = own + (blocks * at_q[..., None, :]).sum(-1)
     spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)
-    least = (p * q * torch.cat([spread.expand(*whole.shape, 3), whole[..., None].expand(*whole.shape, 3)], -1)).sum()
+    least = (p * q)[..., :3].mul(spread).sum()
     work = (at_p * own).sum() + LEAST_INERTIA * least
     return work + _work_of_pairs(s, at_p, at_q, groups)
 
