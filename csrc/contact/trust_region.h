@@ -54,9 +54,7 @@ DIFFVBD_FN void prepare_scene(const RadiusInputs<T>& in, int64_t scene, const Te
 // The radius that a body asks for which moves so far relative to its island.
 template <class T>
 DIFFVBD_FN T asked(const RadiusInputs<T>& in, int64_t place, T relative) {
-  // the sweeps may take back all of the gravity move and of the bending
-  const T gravity = T(2) * in.displacement(kGravity, place) + in.least;
-  return in.fraction * relative + in.displacement(kBends, place) + gravity;
+  return in.fraction * relative + T(2) * in.displacement(kGravity, place) + in.least;  // sweeps may take back gravity
 }
 // The radius that it gets. Prescribed vertices are not limited: their pairs are listed however far they go.
 template <class T>
