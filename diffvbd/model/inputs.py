@@ -65,7 +65,9 @@ def inputs_of(model: Any) -> Inputs:
 
 def parameters_of(model: Any) -> dict[str, tuple[Any, str, int]]:
     """Inputs that are parameters of energies: the energy, its key and its own dimensions."""
-    return {input_name(e, key): (e, key, own) for e in model.parametric_energies for key, own in e.parameters.items()}
+    return model.derived("parameters", lambda: {
+        input_name(e, key): (e, key, own) for e in model.parametric_energies for key, own in e.parameters.items()
+    })  # fmt: skip
 
 
 def parameter_of(model: Any, given: dict[str, Tensor], name: str) -> Tensor | None:

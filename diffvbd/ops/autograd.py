@@ -243,10 +243,14 @@ class Linear:
                     no_transforms()
                 return vmap(info, values.movedim(in_dims[0], 0), *constants), 0
 
-        self.function = _Function
+        self.function, self.run = _Function, run
 
     def __call__(self, *args: Any) -> Tensor:
-        return self.function.apply(*args)
+        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
+            return self.function.apply(*args)
+        if torch.is_grad_enabled() and args[0].requires_grad:
+            return self.function.apply(*args)
+        return self.run(*args)
 
 
 def _rows_of_batch(info: Any, values: Tensor) -> Tensor:

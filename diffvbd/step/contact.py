@@ -697,7 +697,7 @@ def radii_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrie
     """
     s, none = surface, x.new_empty((0,))
     deformation_center, deformation_radius = start.own or (none, none)
-    x, led, begin = (t.detach().contiguous() for t in (x, start.x, begin))
+    x, led, begin = [t.detach().contiguous() for t in (x, start.x, begin)]
     return sweep_radii(
         x, led, begin, motion.move, motion.gravity_move, motion.apart, motion.stretched, start.center,
         start.trust_radius, deformation_center, deformation_radius, s.pinned, s.body_order, s.body_ptr, RADIUS_FACTOR,
@@ -734,6 +734,6 @@ def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, 
     Args:
         x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].  move, gravity_move: [B, V, 3] [m].
     """
-    x, mass, move, gravity_move = (t.detach().contiguous() for t in (x, mass, move, gravity_move))
+    x, mass, move, gravity_move = [t.detach().contiguous() for t in (x, mass, move, gravity_move)]
     index = (surface.pinned, surface.pinned_bodies, surface.body_order, surface.body_ptr)
     return Motion(move, gravity_move, ops_contact.contact_motion(x, origin, mass, move, gravity_move, *index))

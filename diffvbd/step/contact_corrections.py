@@ -445,8 +445,8 @@ def correct(model: System, fields: ops.TouchingFields, time_step: float, frictio
             more: More = once) -> Corrected:  # fmt: skip
     """State after the rigid correction of every free body, by an admissible step fraction, and after those that
     ``more`` adds. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
-    fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    kept = torch.is_grad_enabled() and any(t.requires_grad for t in fields)
+    fields = ops.TouchingFields(*[t.contiguous() for t in fields])
+    kept = torch.is_grad_enabled() and any([t.requires_grad for t in fields])
     x, back, *rest = _correct(*fields, model, time_step, friction_eps, more, kept)
     fractions = _made(fields.x, rest).fraction if kept else rest
     return Corrected(x, [fraction.to(x.dtype) for fraction in fractions], back)
