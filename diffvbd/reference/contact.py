@@ -69,11 +69,11 @@ class Pairs:
         """A parameter, one number or one for each scene, as one for each pair."""
         return value.expand(self.lead).reshape(-1)[self.batch]
 
-    def of_two(self, value: Tensor, body: Tensor) -> Tensor:
-        """A parameter of each two bodies [..., n, n], or as of per_pair(), for each pair; body: [N]."""
-        if value.dim() < 2 or value.shape[-1] != value.shape[-2]:
+    def of_two(self, value: Tensor, model: Any) -> Tensor:
+        """Friction of each two bodies [..., n, n], or as of per_pair(), for each pair."""
+        if not isinstance(model.friction.coefficient, Tensor):
             return self.per_pair(value)
-        a, b = (body.long()[self.corners[:, k]] for k in (0, 3))
+        a, b = (model.surface_of_contact.body.long()[self.corners[:, k]] for k in (0, 3))
         table = value.expand(*self.lead, *value.shape[-2:]).reshape(-1, *value.shape[-2:])
         return (table[self.batch, a, b] + table[self.batch, b, a]) / 2
 
@@ -161,8 +161,7 @@ class LaggedPairForces:
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
-            body = model.surface_of_contact.body
-            self.largest = -pairs.of_two(scene.parameter(friction, "coefficient"), body) * e * first
+            self.largest = -pairs.of_two(scene.parameter(friction, "coefficient"), model) * e * first
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -180,7 +180,7 @@ def by_torch(g: Given) -> TrustRadii:
     pushed = (g.now - g.was).norm(dim=-1).amax(1, keepdim=True)
 
     def asked(relative: Tensor) -> Tensor:
-        return RADIUS_FACTOR * relative + displacement["bends"] + gravity_moves
+        return RADIUS_FACTOR * relative + gravity_moves
 
     def radius_of(relative: Tensor, most: Tensor) -> Tensor:
         return torch.maximum(torch.minimum(asked(relative) + SPARE * DHAT, most), displacement["driven"]) + pushed

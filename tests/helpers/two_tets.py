@@ -71,7 +71,7 @@ def considered() -> list[tuple[list[int], int]]:
     return pairs
 
 
-def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list[int]]) -> reference.Substep:
+def detect(model: Any, x: Tensor, before: Tensor, now: Tensor) -> reference.Substep:
     """Brute force over `considered`, x [B, V, 3], colliders [B, Vc, 3]; lists what may come closer than dhat, too."""
     pairs = considered()
     corners, kind = torch.tensor(np.array([c for c, _ in pairs])), torch.tensor([k for _, k in pairs])
@@ -89,8 +89,9 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list
         tail = torch.stack((kind, torch.full_like(kind, b)), 1)
         rows.append(torch.cat((corners, tail), 1)[listed])
         constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, threshold), 1)[listed])
-    shares, corrections = torch.ones((2, *x.shape[:2])), torch.ones((2, len(x), 2))
-    return reference.Substep(torch.cat(rows), torch.cat(constants), torch.tensor(island), shares, corrections)
+    fractions, corrections = torch.ones(x.shape[:2]), torch.ones((2, len(x), 2))
+    return reference.Substep(torch.cat(rows), torch.cat(constants), x.new_zeros((len(x), 2, 3)), fractions,
+                             fractions < 1, corrections)  # fmt: skip
 
 
 def scene_of(model: Any, x: Tensor, parameters: dict[str, Any] | None = None) -> Any:

@@ -36,7 +36,7 @@ def blocks(model: Any, energy: Any, x: Tensor, x_prev: Tensor) -> tuple[Tensor, 
 def setup(**changes: Any) -> tuple[Any, Tensor, Pairs]:
     model = stand_in(dv.Model(two_tets()), **changes)
     x = moved_state(model)
-    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
+    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None])
     assert len(part.pairs) > 20 and {0, 1, 2} == set(part.pairs[:, 4].tolist())
     return model, x, Pairs(scene_of(model, x), part, None)
 
@@ -60,7 +60,7 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
 def test_barrier_block_is_the_curvature_along_the_normals() -> None:
     """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d): N of its corners share the vertex's color."""
     model, x, _ = setup()
-    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
+    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None])
     vertex = 4
     color, counts = colors(model, len(x) + len(COLLIDERS)), []
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
