@@ -87,12 +87,10 @@ RULES: dict[str, Callable[[], Any]] = {
     "rigid correction before the sweeps": no_first_correction,
     "more rigid corrections after the sweeps": lambda: numbers(contact_corrections, BLOCKED_CORRECTIONS=1,
                                                                LEFT_CORRECTIONS=1),
-    "substeps planned by displacement": lambda: numbers(contact, MOST_PLANNED=1),
     "more substeps while vertices are truncated": lambda: numbers(contact, MOST_DETECTIONS=0),
     "substeps that invert a tet are taken back": lambda: numbers(contact.ContactStep, _inverted=lambda self, x: (
         torch.zeros(len(x), dtype=torch.bool, device=x.device))),
     "own radii of the sweeps": lambda: numbers(contact, radii_of_sweeps=lambda m, s, b, start, *_: start.trust_radius),
-    "no coarse corrections after two refusals": lambda: numbers(contact_corrections, REFUSALS=10**6),
 }  # fmt: skip
 
 

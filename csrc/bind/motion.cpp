@@ -38,11 +38,11 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In g
   });
 }
 // Islands of bodies [B, bodies] int32, their translations [B, bodies, 3], trust-region and deformation radii [B,
-// bodies + 1] and how far bodies want to move over the largest radius [B, bodies], see contact/trust_region.h. held
-// [N]; floor: planes in the data of FloorBarrier, or empty.
-DIFFVBD_OPERATOR(Out<5>, contact_trust_radii, In x, In origin, In mass, In move, In pinned, In order, In ptr, In displacements, In sums,
-                 In floor, In collider, In collider_next, In planes, In body, In radius, In most, In most_alone,
-                 In most_own, In least_own, double dhat, double fraction, double least, bool self_contact) {
+// bodies + 1], see contact/trust_region.h. pinned [N]; floor: planes in the data of FloorBarrier, or empty.
+DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move, In pinned, In order, In ptr,
+                 In displacements, In sums, In floor, In collider, In collider_next, In planes, In body, In radius,
+                 In most, In most_alone, In most_own, In least_own, double dhat, double fraction, double least,
+                 bool self_contact) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -53,7 +53,7 @@ DIFFVBD_OPERATOR(Out<5>, contact_trust_radii, In x, In origin, In mass, In move,
             "contact: expected body of shape [N], N >= vertices, and at most 2^31 corner points in all scenes");
     const Tensor island = device.empty({b, bodies}, ScalarType::Int), u = device.empty({b, bodies, 3}),
                  trust_radius = device.empty({b, bodies + 1}), deformation_radius = device.empty({b, bodies + 1}),
-                 over = device.empty({b, bodies}), memory = device.empty({b * (1 + bodies)});
+                 memory = device.empty({b * (1 + bodies)});
     contact::IslandInputs<T>& of = in.islands;
     of.x = in.motion.x, of.move = in.motion.move, of.origin = read.vectors_or_null("origin", origin);
     of.mass = in.motion.mass.data, of.mass_scene = in.motion.mass.scene;
@@ -73,11 +73,11 @@ DIFFVBD_OPERATOR(Out<5>, contact_trust_radii, In x, In origin, In mass, In move,
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
     contact::RadiusWork<T> work{};
     work.pushed = data<T>(memory), work.most = work.pushed + b;
-    work.island = data<int32_t>(island), work.u = data<T>(u), work.over = data<T>(over);
+    work.island = data<int32_t>(island), work.u = data<T>(u);
     work.trust_radius = data<T>(trust_radius), work.deformation_radius = data<T>(deformation_radius);
     DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(of));)
     DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
-    return Out<5>(island, u, trust_radius, deformation_radius, over);
+    return Out<4>(island, u, trust_radius, deformation_radius);
   });
 }
 

@@ -1,7 +1,6 @@
 // Operators of the start of a substep with contact: translations of islands, step fractions; lagged quantities of the
 // start of the step; and lists of pairs.
 #include "../contact/advance.h"
-
 #include "../contact/islands.h"
 #include "../contact/pair_list.h"
 #include "contact.h"

@@ -109,9 +109,9 @@ DIFFVBD_FN T guard_of_size(T size) {
   return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
 }
 
-constexpr int kMoves = 3;     // in sequence, each of what the moves before have left
-constexpr int kRounds = 16;   // rounds of halving in each
-constexpr int kPatience = 8;  // rounds after which what fails does not move
+constexpr int kMoves = 3;                // in sequence, each of what the moves before have left
+constexpr int kRounds = 16;              // rounds of halving in each
+constexpr int kPatience = 8;             // rounds after which what fails does not move
 constexpr double kRoundedSquare = 4e-6;  // of squares of lengths: more than rounding makes of them
 
 // Whether a point of a collider is at its end already: planes always are.

@@ -10,7 +10,7 @@ namespace diffvbd::contact {
 
 constexpr int kPlaneScalars = 7;  // of a plane in the data of FloorBarrier: normal, height, ...
 constexpr int kPlaneDhat = 5;     // which of them is its dhat
-constexpr int kJoins = 4;  // rounds of joining before all bodies of a scene become one island
+constexpr int kJoins = 4;         // rounds of joining before all bodies of a scene become one island
 
 // `vertices` of the mesh, sorted by body in body_order; corner points from there on are those of colliders.
 template <class T>
@@ -24,8 +24,8 @@ struct IslandInputs {
   int64_t scenes, mass_scene;                  // stride of scenes in mass
   int32_t vertices, corners, num_planes, mesh_bodies;
   const T*
-      trust_radius;    // [B, mesh_bodies + 1]  radius of a body's vertices relative to the translation [m], the largest
-  T half;                  // the reach of the barrier [m]
+      trust_radius;  // [B, mesh_bodies + 1]  radius of a body's vertices relative to the translation [m], the largest
+  T half;            // the reach of the barrier [m]
   Batched<const T> floor;  // [1 | B, floor_planes, kPlaneScalars]
   int32_t floor_planes;
 

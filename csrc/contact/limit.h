@@ -13,7 +13,7 @@ namespace diffvbd::contact {
 constexpr int kNoMove = 8;                             // the exponent that stands for a limit of 0
 constexpr double kBothGapFraction = 0.45;              // of a gap that an update may close where both sides move
 constexpr double kGapFraction = 2 * kBothGapFraction;  // and where one side moves
-constexpr double kLeastTrial = 1.0 / 64;                // the smallest fraction of a start that is tried, but for 0
+constexpr double kLeastTrial = 1.0 / 64;               // the smallest fraction of a start that is tried, but for 0
 constexpr double kStartLeast = 0.05;         // of any gap that a motion may close which does not minimise the barrier
 constexpr double kStartFraction = 0.5;       // of dhat: such a motion brings no pair closer
 constexpr double kTight = 0.125;             // of that: it closes a smaller gap no further,

@@ -11,10 +11,10 @@
 
 namespace diffvbd::contact {
 
-constexpr int kRadiusRounds = 3;  // rounds of radii relative to islands, and islands by these radii
+constexpr int kRadiusRounds = 3;     // rounds of radii relative to islands, and islands by these radii
 constexpr double kGrid = 0.125;      // of dhat: cells that the translation of an island is rounded to
 constexpr double kMostCells = 1e15;  // integers hold them
-constexpr double kSpare = 2;      // of dhat, added to what a body asks for: others may push it
+constexpr double kSpare = 2;         // of dhat, added to what a body asks for: others may push it
 
 template <class T>
 struct RadiusInputs {
@@ -22,7 +22,7 @@ struct RadiusInputs {
   IslandInputs<T> islands;                            // without the radius
   const T *displacements, *sums;                      // of find_motion
   const T *most, *most_alone, *most_own, *least_own;  // [bodies] [m] bounds of the radii: see ContactSurface
-  T fraction, least, dhat;  // of a displacement, and added to it [m]
+  T fraction, least, dhat;                            // of a displacement, and added to it [m]
   bool self_contact;
 
   DIFFVBD_FN T displacement(DisplacementKind which, int64_t place) const {
@@ -36,7 +36,7 @@ struct RadiusWork {
   T* pushed;                             // [B]  longest displacement of a collider's point
   T* most;                               // [B, bodies]
   int32_t* island;                       // [B, bodies]  results from here on
-  T *u, *over;                           // [B, bodies, 3], [B, bodies]
+  T* u;                                  // [B, bodies, 3]
   T *trust_radius, *deformation_radius;  // [B, bodies + 1]
 };
 
@@ -80,8 +80,7 @@ DIFFVBD_FN void wish_of_body(const RadiusInputs<T>& in, int64_t scene, int32_t b
 template <class T>
 DIFFVBD_FN bool wants_more(const RadiusInputs<T>& in, const RadiusWork<T>& work, int64_t scene, int32_t body) {
   const int64_t place = scene * in.motion.bodies + body;
-  const T wanted =
-      asked(in, place, in.displacement(kBends, place)) + in.fraction * in.displacement(kStretched, place);
+  const T wanted = asked(in, place, in.displacement(kBends, place)) + in.fraction * in.displacement(kStretched, place);
   return !(wanted <= in.most[body]);
 }
 
@@ -136,14 +135,10 @@ DIFFVBD_FN void radius_beside_island(const RadiusInputs<T>& in, const MovingBody
   const T relative = T(far[0]), stretched = in.displacement(kStretched, place), most = work.most[place];
   T& trust_radius = radius_at(in, work.trust_radius, b.scene, b.body);
   trust_radius = larger(trust_radius, trust_radius_of(in, work, place, relative, most));
-  const T displacement = relative + in.fraction * stretched,
-          wanted = asked(in, place, relative) + in.fraction * stretched;
-  // up to 2, which makes two substeps; a longer displacement more
-  work.over[place] = larger(displacement / most, smaller(wanted / most, T(2)));
   T deformation_radius = T(0);
   if (in.self_contact) {
-    deformation_radius =
-        (in.fraction + T(1)) * (in.displacement(kApart, place) + stretched) + T(2) * in.displacement(kGravity, place) + in.least;
+    deformation_radius = (in.fraction + T(1)) * (in.displacement(kApart, place) + stretched) +
+                         T(2) * in.displacement(kGravity, place) + in.least;
     deformation_radius =
         larger(smaller(deformation_radius, in.most_own[b.body]), smaller(trust_radius, in.least_own[b.body]));
     deformation_radius = larger(deformation_radius, in.displacement(kDriven, place));

@@ -576,11 +576,11 @@ DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, do
 // --- trial fractions of the rigid motions: reduced until no body is blocked and the potential does not increase.
 // Bodies decide together with those that they may touch, and with no others.
 
-constexpr int kTrials = 6;          // of motions, each reduced for some bodies
-constexpr int kShorter = 3;         // of these: reductions of a blocked body before it stays
-constexpr int kSpreads = 4;         // how often a reduction spreads to touching bodies
+constexpr int kTrials = 6;           // of motions, each reduced for some bodies
+constexpr int kShorter = 3;          // of these: reductions of a blocked body before it stays
+constexpr int kSpreads = 4;          // how often a reduction spreads to touching bodies
 constexpr double kIncrease = 1e-12;  // of the potential: counts as no increase
-constexpr double kRounded = 1e-6;   // of a length, that rounding cannot reach
+constexpr double kRounded = 1e-6;    // of a length, that rounding cannot reach
 
 // The body that a pair counts for: the first of those that it moves with, or -1.
 template <class T>

@@ -144,7 +144,6 @@ class TrustRadii(NamedTuple):
     u: Tensor  # translation of each body's island, rounded to a grid [B, NB, 3] [m]
     trust_radius: Tensor  # relative to the island's translation, and the largest of the scene [B, NB + 1] [m]
     deformation_radius: Tensor  # relative to the body's rigid motion [B, NB + 1] [m]
-    over: Tensor  # wanted displacement, or up to 2 the wanted radius, over the largest radius [B, NB]
 
 
 def contact_trust_radii(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, pinned: Tensor, order: Tensor,

@@ -177,8 +177,7 @@ def _contact_compact(a: Any) -> Any:
 
 def _contact_trust_radii(a: Any) -> Any:
     b, n = a.x.shape[0], _bodies(a)
-    return (new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1),
-            new(a.x, b, n))  # fmt: skip
+    return new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1)
 
 
 def _contact_rigid_system(a: Any) -> Any:

@@ -72,7 +72,7 @@ class ContactStep:
             plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=())
             with torch.no_grad():
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
-        self.substeps: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
+        self.substeps = (None if self.barrier is None else self.barrier.detections) or 1
         like = begun.x_prev
         self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_kappa")
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
@@ -165,19 +165,16 @@ class ContactStep:
         h2a = torch.where(pinned, 0.0, h2a) if pins else h2a
         displacement, resting = self._wanted(h2a)
         remaining, records = displacement, Records()
-        prescribed_substeps, r = self.substeps or 1, 0
-        planned, going = self.substeps, None
-        while r < (self.substeps or 1):
-            was, now = (self._colliders_at(min(1.0, n / prescribed_substeps)) for n in (r, r + 1))
+        planned, r = self.substeps, 0
+        going = None
+        while r < self.substeps:
+            was, now = (self._colliders_at(min(1.0, n / planned)) for n in (r, r + 1))
             # the whole displacement in the first substep; prescribed motion and truncated displacements go on later
             move = remaining
-            if pins and prescribed_substeps > 1:
-                move = torch.where(pinned, displacement / prescribed_substeps, remaining)
+            if pins and planned > 1:
+                move = torch.where(pinned, displacement / planned, remaining)
             motion = motion_of(surface, x, self.origin, self.fields.mass, move, h2a)
             within = self._trust_radii(x, was, now, motion)
-            if planned is None:
-                self.substeps = planned = 1 if is_captured(x) else substeps_of(within.over)
-            assert self.substeps is not None
             detection = self._detect(x, was, now, within)
             sweeps = sweeps_of_substep(settings.sweeps, planned, r)
             records.found.append(detection)
@@ -409,8 +406,7 @@ def run_contact(model: System, begun: Begun, prepared: Prepared, before: Tensor,
 
 # --- the sweeps of a part of a step with pairs or friction, in cycles, with the coarse correcti -----------------------
 
-# Substeps of a step without a given number: by the wanted displacements, and more while pairs truncate motion.
-MOST_PLANNED, MOST_DETECTIONS = 4, 8
+MOST_DETECTIONS = 8  # of a step without a given number: one, and more while pairs truncate motion
 TRUNCATED = 0.01  # fraction of vertices, besides blocked bodies, above which a step goes on and a rollout warns
 
 
@@ -431,13 +427,6 @@ def sweeps_of_substep(sweeps: int, planned: int, substep: int) -> int:
     """Number of sweeps of one substep. One beyond the planned ones has as many as the last of these, at least one."""
     shared = sweeps_of_substeps(sweeps, planned)
     return shared[substep] if substep < planned else max(shared[-1], min(sweeps, 1))
-
-
-def substeps_of(over: Tensor) -> int:
-    """Number of substeps of a step without a given number: one, and one more each time that the wanted displacement
-    over the largest radius doubles. over: Of TrustRadii."""
-    most = float(over.max()) if over.numel() else 0.0
-    return min(MOST_PLANNED, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
 
 
 def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Tensor, listed: Pairs,
@@ -528,7 +517,7 @@ class Detection(NamedTuple):
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
         kept: Rows of the listed pairs that sweeps can reach; None where the host must not read them, as on CUDA.
         sweeps: Number of sweeps of the substep.
-        going: Scenes that go on in a substep beyond the planned ones, bool [B, 1, 1]; None: all, as planned.
+        going: Scenes that go on in a further substep, bool [B, 1, 1]; None: all.
         resting: Vertices of partly pinned bodies that begin without their gravity move, bool [B, V]; None: none.
     """
 

@@ -519,8 +519,6 @@ def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bo
 
 # --- the coarse correction of bodies that touch -----------------------------------------------------------------------
 
-REFUSALS = 2  # corrections of a set without an admissible length, after which a substep makes no more of them
-
 
 class Space(NamedTuple):
     """Functions W [V, F] of a Model by row, and their bodies; constants."""
@@ -581,21 +579,17 @@ class Corrections:
             self.constants = replaced(self.constants, rest=scenes.model.rest_scalars)
         self.space = space_of(scenes.model)
         self.matrix = _dense(packed.detach(), self.space)
-        self.refused = torch.zeros_like(trials.bodies.ptr[:-1])[None]
+        self.sets = trials.bodies.number
         self.set_of = trials.bodies.of_body[:, self.space.body]  # of each function [B, F]
 
     def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """x [B, V, 3] after a correction, and its length for each body of the coarse space [B, bodies]."""
-        over = self.refused >= REFUSALS
-        if not x.is_cuda and bool(over.all()):
-            return x, self._of_bodies(torch.zeros_like(over, dtype=x.dtype))
         r, presses = self._gradient(x)
         with torch.no_grad():
             a = self._solved(presses, r)
             displacement = -self.space.prolonged(a)
-            slope = sum_by(-(r * a).sum(-1).reshape(-1, 1).double(), self.set_of.reshape(-1), over.shape[1] + 1)[:-1, 0]
-            length = torch.where(over | self._lost(), 0.0, self.trials.lengths(x, displacement, slope))
-            self.refused = self.refused + (length == 0)
+            slope = sum_by(-(r * a).sum(-1).reshape(-1, 1).double(), self.set_of.reshape(-1), self.sets + 1)[:-1, 0]
+            length = torch.where(self._lost(), 0.0, self.trials.lengths(x, displacement, slope))
         if torch.is_grad_enabled():
             displacement = -self.space.prolonged(self._differentiable(a, r, presses))
         of_vertex = torch.cat([length, length.new_zeros((1, 1))], 1)[0][self.trials.bodies.of].reshape(*x.shape[:2], 1)
@@ -641,7 +635,7 @@ class Corrections:
     def _lost(self) -> Tensor:
         """The sets of scenes without a correction, bool [sets]."""
         lost = (~self.solved[:, :, 0]).expand(self.set_of.shape).double()
-        return sum_by(lost.reshape(-1, 1), self.set_of.reshape(-1), self.refused.shape[1] + 1)[:-1, 0] > 0
+        return sum_by(lost.reshape(-1, 1), self.set_of.reshape(-1), self.sets + 1)[:-1, 0] > 0
 
     def _back(self, r: Tensor) -> Tensor:
         right = torch.where(self.solved, r, 0.0).double().reshape(r.shape[0], -1, 1)

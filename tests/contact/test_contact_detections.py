@@ -10,7 +10,7 @@ from conftest import DEVICES
 
 import diffvbd as dv
 from diffvbd.mesh import box, join
-from diffvbd.step.contact import MOST_DETECTIONS, substeps_of
+from diffvbd.step.contact import MOST_DETECTIONS
 from diffvbd.testing.tolerances import tolerance
 
 STEPS = 9
@@ -25,12 +25,6 @@ def meeting(speed: float, device: str, dtype: torch.dtype = torch.float64, **opt
     v = torch.zeros_like(model.rest_points)
     v[lower.num_vertices :, 1] = -speed
     return model, model.rest_points, v
-
-
-@pytest.mark.parametrize(("over", "parts"), ((0.0, 1), (1.0, 1), (1.5, 2), (2.0, 2), (2.1, 3), (4.0, 3), (5.0, 4),
-                                             (1e9, 4), (math.nan, 1), (math.inf, 1)))  # fmt: skip
-def test_one_more_each_time_that_the_way_is_twice_as_long(over: float, parts: int) -> None:
-    assert substeps_of(torch.tensor([[0.0, over]])) == parts <= MOST_DETECTIONS
 
 
 @pytest.mark.parametrize("device", DEVICES)

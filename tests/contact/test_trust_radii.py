@@ -205,7 +205,6 @@ def by_torch(g: Given) -> TrustRadii:
         relative = longest(g, g.move - translations(island)[:, body])
         trust_radius = torch.maximum(trust_radius, radius_of(relative, most))
         island = islands_of(g, trust_radius)
-    over = torch.maximum((relative + stretched) / most, ((asked(relative) + stretched) / most).clamp(max=2))
     own = torch.zeros_like(trust_radius)
     if g.barrier.self_contact:
         own = (RADIUS_FACTOR + 1) * (displacement["apart"] + displacement["stretched"]) + gravity_moves
@@ -213,7 +212,7 @@ def by_torch(g: Given) -> TrustRadii:
                             torch.minimum(trust_radius, s.min_deformation_radius))  # fmt: skip
         own = torch.maximum(own, displacement["driven"])
     trust_radius = torch.where(island >= 0, trust_radius - pushed, trust_radius)  # no collider reaches these
-    return TrustRadii(island.to(torch.int32), translations(island), last(trust_radius), last(own), over)
+    return TrustRadii(island.to(torch.int32), translations(island), last(trust_radius), last(own))
 
 
 def check(g: Given) -> None:
@@ -246,7 +245,7 @@ def test_a_body_that_is_not_finite_has_no_radius(device: str) -> None:
     move[1, -1, 0] = torch.nan
     found = g._replace(move=move).found()
     assert found.trust_radius[0].isfinite().all() and found.island[1, 3] == -1
-    assert found.trust_radius[1, 3:].isnan().all() and found.over[1, 3].isnan()
+    assert found.trust_radius[1, 3:].isnan().all()
 
 
 def placed(places: list[tuple[float, float, float]], colliders: Any = (), fall: float = 1.0) -> Given:
