@@ -114,6 +114,10 @@ def test_torques_are_differentiated_and_turn_with_the_point() -> None:
     )
     with pytest.raises(ValueError, match="about: expected a point"):
         dv.contact.forces(model, x, about=(0.0, 1.0), **options)
+    lost = [torch.tensor(0.1, requires_grad=True), torch.tensor(0.0), torch.tensor(0.0)]
+    for wrong in (None, "abc", lost, torch.ones(3, dtype=torch.complex64), torch.zeros(3).to_sparse()):
+        with pytest.raises(TypeError, match="about: expected"):
+            dv.contact.forces(model, x, about=wrong, **options)  # type: ignore[arg-type]
 
 
 def test_printed_they_say_who_presses_whom() -> None:
