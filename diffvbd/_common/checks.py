@@ -179,6 +179,31 @@ def check_readable(name: str, value: Tensor) -> None:
         raise ValueError(f"{name}: expected values, got a tensor on the meta device, which has none")
 
 
+def real_array(name: str, value: Any, wanted: str) -> Tensor:
+    """Numbers, in an array, a tensor or nested sequences, as float64; shares memory and gradient with a tensor."""
+    if isinstance(value, (tuple, list)) and any(isinstance(t, Tensor) and t.requires_grad for t in _leaves(value)):
+        raise TypeError(f"{name}: expected {wanted}, got a {kind_of(value)} of tensors that require grad, which a copy "
+                        "would lose: use torch.stack")  # fmt: skip
+    if isinstance(value, Tensor):
+        check_readable(name, value)
+    try:
+        array = torch.as_tensor(value, dtype=None if hasattr(value, "dtype") else torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(f"{name}: expected {wanted}, got a {kind_of(value)} that is none") from None
+    if array.is_complex() or array.dtype == torch.bool:
+        raise TypeError(f"{name}: expected {wanted} of real numbers, got dtype {array.dtype}")
+    return array.to(torch.float64)
+
+
+def _leaves(value: Any) -> Iterable[Any]:
+    """What nested sequences hold."""
+    if isinstance(value, (tuple, list)):
+        for part in value:
+            yield from _leaves(part)
+    else:
+        yield value
+
+
 def to_float(name: str, value: Any) -> float:
     """A python or numpy number as a float; raises where it is too large for one."""
     try:

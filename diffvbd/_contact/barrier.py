@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +15,7 @@ from .._common.checks import (
     check_positive,
     fail,
     init_names_checked,
+    real_array,
     refuse_gradients,
 )
 from .._common.constants import CONTACT
@@ -119,11 +119,11 @@ class Friction:
             floor if there is one. It counts in either order, with the mean of both entries.
         velocity: eps_v > 0 [m/s].
 
-    Input: ``friction``, the coefficient: scalar, or [n, n] where the energy has a matrix.
+    Input: ``friction``, the coefficient: scalar, or what broadcasts to [n, n] where the energy has a matrix.
 
     Raises:
         ValueError: A coefficient < 0 or not finite, a matrix of another size, a velocity below 1e-12 m/s.
-        TypeError: What is no number, or a tensor that requires grad.
+        TypeError: What holds no real numbers, or a tensor that requires grad.
 
     Source: Li et al. (2020), section 5; docs/method.md, section 12.
     """
@@ -138,10 +138,12 @@ class Friction:
 
     def __post_init__(self) -> None:
         refuse_gradients(self)
-        if np.ndim(self.coefficient) == 0:
-            object.__setattr__(self, "coefficient", check_number("coefficient", self.coefficient))
+        given = self.coefficient
+        if not isinstance(given, (tuple, list)) and getattr(given, "ndim", 0) == 0:
+            object.__setattr__(self, "coefficient", check_number("coefficient", given))
         else:
-            matrix = torch.as_tensor(self.coefficient, dtype=torch.float64).detach().cpu()
+            # a copy: what is done to the caller's matrix later must not change the scene
+            matrix = real_array("coefficient", given, "a number or a matrix [n, n]").clone().cpu()
             if matrix.dim() != 2 or matrix.shape[0] != matrix.shape[1]:
                 fail("coefficient", "a number or a matrix [n, n]", f"shape {list(matrix.shape)}")
             if not bool((torch.isfinite(matrix) & (matrix >= 0)).all()):

@@ -128,7 +128,7 @@ def intersections(model: Model, x: Tensor) -> Tensor:
         raise TypeError(f"x: expected real numbers, got dtype {x.dtype}")
     if x.shape[-2:] != (model.num_vertices, 3):
         fail("x", f"shape [..., {model.num_vertices}, 3]", f"shape {list(x.shape)}")
-    points = x.detach().reshape(-1, model.num_vertices, 3).to(torch.float64)
+    points = x.detach().reshape(x.shape[:-2].numel(), model.num_vertices, 3).to(torch.float64)
     bad = int((~torch.isfinite(points)).any(-1).sum())
     if bad:
         fail("x", "finite positions", f"{bad} that are not")

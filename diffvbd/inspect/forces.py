@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.linalg import cross
 
 from .. import ops
-from .._common.checks import check_kind, fail, name_value
-from .._common.context import looks_at
+from .._common.checks import check_kind, fail, name_value, real_array
+from .._common.context import looks_at, transformed
 from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
@@ -61,7 +61,8 @@ class Forces:
     Attributes:
         vertices: On every vertex, [..., V, 3]; those of self-contact, too.
         body_pairs: Bodies a < b that are near each other in some scene, int64 [M, 2].
-        between: On body a of each of these by body b, [..., M, 3]; b bears the opposite.
+        between: On body a of each of these by body b, [..., M, 3]. b bears the opposite force; its torque is not
+            quite the opposite, because friction acts on it at the other end of the gap.
         colliders: On each body by each collider, [..., N, colliders, 3].
         floors: On each body by each plane of the FloorBarrier, [..., N, planes, 3].
         bodies: On each body by all others, colliders and planes, [..., N, 3].
@@ -168,13 +169,15 @@ def forces(
 
 def _points_about(about: Tensor | Sequence[float], x: Tensor) -> Tensor:
     """The point of each scene [B, 3] in float64."""
-    point, lead = torch.as_tensor(about, dtype=torch.float64, device=x.device), x.shape[:-2]
+    lead = x.shape[:-2]
+    shapes = " or ".join(dict.fromkeys(("[3]", f"{[*lead, 3]}")))
+    point = real_array("about", about, f"a point of shape {shapes}").to(x.device)
     if (
         point.shape[-1:] != (3,)
         or point.dim() > len(lead) + 1
         or any(n not in (1, m) for n, m in zip(point.shape[-2::-1], lead[::-1], strict=False))
     ):
-        fail("about", f"a point of shape [3] or {[*lead, 3]}", f"shape {list(point.shape)}")
+        fail("about", f"a point of shape {shapes}", f"shape {list(point.shape)}")
     if looks_at(point):
         name_value("about", "finite coordinates", point, torch.isfinite(point))
     return point.expand(*lead, 3).reshape(lead.numel(), 3)
@@ -206,7 +209,7 @@ def _refuse_below(given: Wide, where: dict[str, Tensor | None]) -> None:
     for name, x in where.items():
         if floor is None or x is None:
             continue
-        flat = x.detach().double().reshape(-1, *x.shape[-2:])
+        flat = x.detach().double().reshape(x.shape[:-2].numel(), *x.shape[-2:])
         gaps = floor.gaps(flat, given.data()[:, : floor.count()].detach().double(), None)[0]
         below = (~(gaps > 0) & ~given.model._pinned[:, None]).nonzero()
         if len(below):
@@ -216,6 +219,9 @@ def _refuse_below(given: Wide, where: dict[str, Tensor | None]) -> None:
 
 
 def _contact_at(given: Wide, x: Tensor, previous: tuple[Tensor, Tensor] | None) -> ContactState:
+    if transformed() and not x.requires_grad:
+        raise NotImplementedError("diffvbd: torch.func transforms of forces of contact with x as a constant are not "
+                                  "supported: use torch.autograd")  # fmt: skip
     flat = (x.shape[:-2].numel(), *x.shape[-2:])
     start = None if previous is None else previous[0].double().reshape(flat)
     h = given.prepared.settings.numbers.time_step

@@ -204,7 +204,9 @@ def prepare(
         energy, key, own = known[name]
         shape = tuple(model.constants(energy)[key].shape)[:own]
         given[name] = _scenes_first(name, value, like, lead, shape)
-        if energy in (model.contact, model.friction) and (checking() or not like.is_cuda):
+        if energy is model.friction and own:  # rows of a matrix are looked up, so each must be there
+            given[name] = ops.broadcast(given[name], (given[name].shape[0], *shape))
+        if energy in (model.contact, model.friction) and not transformed() and (checking() or not like.is_cuda):
             name_value(name, "finite numbers >= 0", given[name], given[name] >= 0)
     materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):

@@ -77,6 +77,68 @@ def test_rubber_stops_before_steel(surface: str) -> None:
         assert way == pytest.approx(speed**2 / (2 * own * GRAVITY) - speed * h / 2, rel=0.03)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("shape", ((), (1,), (5,), (5, 1), (1, 5)))
+def test_a_smaller_input_is_the_matrix_that_it_broadcasts_to(shape: tuple[int, ...], device: str) -> None:
+    scene = with_matrix("obstacles")
+    model, inputs = scene.model.to(device), {**scene.inputs, **scene.parameters, "solver": scene.solver(3)}
+    small = torch.linspace(0.2, 0.7, math.prod(shape), dtype=torch.float64).reshape(shape)
+    ends, slopes = [], []
+    for given in (small, small.expand(5, 5).clone()):
+        inputs["friction"] = friction = given.to(device).requires_grad_()
+        on = {k: t.to(device) if isinstance(t, torch.Tensor) and k != "friction" else t for k, t in inputs.items()}
+        x, _ = dv.step(model, scene.x.to(device), scene.v.to(device), **on)
+        ends.append(x)
+        slopes.append(torch.autograd.grad(x.square().sum(), friction)[0])
+    assert torch.equal(*ends) and slopes[0].shape == shape and slopes[1].abs().max() > 0
+    assert relative_error(slopes[0], slopes[1].sum_to_size(shape)) <= tolerance("sum")
+
+
+def test_each_scene_may_have_one_number() -> None:
+    scene = with_matrix("batched")
+    model, count = scene.model, len(scene.x)
+    n = len(scene.parameters["friction"])
+    inputs: dict[str, Any] = {**scene.inputs, **scene.parameters, "solver": scene.solver(3)}
+    each = torch.linspace(0.1, 0.6, count, dtype=torch.float64).reshape(count, 1, 1)
+    ends = [dv.step(model, scene.x, scene.v, **{**inputs, "friction": f}) for f in (each, each.expand(count, n, n))]
+    assert all(torch.equal(one, two) for one, two in zip(*ends, strict=True))
+
+
+def test_a_matrix_is_copied_in_float64() -> None:
+    given = matrix(3)
+    energy = dv.Friction(given)
+    given.fill_(-1.0)
+    assert torch.equal(energy.coefficient, matrix(3))
+    assert torch.equal(dv.Friction(matrix(3).tolist()).coefficient, matrix(3))
+    assert torch.equal(dv.Friction(matrix(3).numpy()).coefficient, matrix(3))
+
+
+@pytest.mark.parametrize(
+    ("coefficient", "got"),
+    (
+        ([[0.1, 0.2], [0.3]], "list"),
+        ([["a", "b"], ["c", "d"]], "list"),
+        ([[1j, 0.0], [0.0, 0.0]], "list"),
+        (torch.ones(2, 2, dtype=torch.complex64), "complex64"),
+        (torch.ones(2, 2, dtype=torch.bool), "bool"),
+        (torch.ones(2, 2).to_sparse(), "sparse"),
+        (torch.ones(2, 2, requires_grad=True), "pass friction="),
+        ([[torch.tensor(0.1, requires_grad=True)]], "require grad"),
+    ),
+)
+def test_what_is_no_matrix_of_real_numbers_is_refused(coefficient: Any, got: str) -> None:
+    with pytest.raises(TypeError, match=f"coefficient: expected .*{got}"):
+        dv.Friction(coefficient)
+
+
+def test_transforms_are_refused_in_words() -> None:
+    scene = with_matrix("obstacles")
+    inputs: dict[str, Any] = {**scene.inputs, **scene.parameters, "solver": scene.solver(2)}
+    both = torch.stack([inputs.pop("friction")] * 2)
+    with pytest.raises(NotImplementedError, match="contact are not supported"):
+        torch.func.vmap(lambda friction: dv.step(scene.model, scene.x, scene.v, friction=friction, **inputs)[0])(both)
+
+
 def test_wrong_matrices_are_named() -> None:
     with pytest.raises(ValueError, match="coefficient: expected a number or a matrix"):
         dv.Friction([0.1, 0.2])

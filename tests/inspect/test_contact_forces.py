@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.marks import slow
@@ -114,6 +115,36 @@ def test_torques_are_differentiated_and_turn_with_the_point() -> None:
     )
     with pytest.raises(ValueError, match="about: expected a point"):
         dv.contact.forces(model, x, about=(0.0, 1.0), **options)
+    lost = [torch.tensor(0.1, requires_grad=True), torch.tensor(0.0), torch.tensor(0.0)]
+    for wrong in (None, "abc", lost, torch.ones(3, dtype=torch.complex64), torch.zeros(3).to_sparse()):
+        with pytest.raises(TypeError, match="about: expected"):
+            dv.contact.forces(model, x, about=wrong, **options)  # type: ignore[arg-type]
+
+
+def test_transforms_of_other_inputs_than_x_are_refused_in_words() -> None:
+    model = resting("floor", "cpu")
+    x, point = settled(model), torch.ones(3, dtype=torch.float64)
+
+    def torque(x: torch.Tensor, about: torch.Tensor) -> torch.Tensor:
+        return dv.contact.forces(model, x, about=about).bodies.torque.sum()
+
+    with pytest.raises(NotImplementedError, match="forces of contact"):
+        torch.func.grad(torque, argnums=1)(x, point)
+    with pytest.raises(NotImplementedError, match="forces of contact"):
+        torch.func.vmap(lambda about: torque(x, about))(point[None])
+    tracked = x.clone().requires_grad_()
+    expected = torch.autograd.grad(torque(tracked, point), tracked)[0]
+    assert torch.equal(torch.func.grad(torque)(x, point), expected)
+
+
+def test_no_vertices_bear_no_forces() -> None:
+    mesh = dv.TetMesh(np.zeros((0, 3)), np.zeros((0, 4), dtype=np.int64))
+    for barrier in (dv.FloorBarrier(), dv.PairBarrier()):
+        model = dv.Model(mesh, energies=(dv.StableNeoHookean(), barrier, dv.Friction(0.1)))
+        x = model.rest_points
+        assert dv.contact.forces(model, x.expand(2, 0, 3)).bodies.torque.shape == (2, 0, 3)
+        assert len(dv.contact.intersections(model, x)) == 0
+        assert dv.reactions(model, x, **SOFT).shape == (0, 3)
 
 
 def test_printed_they_say_who_presses_whom() -> None:
