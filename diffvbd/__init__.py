@@ -1,5 +1,6 @@
 """diffvbd: differentiable soft-body simulation by Vertex Block Descent, by the exact adjoint of the executed solver."""
 
+import importlib as _importlib
 import os as _os
 
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
@@ -74,3 +75,10 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
+
+
+def __getattr__(name: str) -> object:
+    """Modules that are imported at their first use, so that ``dir`` shows what a scene is written with."""
+    if name in ("distributed", "results", "testing"):
+        return _importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

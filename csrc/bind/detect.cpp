@@ -1,8 +1,7 @@
 // Operators that search: pairs of primitives, intersections of surfaces.
-#include "../contact/detection.h"
-
 #include <cmath>
 
+#include "../contact/detection.h"
 #include "backend.h"
 
 namespace diffvbd {

@@ -1,6 +1,5 @@
 // The rigid motion of each body with the linear and angular momentum of the wanted displacements, and the deviations
-// from it. Index data: not differentiated. No fraction of a rigid motion brings two points of a body closer
-// (docs/method.md, section 12).
+// from it (docs/method.md, section 12). Index data: not differentiated.
 #pragma once
 
 #include "../core/rotation.h"

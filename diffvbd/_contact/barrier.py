@@ -49,10 +49,9 @@ class PairBarrier:
             their normal force N there, by N / (N + kappa dhat / 10), lest a motion jump where a pair comes to be that
             close one step sooner.
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
-            advance in R substeps; what pairs have truncated goes on in the next substep. None: one, and up to four in
-            steps in which bodies want to go farther past each other than ``reach`` lets them. As long as pairs still
-            truncate motion, such a step goes on, with more sweeps, up to eight substeps in all (docs/contact.md). What
-            is prescribed then moves in the first substep.
+            advance in R substeps; what pairs have truncated goes on in the next substep. None: one, and as long as
+            pairs truncate motion one more, with as many sweeps, up to eight in all (docs/contact.md). What is
+            prescribed then moves in the first substep.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
             detections, relative to the motion that bodies near each other share. None: that is one mean edge of its
             body, or 8 where a single body moves.

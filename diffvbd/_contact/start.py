@@ -50,9 +50,8 @@ def start_between(x: Tensor, move: Tensor, was: Tensor, now: Tensor, planes: Ten
         ratio, deformation_radius = trust_radius / _length(relative), detection.deformation_radius[:, body]
         if own_pairs:
             ratio = torch.minimum(ratio, deformation_radius / _length(displacement - rigid))
-        within = _of_units(_fraction(ratio), pinned, unit)
-        above = _of_units(_fraction(_above(planes, at + u, relative, origin)), pinned, unit)
-        first = torch.minimum(within, above)
+        within = _of_units(ratio, pinned, unit)
+        first = _fraction(_lower(within, planes, at + u, relative, origin, pinned, unit))
         listed = detection.listed[:4]
         wanted = torch.where(pinned[:, None], displacement, u + first[..., None] * relative).contiguous()
         passed, infeasible = ops_contact.advance(at, wanted, detection.u, at, origin, was.detach(), now.detach(),
@@ -68,9 +67,10 @@ def start_above(x: Tensor, move: Tensor, planes: Tensor | None, origin: Tensor, 
                 ) -> SubstepStart:  # fmt: skip
     """The same without pairs: nothing but the floor limits motion."""
     with torch.no_grad():
-        fraction = _of_units(_fraction(_above(planes, x.detach(), move.detach(), origin)), pinned, unit)
-        free, zero = torch.full_like(fraction, FAR), torch.zeros_like(fraction, dtype=torch.bool)
-    start = _started(x, move, torch.zeros_like(x), fraction, pinned)
+        free, none = torch.full_like(x[..., 0], FAR), torch.zeros_like(x)
+        fraction = _fraction(_lower(free, planes, x.detach(), move.detach(), origin, pinned, unit))
+        zero = torch.zeros_like(free, dtype=torch.bool)
+    start = _started(x, move, none, fraction, pinned)
     return SubstepStart(start, x.detach(), free, (), zero, zero.new_zeros((1,), dtype=torch.int64), fraction)
 
 
@@ -82,24 +82,26 @@ def _length(a: Tensor) -> Tensor:
     return a.square().sum(-1).sqrt().clamp(min=torch.finfo(a.dtype).tiny)
 
 
-def _above(planes: Tensor | None, x: Tensor, move: Tensor, origin: Tensor) -> Tensor:
-    """Fraction of its displacement after which a vertex has closed FILTER_ETA of its gap to a plane of the floor."""
+def _lower(ratio: Tensor, planes: Tensor | None, x: Tensor, move: Tensor, origin: Tensor, pinned: Tensor, unit: Tensor
+           ) -> Tensor:  # fmt: skip
+    """The ratio [B, V], or that at which a vertex of its unit has closed FILTER_ETA of its gap to a floor."""
     if planes is None:
-        return torch.ones_like(x[..., 0])
+        return ratio
     plane = planes.detach().reshape(planes.shape[0], 1, -1, PLANE_SCALARS)
     normal = plane[:, 0, :, :3].mT
     gap = ((x if origin.numel() == 0 else x + origin) @ normal - plane[..., 3]).clamp(min=0)
     toward = -(move @ normal)
-    return torch.where(toward > 0, FILTER_ETA * gap / toward, torch.inf).amin(-1)
+    above = torch.where(toward > 0, FILTER_ETA * gap / toward, torch.inf).amin(-1)
+    return torch.minimum(ratio, _of_units(above, pinned, unit))
 
 
 def _fraction(ratio: Tensor) -> Tensor:
-    """The largest of 1, 1/2, ..., 2^-LEAST and 0 that is no larger; 0 of what is no number."""
-    halved = torch.nan_to_num(-torch.log2(ratio).floor(), nan=LEAST + 1.0).clamp(0, LEAST + 1)
-    return torch.where(halved > LEAST, 0.0, torch.ldexp(torch.ones_like(ratio), -halved))
+    """The largest of 1, 1/2, ..., 2^-LEAST and 0 that is no larger."""
+    halved = torch.ceil(-torch.log2(ratio)).clamp(0, LEAST + 1)
+    return torch.where(halved > LEAST, 0.0, torch.exp2(-halved))
 
 
-def _of_units(fraction: Tensor, pinned: Tensor, unit: Tensor) -> Tensor:
-    """The smallest fraction of the vertices of each unit that are not pinned [B, V]."""
-    fraction, index = torch.where(pinned, 1.0, fraction), unit.long().expand(fraction.shape)
-    return torch.ones_like(fraction).scatter_reduce(1, index, fraction, "amin").gather(1, index)
+def _of_units(ratio: Tensor, pinned: Tensor, unit: Tensor) -> Tensor:
+    """The smallest ratio of the vertices of each unit that are not pinned, at most 1 [B, V]."""
+    ratio, index = torch.where(pinned, 1.0, ratio), unit.long().expand(ratio.shape)
+    return torch.ones_like(ratio).scatter_reduce(1, index, ratio, "amin").gather(1, index)
