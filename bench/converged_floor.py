@@ -36,6 +36,7 @@ class Body:
     friction: float = 0.0
     eps_v: float = 1e-3
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pinned: NDArray[np.bool_] | None = None
     iterations: list[int] = field(default_factory=list)  # of each step
 
     def __post_init__(self) -> None:
@@ -48,9 +49,13 @@ class Body:
         self.mu = self.young / (2 * (1 + self.poisson))
         self.unit = self.time_step**2 * self.mu * float(self.volume.sum())  # the size of what the energy's terms cancel
         self.lb = self.mu + self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
-        self.size = 3 * count
-        rows = 3 * self.tets[:, :, None] + np.arange(3)
-        self.where = (rows[:, :, None, :, None] * self.size + rows[:, None, :, None, :]).ravel()
+        self.free = np.ones(count, bool) if self.pinned is None else ~self.pinned
+        number = np.where(self.free, np.cumsum(self.free) - 1, -1)
+        self.size = 3 * int(self.free.sum())
+        rows = np.where(number[self.tets] >= 0, 3 * number[self.tets], -(10**9))[:, :, None] + np.arange(3)
+        index = rows[:, :, None, :, None] * self.size + rows[:, None, :, None, :]
+        both = np.broadcast_to((rows[:, :, None, :, None] >= 0) & (rows[:, None, :, None, :] >= 0), index.shape)
+        self.where, self.kept = index[both], both
         self.crossed = np.cross(self.grad[:, :, None], self.grad[:, None])  # [T, 4, 4, 3]
         self.diagonal = (self.mu * self.volume)[:, None, None] * (self.grad @ self.grad.swapaxes(1, 2))
 
@@ -68,13 +73,17 @@ class Body:
                                      + self.lb / 2 * strain**2)).sum())  # fmt: skip
 
     def barrier(self, x: Array) -> tuple[Array, Array, Array]:
-        """b, b' and b'' of every vertex; b is infinite on or below the plane."""
+        """b, b' and b'' of every free vertex; b is infinite on or below the plane."""
         gap = x[:, 1]
-        d = np.where((gap > 0) & (gap < self.dhat), gap, self.dhat)
+        d = np.where(self.free & (gap > 0) & (gap < self.dhat), gap, self.dhat)
         past, log = d - self.dhat, np.log(d / self.dhat)
-        value = np.where(gap <= 0, np.inf, -self.kappa * past**2 * log)
+        value = np.where(self.free & (gap <= 0), np.inf, -self.kappa * past**2 * log)
         return (value, -self.kappa * (2 * past * log + past**2 / d),
                 -self.kappa * (2 * log + 4 * past / d - (past / d) ** 2))  # fmt: skip
+
+    def floor_force(self, x: Array) -> float:
+        """Force of the plane on the body [N]."""
+        return float(-self.barrier(x)[1].sum())
 
     def _slip(self, x: Array, start: Array) -> tuple[Array, Array, Array]:
         """Slip [V, 2] since the start of the step, its length and the friction of full slip [N]."""
@@ -83,16 +92,17 @@ class Body:
 
     def potential(self, x: Array, y: Array, start: Array) -> float:
         """G [kg m^2] of docs/method.md, section 1."""
-        h, rubbed = self.time_step, 0.0
+        h, own = self.time_step, self.free
+        rubbed = 0.0
         if self.friction:
             reach, (_, length, full) = h * self.eps_v, self._slip(x, start)
             slow = length**2 / reach - length**3 / (3 * reach**2) + reach / 3
             rubbed = (full * np.where(length < reach, slow, length)).sum()
-        inertia = 0.5 * (self.mass * ((x - y) ** 2).sum(1)).sum()
+        inertia = 0.5 * (self.mass[own] * ((x - y)[own] ** 2).sum(1)).sum()
         return inertia + h * h * (self.elastic(x) + self.barrier(x)[0].sum() + rubbed)
 
     def gradient(self, x: Array, y: Array, start: Array) -> tuple[Array, float]:
-        """dG/dx [n] and the size of the parts that it is the sum of."""
+        """dG/dx at free vertices [n] and the size of the parts that it is the sum of."""
         f, cof, strain = self._strain(x)
         stress = self.mu * f + (self.lb * strain - self.mu)[:, None, None] * cof
         each = self.volume[:, None, None] * (self.grad @ stress.swapaxes(1, 2))  # [T, 4, 3]
@@ -103,7 +113,7 @@ class Body:
             reach, (slip, length, full) = h * self.eps_v, self._slip(x, start)
             rate = np.where(length < reach, (2 - length / reach) / reach, 1 / np.maximum(length, reach))
             floor[:, [0, 2]] = (full * rate)[:, None] * slip
-        parts = np.stack([self.mass[:, None] * (x - y), h * h * inner, h * h * floor])
+        parts = np.stack([self.mass[:, None] * (x - y), h * h * inner, h * h * floor])[:, self.free]
         return parts.sum(0).ravel(), float(np.linalg.norm(parts.reshape(3, -1), axis=1).sum())
 
     def hessian(self, x: Array, start: Array, convex: bool) -> Array:
@@ -122,7 +132,7 @@ class Body:
             whole = (vector * np.maximum(value, 0)[:, None]) @ vector.swapaxes(1, 2)
             block = whole.reshape(-1, 4, 3, 4, 3).swapaxes(2, 3)
         h2 = self.time_step**2
-        out: Any = h2 * np.bincount(self.where, block.ravel(), self.size**2).reshape(self.size, self.size)
+        out: Any = h2 * np.bincount(self.where, block[self.kept], self.size**2).reshape(self.size, self.size)
         own = np.zeros((len(x), 3, 3))
         own[:, [0, 1, 2], [0, 1, 2]] = self.mass[:, None]
         own[:, 1, 1] += h2 * self.barrier(x)[2]
@@ -135,7 +145,7 @@ class Body:
             across = rate[:, None, None] * np.eye(2) + bend[:, None, None] * along[:, :, None] * along[:, None]
             own[:, ::2, ::2] += h2 * full[:, None, None] * across
         each = np.arange(self.size).reshape(-1, 3)
-        out[each[:, :, None], each[:, None]] += own
+        out[each[:, :, None], each[:, None]] += own[self.free]
         return out
 
     def _direction(self, x: Array, start: Array, g: Array) -> Array:
@@ -147,23 +157,24 @@ class Body:
             factor = cho_factor(self.hessian(x, start, True), lower=True, overwrite_a=True, check_finite=False)
         return np.asarray(cho_solve(factor, -g, check_finite=False), dtype=np.float64)
 
-    def step(self, x: Array, v: Array) -> tuple[Array, Array]:
+    def step(self, x: Array, v: Array, prescribed: Array | None = None) -> tuple[Array, Array]:
         """One step of implicit Euler, to convergence: the new positions and velocities.
 
         Raises RuntimeError where it does not converge."""
         h, start = self.time_step, x
         y = x + h * v + h * h * np.array(self.gravity)
-        state = x + h * v
-        state[:, 1] = np.maximum(state[:, 1], np.minimum(x[:, 1], 0.5 * self.dhat))
+        y[~self.free] = (x if prescribed is None else prescribed)[~self.free]
+        state = np.where(self.free[:, None], x + h * v, y)
+        state[:, 1] = np.where(self.free, np.maximum(state[:, 1], np.minimum(x[:, 1], 0.5 * self.dhat)), state[:, 1])
         value, (g, size) = self.potential(state, y, start), self.gradient(state, y, start)
         for done in range(MOST):
             way = np.zeros_like(x)
             if np.linalg.norm(g) > TOLERANCE * size:
-                way = self._direction(state, start, g).reshape(-1, 3)
+                way[self.free] = self._direction(state, start, g).reshape(-1, 3)
             if np.abs(way).max() <= ROUNDING * self.extent:
                 self.iterations.append(done)
                 return state, (state - x) / h
-            slope, down = float(g @ way.ravel()), way[:, 1] < 0
+            slope, down = float(g @ way[self.free].ravel()), self.free & (way[:, 1] < 0)
             share = min(1.0, 0.95 * float((-state[down, 1] / way[down, 1]).min(initial=np.inf)))
             while share > 1e-12:
                 trial = state + share * way
@@ -180,11 +191,11 @@ class Body:
             g, size = self.gradient(state, y, start)
         raise RuntimeError(f"Newton's method ended with a residual of {np.linalg.norm(g) / size:.1e}")
 
-    def rollout(self, x: Array, v: Array, steps: int) -> tuple[Array, Array]:
-        """Positions and velocities at the start and after each step [steps + 1, V, 3]."""
+    def rollout(self, x: Array, v: Array, steps: int, prescribed: Any = None) -> tuple[Array, Array]:
+        """Positions and velocities at the start and after each step [steps + 1, V, 3]; prescribed: of step n."""
         xs, vs = [x], [v]
-        for _ in range(steps):
-            x, v = self.step(x, v)
+        for n in range(steps):
+            x, v = self.step(x, v, None if prescribed is None else prescribed[n])
             xs.append(x)
             vs.append(v)
         return np.stack(xs), np.stack(vs)
