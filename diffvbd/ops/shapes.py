@@ -151,10 +151,6 @@ def _bodies(a: Any) -> int:
     return (a.ptr if hasattr(a, "order") else a.body_ptr).shape[0] - 1
 
 
-def _of_planes(planes: Tensor, wants: bool = True) -> int:
-    return planes.shape[-1] if wants and planes.numel() else 0
-
-
 def _points(x: Tensor, collider: Tensor) -> Tensor:
     """One vector for each corner point."""
     return new(x, x.shape[0], x.shape[1] + (collider.shape[1] if collider.dim() == 3 else 0), 3)

@@ -72,11 +72,6 @@ class Prepared(NamedTuple):
     lookback: float = LOOKBACK  # over h v; see csrc/sweep/extrapolation.h
     euler: Tensor | None = None  # bool [B, V]: vertices that take implicit Euler in a step of another scheme
 
-    def displacements(self, of: Callable[[float], Tensor]) -> Tensor:
-        """of(lookback) [B, V, 3], each vertex by the lookback ratio of its scheme."""
-        own = of(self.lookback)
-        return own if self.euler is None else torch.where(self.euler[..., None], of(LOOKBACK), own)
-
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
         return self.settings.numbers.time_step, self.settings.sweeps
