@@ -27,6 +27,8 @@ QUICK = {("held_up", 1, 5), *((name, 1, 1) for name in SCENES if name != "held_u
 SLOW = [(1, 0), (1, 20), (4, 1), (4, 20)]
 LONG = [(20, 2)]
 SHORT = {"thrown", "held_up"}  # scenes that are like the others after a few steps
+# the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
+OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}
 HOURS = [(20, 5), (20, 20)]  # one scene runs the first of them in `make test-all`, too
 # Bounds hold every vertex back in the first step, which therefore starts without a pair closer than dhat.
 NONE_YET = {"grad_pair_damping", "grad_friction"}
@@ -64,7 +66,8 @@ def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("name", "steps", "sweeps"),
-    [*(slow(name, *run) for name in SCENES for run in (SLOW if name in SHORT else SLOW + LONG)),
+    [*(slow(name, *OTHERS.get((name, run), run)) for name in SCENES
+       for run in (SLOW if name in SHORT else SLOW + LONG)),
      slow("crossed", 20, 5),
      *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES for run in HOURS
        if (name, run) != ("crossed", HOURS[0]))],
