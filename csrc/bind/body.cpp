@@ -157,7 +157,7 @@ DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_ba
   const Device device(x);
   const BeginSettings settings{data_count, time_step, filter_eta, lookback, kind, filters};
   return dispatch_float(x, [&]<class T>(T) {
-    // where the bodies that are corrected coast to, and their predictor, once more
+    // extrapolated positions and predictor of the corrected bodies, recomputed
     const Tensor extrapolated = order.numel() > 0 ? device.like_x() : x, y = order.numel() > 0 ? device.like_x() : x;
     const auto in = begin_inputs<T>(f, settings, extrapolated, y, from_predictor, alone);
     const Reader<T> read(x);

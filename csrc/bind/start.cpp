@@ -1,4 +1,4 @@
-// Operators of the start of a substep with contact: translations of islands, step fractions; lagged quantities of the
+// Operators of the start of a substep with contact: islands, step fractions; lagged quantities of the
 // start of the step; and lists of pairs.
 #include "../contact/advance.h"
 #include "../contact/islands.h"

@@ -66,7 +66,7 @@ template <class T>
 cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* infeasible,
                     void* workspace, int multiprocessors, cudaStream_t stream);
 
-// constants [pairs, 8] (contact/narrow.h).
+// constants [pairs, 8] (contact/pair_list.h).
 template <class T>
 cudaError_t refresh_gaps(const contact::GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
 

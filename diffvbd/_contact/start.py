@@ -13,7 +13,7 @@ from .._contact.surface import ContactSurface
 from ..ops import contact as ops_contact
 from ..ops.fields import PLANE_SCALARS
 
-TRUNCATED = 0.99  # fraction of a displacement below which a vertex is truncated
+WHOLE = 0.99  # fraction of a displacement from which a vertex counts as not truncated
 LEAST = 6  # the smallest fraction is 2^-6, and then 0
 FAR = 1e15  # [m] trust-region radius without pairs
 
@@ -57,7 +57,7 @@ def start_between(x: Tensor, move: Tensor, was: Tensor, now: Tensor, planes: Ten
         passed, infeasible = ops_contact.advance(at, wanted, detection.u, at, origin, was.detach(), now.detach(),
                                                  surface.pinned, surface.body, unit, listed)  # fmt: skip
         fraction = first * passed
-        truncated = (torch.minimum(within, passed) < TRUNCATED) & ~pinned
+        truncated = (torch.minimum(within, passed) < WHOLE) & ~pinned
         own = (at + u + fraction[..., None] * (rigid - u), deformation_radius) if own_pairs else ()
     start = _started(x, move, u, fraction, pinned)
     return SubstepStart(start, at + u, trust_radius, own, truncated, infeasible, fraction)
