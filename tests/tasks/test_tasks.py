@@ -252,9 +252,7 @@ HEIGHTS = torch.tensor([0.1, 0.4, 0.7], dtype=torch.float64)
 
 @pytest.mark.parametrize("name", [slow("dress-mu-lam"), slow("dress-silhouette")])
 def test_quick_run_recovers_the_material_dress(name: str, tmp_path: Path) -> None:
-    # stages after the first begin near their end; from vertices, they find it from farther away, too
-    iterations = 16 if name == "dress-mu-lam" else None
-    result = check_fall(name, tmp_path, factor=1e-3, whole=True, iterations=iterations)
+    result = check_fall(name, tmp_path, factor=1e-3, whole=True)
     # what the alternation adds to stage A
     entered = next(row for row in result.history if row["stage"] == 1)
     assert max(result.errors.values()) < tolerance("recovered_dress") < 0.01 < abs(entered["lam"] / 800 - 1)
