@@ -49,7 +49,8 @@ class Checks:
             behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs a quarter of
             one detection or less on the CPU and, on CUDA, waits for the device once. Under torch.compile, and while a
             CUDA graph is captured, nothing is checked: run the rollout once before the capture. On the CPU it also
-            warns where all tets of a body are inverted.
+            warns where all tets of a body are inverted, and with a PairBarrier where a body goes by more than its own
+            size in a step.
         energy: Whether to warn where a scene that only gravity drives has 5 % more energy (where barriers push at the
             start, twice as much) than it began with and gravity gave it; where, without pairs, the sweeps leave the
             motion off by an estimated 2 %; where thin tets bend. True: energy after any step. None: on the CPU, of ten

@@ -34,7 +34,7 @@ from ..step.arguments import (
 from ..step.contact import check_start as refuse_start
 from ..step.integrators import History, check_history, solves_of, take
 from ..step.residual import ErrorEstimate, error_of, of_steps, truncated_fraction
-from ..step.warnings import proven, system_for, warn_of_inverted_bodies, warn_of_sweeps
+from ..step.warnings import proven, system_for, warn_of_inverted_bodies, warn_of_leaps, warn_of_sweeps
 from .checks import Checks, check_checks, checks_contact, look_at_end, look_at_energy, warn_of_contact, warn_of_last_end
 from .memory import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .refine import LOOKS, rollout_finer
@@ -140,6 +140,7 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
         refuse_start(model, x, loads["colliders"], loads["colliders_before"], _changes(loads["colliders"]))
         if looks_at(x):
             warn_of_inverted_bodies(model, x)
+            warn_of_leaps(model, v, time_step)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
     every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, solves_of(scheme) * solver.sweeps)

@@ -265,6 +265,40 @@ def _bodies_of(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return names, first, of
 
 
+def warn_of_leaps(model: Model, v: Tensor, time_step: float) -> None:
+    """Warns where a body goes by more than its own size in a step at the velocities v [..., V, 3]: contact solves for
+    where it ends, and that may be behind what it should hit."""
+    surface, barrier, size = model.surface_of_contact, model.contact, (-1, *v.shape[-2:])
+    if surface is None or barrier is None or v.numel() == 0:
+        return
+    alone = bool(surface.plane_points[model.num_vertices :].all())  # no body passes a Plane
+    if alone and (surface.bodies < 2 or not barrier.between_bodies):
+        return
+    sizes, counts = model.derived("sizes of bodies", lambda: _sizes_of(model))
+    mean = v.new_zeros((v.reshape(size).shape[0], len(sizes), 3)).index_add_(1, model.body, v.detach().reshape(size))
+    mean = mean / counts[:, None]
+    if alone:
+        mean = mean - mean.mean(1, keepdim=True)  # all together may be as fast as they like
+    leap = time_step * mean.norm(dim=-1)
+    over = (leap > sizes).nonzero()
+    if len(over):
+        scene, body = over[0].tolist()
+        warn(
+            f"v: body {body} in scene {scene} goes {leap[scene, body]:.2g} m in a step, more than its size, "
+            f"{sizes[body]:.2g} m: contact may end the step with it behind what it should hit; take a smaller "
+            "time_step; checks=dv.Checks(start=False) starts without a word"
+        )
+
+
+def _sizes_of(model: Model) -> tuple[Tensor, Tensor]:
+    """Diagonal of each body's box at rest [bodies] [m], and how many vertices it has."""
+    x, body, count = model.rest_points, model.body, model.mesh.num_bodies
+    rows = body[:, None].expand(-1, 3)
+    none = x.new_zeros((count, 3))
+    high, low = (none.scatter_reduce(0, rows, x, way, include_self=False) for way in ("amax", "amin"))
+    return (high - low).norm(dim=1), torch.bincount(body, minlength=count).to(x)
+
+
 def warn_of_bending(model: Model, x: Tensor) -> None:
     """Warns of thin tets that a state x [..., V, 3] bends: linear ones lock."""
     aspect, height = model.derived("thinness", partial(thinness, model)) if model.num_tets else (0.0, 0.0)

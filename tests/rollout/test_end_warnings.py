@@ -371,6 +371,26 @@ def test_some_inverted_tets_are_no_mistake() -> None:
     assert said(model, pushed) == [] and said(model, x) == []
 
 
+def leaps(speeds: tuple[float, float], energies: Any = None, **options: Any) -> list[str]:
+    """Warnings of two cubes of 1 m that start with these speeds, in steps of 0.01 s."""
+    energies = (dv.StableNeoHookean(), dv.PairBarrier()) if energies is None else energies
+    model, x = two_cubes(energies=energies)
+    v = torch.zeros_like(x)
+    v[:, 0] = torch.tensor(speeds, dtype=v.dtype)[model.body]
+    found = messages(lambda: dv.rollout(model, x, v, steps=1, **GIVEN, **options))
+    return [message for message in found if "more than its size" in message]
+
+
+def test_a_body_that_leaps_over_another_is_named() -> None:
+    (message,) = leaps((0.0, -400.0))
+    assert "body 0" in message and "2 m in a step" in message  # beside the mean of both
+    (message,) = leaps((0.0, -800.0))
+    assert message.startswith("v: ") and "time_step" in message
+    assert leaps((0.0, -300.0)) == [] == leaps((900.0, 900.0))
+    assert leaps((0.0, -800.0), energies=(dv.StableNeoHookean(),)) == []
+    assert leaps((0.0, -800.0), checks=dv.Checks(start=False)) == []
+
+
 def test_nothing_is_said_where_nobody_asks() -> None:
     model, x = two_cubes()
     other = mirrored(model, x, 0)
