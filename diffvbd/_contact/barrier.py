@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,8 +20,12 @@ from .._common.checks import (
     refuse_gradients,
 )
 from .._common.constants import CONTACT
+from ..mesh import TetMesh
+from .colliders import unique_edges
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
+# Defaults: dhat over the mean edge of the finest surface; and an impact that closes four fifths of it.
+DHAT_OF_EDGE, IMPACT, CLOSED = 0.1, 3.0, 0.8  # -, [m/s], -
 LEAST_VELOCITY = 1e-12  # [m/s]; its square times that of a time step must be a number in float32
 
 
@@ -41,8 +46,10 @@ class PairBarrier:
     never a pair: they may pass through each other.
 
     Args:
-        kappa: Barrier stiffness [N/m].
-        dhat: Activation distance [m]. Pairs of one body that are closer at rest use 0.9 of their rest distance.
+        kappa: Barrier stiffness [N/m]. None: so stiff that one side of the body that needs most stops it at 3 m/s
+            within four fifths of dhat.
+        dhat: Activation distance [m]. Pairs of one body that are closer at rest use 0.9 of their rest distance. None: a
+            tenth of the mean surface edge of the body with the finest surface.
         self_contact: Pairs within a body.
         between_bodies: Pairs of different bodies. Pairs with colliders always count.
         damping: Damping of approaching motion of pairs that started the step closer than dhat [N s/m]. It fades in with
@@ -72,8 +79,8 @@ class PairBarrier:
     parameters: ClassVar[dict[str, int]] = {"kappa": 0, "damping": 0}
     units: ClassVar[dict[str, str]] = {"kappa": "N/m", "damping": "N s/m"}
 
-    kappa: float = 400.0
-    dhat: float = 0.02
+    kappa: Any = None  # a number in a Model
+    dhat: Any = None
     self_contact: bool = True
     between_bodies: bool = True
     damping: float = 0.0
@@ -83,8 +90,10 @@ class PairBarrier:
 
     def __post_init__(self) -> None:
         refuse_gradients(self)
-        object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
-        object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
+        if self.kappa is not None:
+            object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
+        if self.dhat is not None:
+            object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
         object.__setattr__(self, "damping", check_number("damping", self.damping))
         for name in ("self_contact", "between_bodies"):
             check_bool(name, getattr(self, name))
@@ -92,16 +101,37 @@ class PairBarrier:
             object.__setattr__(self, "detections", check_count("detections", self.detections, 1, 1000))
         if self.reach is not None:
             object.__setattr__(self, "reach", check_positive("reach", self.reach, "m"))
-            if self.reach <= self.dhat:
+            if self.dhat is not None and self.reach <= self.dhat:
                 fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
-        for name, length in (("dhat", self.dhat), ("reach", self.reach or 0.0)):
-            if length > MOST_REACH:
+        for name, length in (("dhat", self.dhat), ("reach", self.reach)):
+            if length is not None and length > MOST_REACH:
                 fail(name, f"at most {MOST_REACH:g} m", length)
         if self.capacity is not None:
             object.__setattr__(self, "capacity", check_count("capacity", self.capacity, 1, 2**26))
 
     def constants(self, like: Tensor) -> dict[str, Tensor]:
         return _scalars(self, like)
+
+    def of_scene(self, mesh: TetMesh, density: np.ndarray) -> PairBarrier:
+        """The same with numbers for kappa and dhat. density: Of each tet [T] [kg/m^3]."""
+        if self.kappa is not None and self.dhat is not None:
+            return self
+        if not mesh.num_tets:
+            fail("energies: PairBarrier", "kappa and dhat for a mesh without tets", "no numbers")
+        label = np.unique(mesh.body, return_inverse=True)[1].reshape(-1)
+        first, second = unique_edges(mesh.surface).T
+        count = np.bincount(label[first], minlength=mesh.num_bodies)
+        lengths = np.linalg.norm(mesh.points[first] - mesh.points[second], axis=1)
+        edge = np.bincount(label[first], lengths, mesh.num_bodies)[count > 0] / count[count > 0]
+        dhat = self.dhat or min(DHAT_OF_EDGE * float(edge.min()), (self.reach or np.inf) / 2)
+        a, b, c, d = mesh.points[mesh.tets].transpose(1, 0, 2)
+        weight = density * np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6
+        mass = np.bincount(label[mesh.tets[:, 0]], weight, mesh.num_bodies)[count > 0]
+        side = np.bincount(label[np.unique(mesh.surface)], minlength=mesh.num_bodies)[count > 0] / 6
+        # m v^2 / 2 = n b of a gap that is left
+        most = float((mass / side).max()) * IMPACT**2 / 2
+        kappa = most / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
+        return replace(self, kappa=kappa if self.kappa is None else self.kappa, dhat=dhat)
 
 
 @init_names_checked

@@ -95,6 +95,10 @@ class Model:
         mask = vertex_mask(pinned, mesh.num_vertices)
         check_isolated(tets, mask)
         self._density = per_tet_density(density, mesh.num_tets)
+        self._given_contact = self.contact
+        if self.contact is not None:  # defaults that follow from mesh and mass
+            fitted = self.contact.of_scene(mesh, self._density.numpy())
+            self._set_energies(tuple(fitted if e is self.contact else e for e in self.energies))
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = first_of_body(body)
@@ -278,7 +282,14 @@ class Model:
         own = {
             "density": self._density.cpu(),
             "pinned": self._pinned.cpu() if self._pinned.any() else None,
-            "energies": [e.placed(self.num_vertices, cpu) if isinstance(e, VertexEnergy) else e for e in self.energies],
+            "energies": [
+                e.placed(self.num_vertices, cpu)
+                if isinstance(e, VertexEnergy)
+                else self._given_contact
+                if e is self.contact
+                else e
+                for e in self.energies
+            ],
             "colliders": self.colliders,
             "dtype": self.dtype,
             "device": self.device,

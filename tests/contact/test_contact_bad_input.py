@@ -40,7 +40,7 @@ def raises(run: Callable[[], Any], name: str, got: str) -> None:
         ("dhat", 0.0, "0"),
         ("dhat", -1.0, "-1"),
         ("dhat", INF, "inf"),
-        ("dhat", None, "NoneType"),
+        ("dhat", "near", "str"),
         ("damping", -1.0, "-1"),
         ("damping", [1.0], "list"),
         ("self_contact", 1, "int"),
@@ -59,7 +59,7 @@ def raises(run: Callable[[], Any], name: str, got: str) -> None:
     ],
 )
 def test_pair_barrier(name: str, value: Any, got: str) -> None:
-    raises(lambda: dv.PairBarrier(**{name: value}), name, got)
+    raises(lambda: dv.PairBarrier(**{"dhat": 0.02, name: value}), name, got)
 
 
 @pytest.mark.parametrize(
