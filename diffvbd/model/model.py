@@ -279,17 +279,11 @@ class Model:
     def replace(self, **changes: Any) -> Model:
         """A new Model of the same mesh with other arguments of the constructor; other names raise TypeError."""
         cpu = torch.device("cpu")
+        given = [self._given_contact if e is self.contact else e for e in self.energies]
         own = {
             "density": self._density.cpu(),
             "pinned": self._pinned.cpu() if self._pinned.any() else None,
-            "energies": [
-                e.placed(self.num_vertices, cpu)
-                if isinstance(e, VertexEnergy)
-                else self._given_contact
-                if e is self.contact
-                else e
-                for e in self.energies
-            ],
+            "energies": [e.placed(self.num_vertices, cpu) if isinstance(e, VertexEnergy) else e for e in given],
             "colliders": self.colliders,
             "dtype": self.dtype,
             "device": self.device,
