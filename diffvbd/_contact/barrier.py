@@ -46,8 +46,8 @@ class PairBarrier:
     never a pair: they may pass through each other.
 
     Args:
-        kappa: Barrier stiffness [N/m]. None: so stiff that one side of the body that needs most stops it at 3 m/s
-            within four fifths of dhat.
+        kappa: Barrier stiffness [N/m]. None: so stiff that one side of the moving body that needs most stops it at 3
+            m/s within four fifths of dhat.
         dhat: Activation distance [m]. Pairs of one body that are closer at rest use 0.9 of their rest distance. None: a
             tenth of the mean surface edge of the body with the finest surface.
         self_contact: Pairs within a body.
@@ -112,8 +112,12 @@ class PairBarrier:
     def constants(self, like: Tensor) -> dict[str, Tensor]:
         return _scalars(self, like)
 
-    def of_scene(self, mesh: TetMesh, density: np.ndarray) -> PairBarrier:
-        """The same with numbers for kappa and dhat. density: Of each tet [T] [kg/m^3]."""
+    def of_scene(self, mesh: TetMesh, density: np.ndarray, pinned: np.ndarray) -> PairBarrier:
+        """The same with numbers for kappa and dhat.
+
+        Args:
+            density: Of each tet [T] [kg/m^3].  pinned: bool [V]; a body that is pinned as a whole hits nothing.
+        """
         if self.kappa is not None and self.dhat is not None:
             return self
         if not mesh.num_tets:
@@ -128,8 +132,9 @@ class PairBarrier:
         weight = density * np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6
         mass = np.bincount(label[mesh.tets[:, 0]], weight, mesh.num_bodies)[count > 0]
         side = np.bincount(label[np.unique(mesh.surface)], minlength=mesh.num_bodies)[count > 0] / 6
+        moves = np.bincount(label, ~pinned, mesh.num_bodies)[count > 0] > 0
         # m v^2 / 2 = n b of a gap that is left
-        most = float((mass / side).max()) * IMPACT**2 / 2
+        most = float((mass / side)[moves if moves.any() else ...].max()) * IMPACT**2 / 2
         kappa = most / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
         return replace(self, kappa=kappa if self.kappa is None else self.kappa, dhat=dhat)
 

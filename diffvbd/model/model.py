@@ -97,7 +97,7 @@ class Model:
         self._density = per_tet_density(density, mesh.num_tets)
         self._given_contact = self.contact
         if self.contact is not None:  # defaults that follow from mesh and mass
-            fitted = self.contact.of_scene(mesh, self._density.numpy())
+            fitted = self.contact.of_scene(mesh, self._density.numpy(), mask.numpy())
             self._set_energies(tuple(fitted if e is self.contact else e for e in self.energies))
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())

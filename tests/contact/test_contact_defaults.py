@@ -32,6 +32,14 @@ def test_reach_follows_from_the_finest_surface_and_stiffness_from_mass() -> None
     assert model_of(both).contact.kappa == pytest.approx(1e3 * alone.kappa)  # of 1000 kg
 
 
+def test_a_body_that_is_pinned_does_not_count() -> None:
+    both = dv.mesh.join([cube(0.1), cube(1.0).translate((2.0, 0.0, 0.0))])
+    table = dv.Model(both, pinned=both.body == 1, energies=(dv.StableNeoHookean(), dv.PairBarrier()))
+    assert table.contact.kappa == pytest.approx(model_of(cube(0.1)).contact.kappa)
+    still = dv.Model(cube(0.1), pinned=range(27), energies=(dv.StableNeoHookean(), dv.PairBarrier()))
+    assert still.contact.kappa == model_of(cube(0.1)).contact.kappa
+
+
 def test_what_is_given_counts() -> None:
     own = model_of(cube(0.1), kappa=123.0).contact
     assert own.kappa == 123.0 and own.dhat == model_of(cube(0.1)).contact.dhat
