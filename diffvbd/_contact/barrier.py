@@ -120,8 +120,8 @@ class PairBarrier:
         """
         if self.kappa is not None and self.dhat is not None:
             return self
-        if not mesh.num_tets:
-            fail("energies: PairBarrier", "kappa and dhat for a mesh without tets", "no numbers")
+        if not mesh.num_tets:  # nothing that could touch: any numbers do
+            return replace(self, **{k: 1.0 for k in ("kappa", "dhat") if getattr(self, k) is None}, reach=None)
         label = np.unique(mesh.body, return_inverse=True)[1].reshape(-1)
         first, second = unique_edges(mesh.surface).T
         count = np.bincount(label[first], minlength=mesh.num_bodies)

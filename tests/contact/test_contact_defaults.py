@@ -72,7 +72,7 @@ def test_a_first_scene_in_si_units_falls_and_rests(size: float, density: float, 
     assert abs(float(pushed[1]) / weight - 1) < tolerance("settled")
 
 
-def test_without_a_mesh_there_is_nothing_to_follow_from() -> None:
+def test_a_mesh_without_tets_has_a_barrier_too() -> None:
     points = dv.TetMesh(np.eye(3), np.zeros((0, 4), int))
-    with pytest.raises(ValueError, match="PairBarrier: expected kappa and dhat for a mesh without tets"):
-        dv.Model(points, pinned=[0, 1, 2], energies=(dv.PairBarrier(),))
+    model = dv.Model(points, pinned=[0, 1, 2], energies=(dv.PairBarrier(reach=0.1),))
+    assert model.contact.kappa > 0 and model.contact.dhat > 0

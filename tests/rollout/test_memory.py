@@ -1,5 +1,6 @@
 """`dv.memory` against bytes that torch's allocator and autograd report, within the tolerance "memory"."""
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +35,7 @@ def beam_model(
 
 def allocated_bytes(run: Callable[[], Any]) -> tuple[int, int]:
     """What run() and its result still hold at the end, and the largest amount held on the way [bytes]."""
+    gc.collect()  # what tests before this left in cycles is not freed while it counts
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
         result = run()
     events = profiler.profiler.kineto_results.events()
