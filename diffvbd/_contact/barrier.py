@@ -21,7 +21,8 @@ from .._common.checks import (
 )
 from .._common.constants import CONTACT
 from ..mesh import TetMesh
-from .colliders import unique_edges
+from ..mesh.tet_mesh import signed_volume
+from .colliders import mean_edges, unique_edges
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
 # Defaults: dhat over the mean edge of the finest surface; and an impact that closes four fifths of it.
@@ -120,22 +121,18 @@ class PairBarrier:
         """
         if self.kappa is not None and self.dhat is not None:
             return self
-        if not mesh.num_tets:  # nothing that could touch: any numbers do
-            return replace(self, **{k: 1.0 for k in ("kappa", "dhat") if getattr(self, k) is None}, reach=None)
-        label = np.unique(mesh.body, return_inverse=True)[1].reshape(-1)
-        first, second = unique_edges(mesh.surface).T
-        count = np.bincount(label[first], minlength=mesh.num_bodies)
-        lengths = np.linalg.norm(mesh.points[first] - mesh.points[second], axis=1)
-        edge = np.bincount(label[first], lengths, mesh.num_bodies)[count > 0] / count[count > 0]
-        dhat = self.dhat or min(DHAT_OF_EDGE * float(edge.min()), (self.reach or np.inf) / 2)
-        a, b, c, d = mesh.points[mesh.tets].transpose(1, 0, 2)
-        weight = density * np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6
-        mass = np.bincount(label[mesh.tets[:, 0]], weight, mesh.num_bodies)[count > 0]
-        side = np.bincount(label[np.unique(mesh.surface)], minlength=mesh.num_bodies)[count > 0] / 6
-        moves = np.bincount(label, ~pinned, mesh.num_bodies)[count > 0] > 0
-        # m v^2 / 2 = n b of a gap that is left
-        most = float((mass / side)[moves if moves.any() else ...].max()) * IMPACT**2 / 2
-        kappa = most / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
+        finest, load = 1.0, 1.0  # [m], [kg] for each vertex of a side; any will do where nothing can touch
+        if mesh.num_tets:
+            label, bodies = np.unique(mesh.body, return_inverse=True)[1].reshape(-1), mesh.num_bodies
+            edge = mean_edges(mesh.points, unique_edges(mesh.surface), label, bodies)
+            mass = np.bincount(label[mesh.tets[:, 0]], density * signed_volume(mesh.points, mesh.tets)[0], bodies)
+            side = np.bincount(label[np.unique(mesh.surface)], minlength=bodies) / 6
+            moves = np.bincount(label, ~pinned, bodies) > 0
+            finest = float(edge[edge > 0].min())
+            load = float((mass / np.maximum(side, 1 / 6))[moves if moves.any() else ...].max())
+        dhat = self.dhat or min(DHAT_OF_EDGE * finest, (self.reach or np.inf) / 2)
+        # m v^2 / 2 = n b of the gap that is left
+        kappa = load * IMPACT**2 / 2 / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
         return replace(self, kappa=kappa if self.kappa is None else self.kappa, dhat=dhat)
 
 

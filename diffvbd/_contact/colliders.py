@@ -158,4 +158,13 @@ def unique_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.sort(pairs, 1), axis=0)
 
 
+def mean_edges(points: NDArray[np.float64], edges: NDArray[np.int64], body: NDArray[np.int64], bodies: int
+               ) -> NDArray[np.float64]:  # fmt: skip
+    """Mean length of the edges of each body [bodies] [m], 0 where it has none; body: Of each point."""
+    first, second = edges.T
+    lengths = np.linalg.norm(points[first] - points[second], axis=1)
+    total, number = (np.bincount(body[first], weights, bodies) for weights in (lengths, None))
+    return total / np.maximum(number, 1)
+
+
 __all__ = ["Capsule", "Obstacle", "Plane", "Sphere"]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._contact.barrier import PairBarrier
-from .._contact.colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
+from .._contact.colliders import Capsule, Collider, Obstacle, Plane, Sphere, mean_edges, unique_edges
 from ..mesh import TetMesh
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
@@ -103,10 +103,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         if part.plane:
             planes.append([first, first + 1, first + 2])
     # of each body: neither a large obstacle nor a coarse neighbour widens a search
-    first, second = edges[0].T
-    lengths = np.linalg.norm(mesh.points[first] - mesh.points[second], axis=1)
-    total, number = (np.bincount(label[first], weights, minlength=bodies) for weights in (lengths, None))
-    edge = torch.from_numpy(total / np.maximum(number, 1))
+    edge = torch.from_numpy(mean_edges(mesh.points, edges[0], label, bodies))
     pinned_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
     pinned_bodies = torch.from_numpy(pinned_vertices > 0)
     moving_bodies = pinned_vertices < np.bincount(label, minlength=bodies)
