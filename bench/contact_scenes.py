@@ -19,6 +19,7 @@ import diffvbd as dv
 from bench.contact import turned
 from diffvbd import mesh, reference
 from diffvbd.colliders import Plane
+from diffvbd.reference.energies import smoothed
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -262,10 +263,31 @@ def flown(number: int, device: str) -> tuple[int, int, float, bool]:
 PARTS = ("start", "first rigid correction", "sweeps", "coarse correction", "corrections after the sweeps")
 
 
+def friction_energy(of: Any, x: Tensor) -> float:
+    """Potential of lagged friction and damping in a step of diffvbd.step.contact, times h^2. x: [B, V, 3] [m]."""
+    from diffvbd.adjoint.contact import at_corners
+
+    numbers, total = of.prepared.settings.numbers, 0.0
+    h, reach = numbers.time_step, numbers.friction_eps
+    if len(of.lagged.pairs):
+        load, rate, n, w = of.lag.split((1, 1, 3, 4), -1)
+        moved = torch.cat([x - of.x_prev, torch.zeros_like(of.before)], 1)  # colliders rest
+        moved = (w[..., None] * at_corners(moved, of.lagged)).sum(1)
+        along = (n * moved).sum(-1, keepdim=True)
+        total += float((h * h * load[:, 0] * smoothed((moved - along * n).T, reach)[0]).sum())
+        total += float((0.5 * h * rate * along.clamp(max=0) ** 2).sum())
+    if of.floor_lag.numel():
+        load, n = of.floor_lag[..., 0], of.floor_lag[..., 1:]
+        travel = (x - of.x_prev)[:, :, None]
+        slip = travel - n * (n * travel).sum(-1, keepdim=True)
+        total += float((h * h * load * smoothed(slip.mT, reach)[0]).sum())
+    return total
+
+
 def risen(number: int, device: str) -> dict[str, float]:
     """By part of a step the largest rise of the scene's potential over its value at the start of the step, in four
-    steps. It looks between the parts of diffvbd.step.contact; pairs and lagged friction are that module's own terms."""
-    from diffvbd.step import contact, contact_corrections
+    steps. It looks between the parts of diffvbd.step.contact."""
+    from diffvbd.step import contact
 
     model, x, v, material, solver = drawn(number, device)
     floor, h = [energy for energy in model.energies if isinstance(energy, dv.FloorBarrier)], solver.time_step
@@ -273,12 +295,8 @@ def risen(number: int, device: str) -> dict[str, float]:
     now: dict[str, Any] = {}
 
     def potential(x: Tensor) -> float:
-        terms = contact_corrections
         total = reference.incremental_potential(body, x, now["y"], **material, time_step=h).sum()
-        for listed, values in ((now["terms"].listed, terms.barrier_values), (now["terms"].lagged, terms.lagged_values)):
-            total = total + values(now["terms"], x).sum() if len(listed.pairs) else total
-        rubs = now["terms"].fields.floor_lag.numel() > 0
-        return float(total + terms.floor_friction_values(now["terms"], x).sum() if rubs else total)
+        return float(total + h * h * pair_energy(model, x).sum()) + friction_energy(now["step"], x)
 
     def note(part: str, x: Tensor, to: Tensor) -> None:
         before, after = potential(x.detach()), potential(to.detach())
@@ -304,7 +322,6 @@ def risen(number: int, device: str) -> dict[str, float]:
     def started(x: Tensor, move: Tensor, was: Tensor, at: Tensor, floor: Any, origin: Tensor, detection: Any,
                 *rest: Any) -> Any:  # fmt: skip
         end = start(x, move, was, at, floor, origin, detection, *rest)
-        now["terms"] = contact._scenes(now["step"], end, at, detection.listed)
         note("start", x, end.x)
         return end
 

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "../cpu/advance.h"
+#include "../cpu/contact_coarse.h"
 #include "../cpu/contact_rigid.h"
 #include "../cpu/detect.h"
 #include "../cpu/loops.h"

@@ -14,6 +14,7 @@
 #include "../cuda/bodies.h"
 #include "../cuda/coarse.h"
 #include "../cuda/contact.h"
+#include "../cuda/contact_coarse.h"
 #include "../cuda/contact_rigid.h"
 #include "../cuda/neighbors.h"
 #include "../cuda/step.h"

@@ -48,6 +48,12 @@
   INDEX(pairs) INDEX(constants) INDEX(pair_ptr) INDEX(pair_entry) \
   ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(trust_radius)
 
+// The coarse functions of a Model, by vertex and by function, int32, but weight; the star of each vertex; and the tets'
+// material and rest shape (subspace/contact_coarse.h).
+#define DIFFVBD_SPACE_FIELDS(ADJOINT, INDEX) \
+  INDEX(vertex_ptr) INDEX(function) INDEX(weight) INDEX(function_ptr) INDEX(entry) INDEX(vertex) INDEX(own) \
+  INDEX(body_ptr) INDEX(body_function) INDEX(tets) INDEX(star_ptr) INDEX(star) ADJOINT(mu) ADJOINT(lam) ADJOINT(rest)
+
 // The beginning of a step (start/begin.h): as of the correction, and the other bodies. other [vertices]: which of them
 // a vertex is in, -1: none, -2: it is corrected; tets, other_tets [listed, 5]: a tet and its corners; rest [1 | scenes,
 // tets, kRestScalars], empty where tets have no energy.
@@ -85,6 +91,7 @@ DIFFVBD_STRUCT(SweepFields, SWEEP)
 DIFFVBD_STRUCT(StepFields, STEP)
 DIFFVBD_STRUCT(RigidFields, RIGID)
 DIFFVBD_STRUCT(TouchingFields, TOUCHING)
+DIFFVBD_STRUCT(SpaceFields, SPACE)
 DIFFVBD_STRUCT(BeginFields, BEGIN)
 DIFFVBD_STRUCT(CoarseFields, COARSE)
 DIFFVBD_BARS(SweepBars, SWEEP)

@@ -18,6 +18,11 @@ struct Dual {
   DIFFVBD_FN explicit Dual(S v) : value(R(v)), derivative(R(0)) {}
 };
 
+DIFFVBD_FN double value_of(double a) { return a; }
+template <class R>
+DIFFVBD_FN R value_of(const Dual<R>& a) {
+  return a.value;
+}
 template <class R>
 DIFFVBD_FN Dual<R> operator+(const Dual<R>& a, const Dual<R>& b) {
   return {a.value + b.value, a.derivative + b.derivative};

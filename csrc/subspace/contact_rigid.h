@@ -69,6 +69,7 @@ struct RigidInputs {
   int32_t planes;
   double friction_eps;
   bool has_friction;
+  bool bends;  // bodies do not move rigidly (contact_coarse.h): pairs within one act, too; friction is linear at x
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
   // Lists are of all scenes, but what a scene does must not depend on others.
@@ -111,11 +112,11 @@ DIFFVBD_FN int32_t moving_body(const RigidInputs<T>& in, int32_t corner) {
   return body < in.bodies() && in.free[body] ? body : -1;
 }
 
-// Whether a listed pair depends on rigid motions: the pairs within a body do not.
+// Whether a listed pair depends on the motions: of rigid ones the pairs within a body do not.
 template <class T>
 DIFFVBD_FN bool is_between(const RigidInputs<T>& in, int64_t pair) {
   const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
-  return in.gate.body[record[0]] != in.gate.body[record[sides(record[4])]];
+  return in.bends || in.gate.body[record[0]] != in.gate.body[record[sides(record[4])]];
 }
 
 // Positions of corner points: at x, or after the trial displacement.

@@ -208,23 +208,51 @@ struct BarrierWork {
   }
 };
 
+// f1(|u|) / |u| and its derivative over |u|, constant below the rounding of rest.
+template <class R>
+DIFFVBD_FN FrictionRate<R> friction_rate_of(const Vec3<R>& u, double eps) {
+  const R square = dot(u, u);
+  const double length = square_root(value_of(square));
+  const R known = kRestingMotion * eps < length ? square_root(square) : R(length);
+  return FrictionRate<R>(known, R(eps));
+}
+
+// The virtual work by P of friction with a load of 1 after a motion Q. d: the motion since the start of the step, of
+// which u is tangential to n. Force and stiffness at u, times Q; where it is not `linear`, the force after Q.
+template <class R>
+DIFFVBD_FN R friction_work(const Vec3<R>& n, const Vec3<R>& d, const Vec3<R>& P, const Vec3<R>& Q, double eps,
+                           bool linear) {
+  const Vec3<R> u = d - dot(n, d) * n, slip = Q - dot(n, Q) * n;
+  if (!linear) return friction_rate_of(u + slip, eps).value * dot(u + slip, P);
+  const FrictionRate<R> f = friction_rate_of(u, eps);
+  return f.value * dot(u + slip, P) + f.curvature * dot(u, P) * dot(u, Q);
+}
+DIFFVBD_FN Vec3<Dual<double>> dual_of(const Vector& a, int direction) {
+  return {{a.x, double(direction == 0)}, {a.y, double(direction == 1)}, {a.z, double(direction == 2)}};
+}
+
 // Of a lagged pair. With d how its weighted corners have moved since the start of the step, P and Q how they move by p
-// and q, n its normal, u the tangential displacement after Q, A = h damping, L = h^2 normal force and f1 of smoothed
-// friction,
+// and q, n its normal, A = h damping, L = h^2 normal force,
 //
-//     W = A min(n . d, 0) n . P + s A (n . P) (n . Q) + L f1(|u|) / |u| u . P,
+//     W = A min(n . d, 0) n . P + s A (n . P) (n . Q) + L friction_work(n, d, P, s Q),
 //
-// with the last two for each side that moves by itself, where s = 2, else 1. Positions at the start of the
-// step take the derivatives by x with the other sign.
+// for each side that moves by itself, where s = 2, else 1. Positions at the start of the step take the derivatives by x
+// with the other sign.
 template <class T>
 struct LaggedWork {
   bool acts;
   PairMotions m;
   Vector since[4], n, d;  // since: how each corner has moved
   double w[4], load, damping, h, eps;
+  bool linear;
 
   DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, d{}, h(in.scene.time_step), eps(in.friction_eps) {
+      : acts(pair < in.first_lagged(in.scene.scenes)),
+        m{},
+        d{},
+        h(in.scene.time_step),
+        eps(in.friction_eps),
+        linear(in.bends) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force: above dhat, or by a coefficient of zero
@@ -245,35 +273,41 @@ struct LaggedWork {
     }
   }
 
+  template <class R>
+  DIFFVBD_FN R work(const Vec3<R>& by_n, const Vec3<R>& by_d, const Vec3<R>& P, const Vec3<R>& Q, double A,
+                    double L) const {
+    const R along = dot(by_n, by_d), approach = along < R(0) ? along : R(0), fraction = R(m.fraction);
+    const R damped = R(A) * (approach + fraction * dot(by_n, Q)) * dot(by_n, P);
+    if (L == 0) return damped;
+    return damped + R(L) * friction_work(by_n, by_d, P, fraction * Q, eps, linear);
+  }
+
   // Stores the rows of the corners [4, 9], and adds to lag_bar [9].
   DIFFVBD_FN void store(T* rows, T* lag_bar) const {
-    const double along = dot(n, d), approach = along < 0 ? along : 0, A = h * damping, L = h * h * load;
-    double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
+    const double h2 = h * h;
+    double by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
     Vector by_n{}, by_d{};
     for (int side = 0; side < m.sides; ++side) {
-      const Vector P = weighted(w, m.p, m, side), Q = weighted(w, m.q, m, side), displacement = m.fraction * Q;
-      const Vector u = d - along * n + (displacement - dot(n, displacement) * n);
-      const FrictionRate<double> f(square_root(dot(u, u)), eps);
-      const double nP = dot(n, P), nQ = dot(n, Q), slipping = dot(u, P);
-      const Vector by_u = L * (f.value * P + (f.curvature * slipping) * u);
-      const Vector by_displacement = by_u - dot(n, by_u) * n;
-      by_d += by_u;
-      by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
-      by_n += (A * approach) * P + (m.fraction * A) * (nQ * P + nP * Q) - (along + dot(n, displacement)) * by_u -
-              dot(n, by_u) * displacement;
-      by_load += f.value * slipping, by_damping += approach * nP + m.fraction * nP * nQ;
-      const Vector by_p = (A * (approach + m.fraction * nQ)) * n + (L * f.value) * u;
-      const Vector by_q = m.fraction * ((A * nP) * n + by_displacement);
+      const Vector P = weighted(w, m.p, m, side), Q = weighted(w, m.q, m, side);
+      by_load += work(n, d, P, Q, 0, h2), by_damping += work(n, d, P, Q, h, 0);
+      Vector by[4] = {};  // by n, d, P and Q
+      for (int which = 0; (load != 0 || damping != 0) && which < 4; ++which) {
+        double* const to[] = {&by[which].x, &by[which].y, &by[which].z};
+        for (int i = 0; i < 3; ++i) {
+          const auto along = [&](const Vector& a, int k) { return dual_of(a, k == which ? i : -1); };
+          *to[i] = work(along(n, 0), along(d, 1), along(P, 2), along(Q, 3), h * damping, h2 * load).derivative;
+        }
+      }
+      by_n += by[0], by_d += by[1];
       for (int k = 0; k < 4; ++k) {
         if (!m.is_of(side, k)) continue;
-        put(rows + kWorkScalars * k + 3, w[k] * by_p);
-        put(rows + kWorkScalars * k + 6, w[k] * by_q);
-        by_w[k] += dot(by_p, m.p[k]) + dot(by_q, m.q[k]);
+        put(rows + kWorkScalars * k + 3, w[k] * by[2]);
+        put(rows + kWorkScalars * k + 6, w[k] * by[3]);
+        by_w[k] += dot(by[2], m.p[k]) + dot(by[3], m.q[k]);
       }
     }
-    by_d += by_along * n, by_n += by_along * d;
     for (int k = 0; k < 4; ++k) put(rows + kWorkScalars * k, w[k] * by_d);
-    lag_bar[0] -= T(h * h * by_load), lag_bar[1] -= T(h * by_damping);
+    lag_bar[0] -= T(by_load), lag_bar[1] -= T(by_damping);
     add_to(lag_bar + 2, -by_n);
     for (int k = 0; k < 4; ++k) lag_bar[5 + k] -= T(by_w[k] + dot(by_d, since[k]));
   }
@@ -307,34 +341,19 @@ DIFFVBD_FN void motion_adjoint(const double* motion, double fraction, const Vect
   for (int i = 0; i < 2; ++i) put(out + 3 * i, parts[i]);
 }
 
-// f1(|u|) / |u| and its derivative over |u|, constant below the rounding of rest.
-DIFFVBD_FN FrictionRate<Dual<double>> friction_rate_of(const Vec3<Dual<double>>& u, double eps) {
-  const Dual<double> square = dot(u, u);
-  const double length = square_root(square.value);
-  const Dual<double> known = kRestingMotion * eps < length ? square_root(square) : Dual<double>(length);
-  return FrictionRate<Dual<double>>(known, Dual<double>(eps));
-}
-
-// P . g of friction on one plane of a floor after Q. lag: load [N], normal; travel: since the start of the step.
-template <class R>
-DIFFVBD_FN R friction_work(const R* lag, const Vec3<R>& travel, const Vector& P, const Vector& Q, double h2,
-                           double eps) {
-  const Vec3<R> n = {lag[1], lag[2], lag[3]}, p = {R(P.x), R(P.y), R(P.z)}, q = {R(Q.x), R(Q.y), R(Q.z)};
-  const Vec3<R> displacement = travel + q, u = displacement - dot(n, displacement) * n;
-  return R(h2) * lag[0] * friction_rate_of(u, eps).value * dot(p, u);
-}
-
-// Its derivatives: by travel, and by what is lagged [4].
+// Of friction on one plane of a floor, the derivatives of the work by the travel since the start of the step, and by
+// what is lagged [4]: load [N] and normal.
 DIFFVBD_FN Vector friction_adjoint(const double* lag, const Vector& travel, const Vector& P, const Vector& Q, double h2,
-                                   double eps, double* by_lag) {
+                                   double eps, bool linear, double* by_lag) {
+  const Vector n = vector_at(lag + 1);
   const auto derived = [&](int direction) {
-    Dual<double> turned[kFloorLag];
-    for (int i = 0; i < kFloorLag; ++i) turned[i] = {lag[i], double(i + 3 == direction)};
-    const Vec3<Dual<double>> displacement = {
-        {travel.x, double(direction == 0)}, {travel.y, double(direction == 1)}, {travel.z, double(direction == 2)}};
-    return friction_work(turned, displacement, P, Q, h2, eps).derivative;
+    return h2 * lag[0] *
+           friction_work(dual_of(n, direction - 3), dual_of(travel, direction), dual_of(P, -1), dual_of(Q, -1), eps,
+                         linear)
+               .derivative;
   };
-  for (int i = 0; i < kFloorLag; ++i) by_lag[i] = derived(3 + i);
+  by_lag[0] = h2 * friction_work(n, travel, P, Q, eps, linear);
+  for (int i = 0; i < 3; ++i) by_lag[1 + i] = derived(3 + i);
   return {derived(0), derived(1), derived(2)};
 }
 
@@ -344,6 +363,20 @@ struct VertexAdjoint {
   Vector arm;           // the part of x that goes by r
   double mass;
 };
+
+// Adds that of friction on planes. floor_lag: the adjoint of floor_lag at this vertex, which is added to, or null.
+template <class T>
+DIFFVBD_FN void add_friction_adjoint(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& travel,
+                                     const Vector& P, const Vector& Q, double h2, T* floor_lag, VertexAdjoint& out) {
+  for (int k = 0; k < in.planes; ++k) {
+    const T* given = contact::floor_lag(in, b, v, k);
+    double lag[kFloorLag], by_lag[kFloorLag];
+    for (int i = 0; i < kFloorLag; ++i) lag[i] = given[i];
+    const Vector by_travel = friction_adjoint(lag, travel, P, Q, h2, in.friction_eps, in.bends, by_lag);
+    out.x -= by_travel, out.x_prev += by_travel;
+    for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
+  }
+}
 
 // by_p, by_q: adjoints of P and Q by pairs. floor_lag: the adjoint of floor_lag at this vertex, which is added to, or
 // null.
@@ -362,14 +395,7 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
   b.energies(v, [&](auto energy, int, const double* data, int count) {
     vertex_energy_vjp<decltype(energy)>(s, data, count, P, Q, out.x, out.x_prev);
   });
-  for (int k = 0; k < in.planes; ++k) {
-    const T* given = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * kFloorLag;
-    double lag[kFloorLag], by_lag[kFloorLag];
-    for (int i = 0; i < kFloorLag; ++i) lag[i] = given[i];
-    const Vector by_travel = friction_adjoint(lag, x - s.x_prev, P, Q, h * h, in.friction_eps, by_lag);
-    out.x -= by_travel, out.x_prev += by_travel;
-    for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
-  }
+  add_friction_adjoint(in, b, v, x - s.x_prev, P, Q, h * h, floor_lag, out);
   const Vector turn_p = {p[0], p[1], p[2]}, turn_q = {q[0], q[1], q[2]};
   const double turns = dot(turn_p, turn_q);
   out.arm = -cross(g + H * Q + by_p, turn_p) - cross(H * P + by_q, turn_q) - (2 * kLeastInertia * turns * mass) * r;

@@ -17,7 +17,7 @@ from torch.utils.cpp_extension import CUDA_HOME, BuildExtension, CUDAExtension
 CXX_FLAGS = ["-O3", "-g0", "-fvisibility=hidden", "-Wno-psabi", "-Wno-ignored-attributes"]
 # The kernels see no torch header, so their C++ standard is ours to choose.
 # Compressed, because there is a kernel for each set of energies: a quarter of the bytes.
-NVCC_FLAGS = ["-O3", "-std=c++17", "--expt-relaxed-constexpr", "-Xcompiler", "-fvisibility=hidden"]
+NVCC_FLAGS = ["-O3", "-std=c++17", "--expt-relaxed-constexpr", "--extended-lambda", "-Xcompiler", "-fvisibility=hidden"]
 NVCC_FLAGS += ["-Xfatbin", "-compress-all"]
 
 # Sources that instantiate templates, one for each variant, so that they compile side by side.

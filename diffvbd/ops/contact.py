@@ -328,9 +328,14 @@ def rigid_reverse(fields: TouchingFields, made: Made, x_bar: Tensor, data_count:
     """Adjoint of corrections, from x_bar [B, V, 3] of the state after the last one: of the displacements, and of
     -p . (gradient + matrix q), where p moves points by the adjoint of a motion and q by the motion. fields: Of all
     corrections, but for x."""
-    x, x_prev, y, mass, shared, own, *rest = raw.contact_rigid_reverse(
-        *fields, *(list(each) for each in made), x_bar.contiguous(), data_count, time_step, friction_eps, wants_data
-    )
+    out = raw.contact_rigid_reverse(*fields, *(list(each) for each in made), x_bar.contiguous(), data_count, time_step,
+                                    friction_eps, wants_data)  # fmt: skip
+    return adjoints_of(out, data_count, wants_data)
+
+
+def adjoints_of(out: Sequence[Tensor], data_count: Sequence[int], wants_data: bool) -> RigidAdjoints:
+    """What an operator of a correction returns, with the adjoints of the data as one."""
+    x, x_prev, y, mass, shared, own, *rest = out
     data = join_data(shared, own, data_count) if wants_data else shared
     return RigidAdjoints(x, x_prev, y, mass, data, *rest)
 

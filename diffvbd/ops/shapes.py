@@ -208,6 +208,20 @@ def _contact_rigid_reverse(a: Any) -> Any:
     return *same(a.x, 3), *(new(a.x, *shape) for shape in shapes)
 
 
+def _contact_coarse_system(a: Any) -> Any:
+    b, functions = a.x.shape[0], a.function_ptr.shape[0] - 1
+    size = 3 * functions
+    return new(a.x, b, functions, 3, dtype=DOUBLE), new(a.x, b, size, size, dtype=DOUBLE)
+
+
+def _contact_coarse_reverse(a: Any) -> Any:
+    b, tets, wants = a.x.shape[0], a.tets.shape[0], a.wants
+    a.wants_data = wants[0]
+    shapes = ((b, tets if wants[1] else 0, 2), (b, tets if wants[2] else 0, REST_SCALARS),
+              (b, a.packed.shape[1] if wants[3] else 0))  # fmt: skip
+    return *_contact_rigid_reverse(a), *(new(a.x, *shape) for shape in shapes)
+
+
 TABLE: dict[str, Row] = {
     "pack_rest": lambda a: new(a.rest, a.rest.shape[0], a.sizes[2], REST_ROW[a.rest.device.type],
                                LANES[a.rest.device.type]),
@@ -249,6 +263,10 @@ TABLE: dict[str, Row] = {
     "contact_rigid_move": _contact_rigid_move,
     "contact_rigid_backward": _contact_rigid_backward,
     "contact_rigid_reverse": _contact_rigid_reverse,
+    "contact_coarse_system": _contact_coarse_system,
+    "contact_coarse_move": lambda a: (torch.empty_like(a.x), new(a.x, a.x.shape[0], a.free.shape[0], dtype=DOUBLE)),
+    "contact_coarse_restrict": lambda a: _contact_coarse_system(a)[0],
+    "contact_coarse_reverse": _contact_coarse_reverse,
 }  # fmt: skip
 
 

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import ops
 from .._common.constants import CONTACT
 from .._common.context import MorePairs, checking, in_segment, is_captured, not_compiled, recorders, replaced
 from .._contact import detection as search
@@ -36,16 +35,8 @@ from ..ops.fields import DISPLACEMENTS
 from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
-from .contact_corrections import (
-    Corrections,
-    Scenes,
-    Trials,
-    bodies_of,
-    corrected,
-    corrected_after,
-    is_blocked,
-    touching,
-)
+from .contact_coarse import Corrections
+from .contact_rigid import bodies_of, corrected, corrected_after, is_blocked, touching
 from .predict import Begun
 
 CLOSE = 1e-3  # of dhat: pairs with so much more gap do not push, however it is rounded
@@ -442,8 +433,8 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
         return SweptSubstep(*sweep(x, settings))
     corrections = None
     if of.coarse_matrix is not None:
-        judge = _trials(of, start, collider, listed)
-        corrections = Corrections(judge, of.fields, of.coarse_matrix, _scenes(of, start, collider, listed))
+        fields = touching(of, x, collider, start, listed)
+        corrections = Corrections(of.model, of.fields, fields, of.coarse_matrix, settings.numbers)
     numbers = settings.numbers
     within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     limits, lengths = [], []
@@ -463,18 +454,6 @@ def _cycles(model: System, sweeps: int) -> list[int]:
         return [sweeps]
     every, after = model.coarse.every, sweeps - 1
     return [1, *(min(every, after - begun) for begun in range(0, after, every))]
-
-
-def _scenes(of: ContactStep, start: SubstepStart, collider: Tensor, listed: Pairs) -> Scenes:
-    numbers = of.prepared.settings.numbers
-    fields = touching(of, of.x_prev, collider, start, listed)
-    return Scenes(of.model, fields, numbers.time_step, numbers.friction_eps)
-
-
-def _trials(of: ContactStep, start: SubstepStart, collider: Tensor, listed: Pairs) -> Trials:
-    s = _scenes(of, start, collider, listed)
-    s = replaced(s, fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
-    return Trials(s, of.increase_inputs)
 
 
 def of_going(substep: SweptSubstep, going: Tensor) -> SweptSubstep:

@@ -54,7 +54,7 @@ def test_gradients_of_shortened_and_refused_corrections(device: str) -> None:
     scene = replace(
         scene,
         model=scene.model.replace(energies=once),
-        v=scene.v + noise("violent", "batched", shape=scene.v.shape, size=25.0),
+        v=scene.v + noise("violent", "batched", shape=scene.v.shape, size=12.0),
     )
     lengths = check(scene, 2, 7, device)
     assert (lengths == 1).any() and ((lengths > 0) & (lengths < 1)).any() and (lengths == 0).any(), lengths

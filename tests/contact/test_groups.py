@@ -14,10 +14,9 @@ import diffvbd as dv
 from diffvbd import mesh, ops
 from diffvbd.ops import contact as contact_rigid
 from diffvbd.ops.fields import FEW, MOST_COUPLED
-from diffvbd.step.contact_corrections import Scenes
 from diffvbd.testing import relative_error, tolerance
 
-corrections = importlib.import_module("diffvbd.step.contact_corrections")
+corrections = importlib.import_module("diffvbd.step.contact_rigid")
 LOW, HALF_GAP, SPEED = -5e-4, 2.5e-4, 1e-3
 ENERGIES = (dv.StableNeoHookean(), dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3),
             dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5, SPEED))  # fmt: skip
@@ -54,8 +53,8 @@ def groups_of(model: dv.Model, monkeypatch: pytest.MonkeyPatch) -> Tensor:
     seen: list[Tensor] = []
 
     def correct(model: dv.Model, fields: ops.TouchingFields, *options: Any) -> Any:
-        s = Scenes(model, ops.TouchingFields(*(t.detach().contiguous() for t in fields)), *options[:2])
-        seen.append(contact_rigid.rigid_system(s.fields, s.model._data_count, *options[:2])[3])
+        detached = ops.TouchingFields(*(t.detach().contiguous() for t in fields))
+        seen.append(contact_rigid.rigid_system(detached, model._data_count, *options[:2])[3])
         return original(model, fields, *options)
 
     original = corrections.correct

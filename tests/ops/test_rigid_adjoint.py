@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.vertex_terms import Scenes, vertex_blocks, vertex_gradient
 from torch import Tensor
 
 import diffvbd as dv
@@ -17,11 +18,10 @@ from diffvbd.ops.autograd import in_shape
 from diffvbd.ops.fields import MOST_COUPLED
 from diffvbd.ops.sums import Order, of_segments, sum_segments
 from diffvbd.reference.rigid_contact import LEAST_INERTIA
-from diffvbd.step.contact_corrections import Scenes, vertex_blocks, vertex_gradient
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import noise
 
-rigid_contact = importlib.import_module("diffvbd.step.contact_corrections")
+rigid_contact = importlib.import_module("diffvbd.step.contact_rigid")
 ELASTIC = dv.StableNeoHookean()
 
 
@@ -158,7 +158,7 @@ def _work_of_pairs(s: Scenes, at_p: Tensor, at_q: Tensor, groups: Tensor) -> Ten
     )  # fmt: skip
     work = (found.by_x * points + found.by_p * at_p + found.by_q * at_q).sum()
     if len(found.by_kappa):
-        kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, s.listed)
+        kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, rigid_contact.listed_of(f))
         work = work + (kappa * found.by_kappa).sum()
     if len(found.since):
         before = torch.cat([f.x_prev, f.collider_prev], 1)
@@ -191,8 +191,8 @@ def test_compiled_adjoint_is_that_of_autograd(name: str, device: str, monkeypatc
     model, x, v = model.to(device), x.to(device), v.to(device)
     compiled, seen, longest = rigid_contact._adjoints, {}, []
 
-    def both(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> Any:
-        found = compiled(s, x_bar, made, needs)
+    def both(f: ops.TouchingFields, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool], *options: Any) -> Any:
+        found, s = compiled(f, x_bar, made, needs, *options), Scenes(options[0], f, options[1], options[2] or 1.0)
         names = [field for field, need in zip(ops.TouchingFields._fields, needs, strict=True) if need]
         bars = [in_shape(bar, t) for bar, t, need in zip(found, s.fields, needs, strict=True) if need]
         longest.append(len(made.x))

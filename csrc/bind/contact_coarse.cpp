@@ -1,0 +1,180 @@
+// Operators of the coarse correction of bodies that touch.
+#include "../subspace/contact_coarse.h"
+
+#include "touching.h"
+
+namespace diffvbd {
+namespace {
+
+// free: the bodies of the mesh that have a vertex to move.
+template <class T>
+contact::CoarseInputs<T> coarse_inputs(const TouchingFields& f, const SpaceFields& s, const TouchingSettings& q,
+                                       const T* move, const Tensor& none) {
+  contact::CoarseInputs<T> c{};
+  c.in = touching_inputs<T>(f, q, move, none);
+  c.in.bends = true;
+  const Reader<T> read(f.x);
+  const int64_t entries = s.function.numel(), functions = s.function_ptr.numel() - 1, tets = s.tets.size(0);
+  contact::CoarseSpace& space = c.space;
+  space.vertex_ptr = read.index("vertex_ptr", s.vertex_ptr, read.v + 1);
+  space.function = read.index("function", s.function, entries), space.entry = read.index("entry", s.entry, entries);
+  space.function_ptr = read.index("function_ptr", s.function_ptr, functions + 1);
+  space.vertex = read.index("vertex", s.vertex, entries), space.own = read.index("own", s.own, 4 * functions);
+  space.body_ptr = read.index("body_ptr", s.body_ptr, c.in.bodies() + 1);
+  space.body_function = read.index("body_function", s.body_function, functions);
+  space.functions = static_cast<int32_t>(functions);
+  c.weight = read.like("weight", s.weight, entries);
+  c.num_tets = tets;
+  if (tets == 0) return c;
+  c.tets = array<int64_t>("tets", s.tets, f.x, ScalarType::Long, 4 * tets);
+  c.star_ptr = array<int64_t>("star_ptr", s.star_ptr, f.x, ScalarType::Long, read.v + 1);
+  c.star = read.index("star", s.star, 4 * tets);
+  const auto material = material_of(s);
+  for (int m = 0; m < kMaterialScalars; ++m) c.material[m] = read.batch(kMaterialNames[m], *material[m], tets, 1);
+  c.rest = read.batch("rest", s.rest, kRestScalars * tets);
+  return c;
+}
+
+struct ListSizes {
+  int64_t listed, lagged;
+  explicit ListSizes(const TouchingFields& f)
+      : listed(f.pairs.size(0)), lagged(f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0) {}
+};
+
+// P' g [scenes, F, 3] and the matrices [scenes, 3F, 3F], float64. packed [1 | scenes, 9 cells]: those of all bodies
+// without vertex energies and pairs.
+DIFFVBD_OPERATOR(Out<2>, contact_coarse_system, DIFFVBD_PARAMETERS(TOUCHING) DIFFVBD_PARAMETERS(SPACE) In packed,
+                 Ints data_count, double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
+    const Reader<T> read(x);
+    const int64_t b = read.b, v = read.v, n = c.size();
+    const ListSizes sizes(f);
+    const int64_t rows = sizes.listed + sizes.lagged;
+    const Tensor acts = device.empty({rows}, ScalarType::Byte),
+                 forces = device.empty({rows, contact::kCornerDoubles}, ScalarType::Double),
+                 gradient = device.empty({b, v, 3}, ScalarType::Double),
+                 block = device.empty({b, v, 6}, ScalarType::Double);
+    const contact::SystemMemory memory{data<uint8_t>(acts),    data<contact::CornerForce>(forces),
+                                       data<double>(gradient), data<double>(block),
+                                       sizes.listed,           sizes.lagged};
+    const Tensor r = device.empty({b, n / 3, 3}, ScalarType::Double),
+                 matrix = device.empty({b, n, n}, ScalarType::Double);
+    const auto own = read.batch("packed", packed, packed.dim() == 2 ? packed.size(1) : 0);
+    DIFFVBD_RUN(device, contact_coarse_system<T>, c, own, memory, data<double>(r), data<double>(matrix));
+    return Out<2>(r, matrix);
+  });
+}
+
+// The state after the fraction of -P a that each island takes, and that fraction of each body [scenes, bodies],
+// float64. info [scenes] int32: not 0 where the matrix was not positive definite, and nothing moves.
+DIFFVBD_OPERATOR(Out<2>, contact_coarse_move, DIFFVBD_PARAMETERS(TOUCHING) DIFFVBD_PARAMETERS(SPACE) In a, In r,
+                 In info, Ints data_count, double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    const Tensor move = device.like_x();
+    const auto c =
+        coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move), device.empty({0}));
+    const Reader<T> read(x);
+    const int64_t b = read.b, v = read.v, n = c.in.bodies();
+    const ListSizes sizes(f);
+    const auto doubles = [&](Ints shape) { return device.empty(shape, ScalarType::Double); };
+    const auto bytes = [&](Ints shape) { return device.empty(shape, ScalarType::Byte); };
+    const Tensor displacement = doubles({b, v, 3}), coefficients = doubles({b, v, coarse::kDegree}),
+                 vertices = doubles({2, b, v}), pairs_memory = doubles({2, sizes.listed + sizes.lagged}),
+                 body_memory = doubles({b, n, coarse::kDegree + 1}), change = doubles({b, n, 2}),
+                 lead = device.empty({b, n}, ScalarType::Int), decided = bytes({b, n}), units = device.empty({2, b, n}),
+                 flags = bytes({2, b, n}), failed = bytes({b}),
+                 motions = device.empty({b, v, static_cast<int64_t>(sizeof(contact::Motion<T>) / sizeof(T))});
+    const Tensor end = device.like_x(), fraction = doubles({b, n});
+    const contact::TrialMemory<T> memory{data<double>(displacement),
+                                         data<double>(coefficients),
+                                         data<double>(vertices),
+                                         data<double>(vertices) + b * v,
+                                         data<double>(pairs_memory),
+                                         data<double>(pairs_memory) + sizes.listed + sizes.lagged,
+                                         data<double>(body_memory),
+                                         data<double>(change),
+                                         data<double>(fraction),
+                                         data<int32_t>(lead),
+                                         data<uint8_t>(decided),
+                                         {data<T>(units), data<T>(units) + b * n, data<uint8_t>(flags),
+                                          data<uint8_t>(flags) + b * n, data<uint8_t>(failed), false},
+                                         data<contact::Motion<T>>(motions),
+                                         data<T>(move),
+                                         sizes.listed,
+                                         sizes.lagged};
+    DIFFVBD_RUN(device, contact_coarse_move<T>, c, read.doubles("a", a, b * c.size()),
+                read.doubles("r", r, b * c.size()), read.index("info", info, b), memory, data<T>(end));
+    return Out<2>(end, fraction);
+  });
+}
+
+// P' of the adjoint of the displacement [scenes, F, 3], float64, from that of the state after it [scenes, V, 3].
+DIFFVBD_OPERATOR(Tensor, contact_coarse_restrict, DIFFVBD_PARAMETERS(TOUCHING) DIFFVBD_PARAMETERS(SPACE) In x_bar,
+                 In fraction, Ints data_count, double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
+    const Reader<T> read(x);
+    const Tensor out = device.empty({read.b, c.size() / 3, 3}, ScalarType::Double);
+    DIFFVBD_RUN(device, contact_coarse_restrict<T>, c, read.vectors("x_bar", x_bar),
+                read.doubles("fraction", fraction, read.b * c.in.bodies()), data<double>(out));
+    return out;
+  });
+}
+
+// The adjoints of contact_rigid_reverse in its order, then of the tets' material [scenes, tets, 2] and rest shape
+// [scenes, tets, 7], and of packed [scenes, 9 cells]; wants: data, material, rest, packed. l [scenes, F, 3]: the
+// solution for what contact_coarse_restrict returns.
+DIFFVBD_OPERATOR(Out<14>, contact_coarse_reverse, DIFFVBD_PARAMETERS(TOUCHING) DIFFVBD_PARAMETERS(SPACE) In packed,
+                 In a, In l, In fraction, In x_bar, Ints data_count, double time_step, double friction_eps,
+                 Flags wants) {
+  require(wants.size() == 4, "diffvbd::contact_coarse_reverse: expected 4 wishes");
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
+  const Device device(x);
+  return dispatch_float(x, [&]<class T>(T) {
+    auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
+    const Reader<T> read(x);
+    const int64_t b = read.b, v = read.v, corners = c.in.gate.corners, tets_listed = c.num_tets,
+                  cells = packed.dim() == 2 ? packed.size(1) / 9 : 0;
+    c.space.cells = static_cast<int32_t>(cells);
+    const WorkTensors pairs_out(f, device);
+    const Tensor p = device.empty({b, corners, 3}), q = device.empty({b, corners, 3});
+    const RigidBars bars(c.in.scene, true, wants[0], [&](Ints sizes, bool) { return device.zeros(sizes); });
+    const Tensor floor_out = device.zeros({c.in.planes > 0 ? b : 0, v, c.in.planes, contact::kFloorLag});
+    const Tensor collider_out = device.zeros({b, corners - v, 3}),
+                 collider_prev_out = device.zeros({b, corners - v, 3});
+    const Tensor material_out = device.empty({b, wants[1] ? tets_listed : 0, kMaterialScalars}),
+                 rest_out = device.empty({b, wants[2] ? tets_listed : 0, kRestScalars}),
+                 packed_out = device.empty({b, wants[3] ? 9 * cells : 0});
+    const contact::CoarseAdjoints<T> out{{bars.pointers<T>(nullptr, nullptr), data_or_null<T>(floor_out),
+                                          data<T>(collider_out), data<T>(collider_prev_out)},
+                                         data_or_null<T>(material_out),
+                                         data_or_null<T>(rest_out),
+                                         data_or_null<T>(packed_out)};
+    const auto work = pairs_out.view<T>();
+    const auto sums = pairs_out.sums<T>();
+    const double *own_a = read.doubles("a", a, b * c.size()), *own_l = read.doubles("l", l, b * c.size()),
+                 *own_fraction = read.doubles("fraction", fraction, b * c.in.bodies());
+    const contact::VirtualMotions<T> given{data<T>(p), data<T>(q)};
+    DIFFVBD_ON_CUDA(const Tensor pushing = device.empty({1 + f.pairs.size(0)}, ScalarType::Int);)
+    DIFFVBD_RUN(device, contact_coarse_motions<T>, c, own_a, own_l, own_fraction, data<T>(p), data<T>(q));
+    DIFFVBD_RUN(device, rigid_backward<T>, c.in, given, work, sums DIFFVBD_ON_CUDA(, data<int32_t>(pushing)));
+    DIFFVBD_RUN(device, contact_coarse_reverse<T>, c, own_a, own_l, own_fraction, read.vectors("x_bar", x_bar), given,
+                sums, out);
+    return Out<14>(bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_out, collider_out,
+                   collider_prev_out, pairs_out.by_kappa, pairs_out.lag_bar, material_out, rest_out, packed_out);
+  });
+}
+
+}  // namespace
+}  // namespace diffvbd
