@@ -1,6 +1,7 @@
 // Operators of the coarse correction of bodies that touch.
 #include "../subspace/contact_coarse.h"
 
+#include "../core/parts.h"
 #include "touching.h"
 
 namespace diffvbd {
@@ -35,11 +36,18 @@ contact::CoarseInputs<T> coarse_inputs(const TouchingFields& f, const SpaceField
   return c;
 }
 
-struct ListSizes {
-  int64_t listed, lagged;
-  explicit ListSizes(const TouchingFields& f)
-      : listed(f.pairs.size(0)), lagged(f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0) {}
-};
+// Memory for what parts(take) takes; lives as long as the result.
+template <class F>
+Tensor workspace(const Device& device, const F& parts) {
+  Parts<> sizes(nullptr);
+  parts(sizes);
+  const Tensor out = device.empty({static_cast<int64_t>(sizes.bytes)}, ScalarType::Byte);
+  Parts<> places(out.data_ptr());
+  parts(places);
+  return out;
+}
+
+int64_t lagged_pairs(const TouchingFields& f) { return f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0; }
 
 // P' g [scenes, F, 3] and the matrices [scenes, 3F, 3F], float64. packed [1 | scenes, 9 cells]: those of all bodies
 // without vertex energies and pairs.
@@ -52,15 +60,8 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_system, DIFFVBD_PARAMETERS(TOUCHING) DIF
     const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, n = c.size();
-    const ListSizes sizes(f);
-    const int64_t rows = sizes.listed + sizes.lagged;
-    const Tensor acts = device.empty({rows}, ScalarType::Byte),
-                 forces = device.empty({rows, contact::kCornerDoubles}, ScalarType::Double),
-                 gradient = device.empty({b, v, 3}, ScalarType::Double),
-                 block = device.empty({b, v, 6}, ScalarType::Double);
-    const contact::SystemMemory memory{data<uint8_t>(acts),    data<contact::CornerForce>(forces),
-                                       data<double>(gradient), data<double>(block),
-                                       sizes.listed,           sizes.lagged};
+    contact::SystemMemory memory{f.pairs.size(0), lagged_pairs(f)};
+    const Tensor work = workspace(device, [&](auto& take) { memory.parts(take, b * v); });
     const Tensor r = device.empty({b, n / 3, 3}, ScalarType::Double),
                  matrix = device.empty({b, n, n}, ScalarType::Double);
     const auto own = read.batch("packed", packed, packed.dim() == 2 ? packed.size(1) : 0);
@@ -82,33 +83,9 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_move, DIFFVBD_PARAMETERS(TOUCHING) DIFFV
         coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move), device.empty({0}));
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, n = c.in.bodies();
-    const ListSizes sizes(f);
-    const auto doubles = [&](Ints shape) { return device.empty(shape, ScalarType::Double); };
-    const auto bytes = [&](Ints shape) { return device.empty(shape, ScalarType::Byte); };
-    const Tensor displacement = doubles({b, v, 3}), coefficients = doubles({b, v, coarse::kDegree}),
-                 vertices = doubles({2, b, v}), pairs_memory = doubles({2, sizes.listed + sizes.lagged}),
-                 body_memory = doubles({b, n, coarse::kDegree + 1}), change = doubles({b, n, 2}),
-                 lead = device.empty({b, n}, ScalarType::Int), decided = bytes({b, n}), units = device.empty({2, b, n}),
-                 flags = bytes({2, b, n}), failed = bytes({b}),
-                 motions = device.empty({b, v, static_cast<int64_t>(sizeof(contact::Motion<T>) / sizeof(T))});
-    const Tensor end = device.like_x(), fraction = doubles({b, n});
-    const contact::TrialMemory<T> memory{data<double>(displacement),
-                                         data<double>(coefficients),
-                                         data<double>(vertices),
-                                         data<double>(vertices) + b * v,
-                                         data<double>(pairs_memory),
-                                         data<double>(pairs_memory) + sizes.listed + sizes.lagged,
-                                         data<double>(body_memory),
-                                         data<double>(change),
-                                         data<double>(fraction),
-                                         data<int32_t>(lead),
-                                         data<uint8_t>(decided),
-                                         {data<T>(units), data<T>(units) + b * n, data<uint8_t>(flags),
-                                          data<uint8_t>(flags) + b * n, data<uint8_t>(failed), false},
-                                         data<contact::Motion<T>>(motions),
-                                         data<T>(move),
-                                         sizes.listed,
-                                         sizes.lagged};
+    const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double);
+    contact::TrialMemory<T> memory{f.pairs.size(0), lagged_pairs(f), data<T>(move), data<double>(fraction)};
+    const Tensor work = workspace(device, [&](auto& take) { memory.parts(take, b, b * v, b * n); });
     DIFFVBD_RUN(device, contact_coarse_move<T>, c, read.doubles("a", a, b * c.size()),
                 read.doubles("r", r, b * c.size()), read.index("info", info, b), memory, data<T>(end));
     return Out<2>(end, fraction);

@@ -5,6 +5,8 @@
 
 #include <cstdint>
 
+#include "../core/parts.h"
+
 namespace diffvbd::cuda {
 
 inline unsigned blocks_for(int64_t items, int threads) {
@@ -16,19 +18,6 @@ __device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(bloc
 __device__ __forceinline__ int64_t own_item(int threads) {
   return static_cast<int64_t>(blockIdx.x) * threads + threadIdx.x;
 }
-
-// Hands out the parts of a workspace; without memory it counts their bytes.
-template <size_t alignment = 256>
-struct Parts {
-  unsigned char* memory;
-  size_t bytes = 0;
-  explicit Parts(void* workspace) : memory(static_cast<unsigned char*>(workspace)) {}
-  template <class U>
-  void operator()(U*& pointer, int64_t items) {
-    pointer = reinterpret_cast<U*>(memory + bytes);
-    bytes += (items * sizeof(U) + alignment - 1) / alignment * alignment;
-  }
-};
 
 }  // namespace diffvbd::cuda
 

@@ -1,4 +1,4 @@
-// The coarse correction of bodies that touch (docs/method.md, section 18): one Newton step of the incremental potential
+// The coarse correction of bodies that touch (docs/method.md, section 16): one Newton step of the incremental potential
 // in the coarse functions of all bodies of a scene together, and its transpose. With P the functions at the vertices
 // and A the matrix without vertex energies and pairs (coarse_matrix.h),
 //
@@ -96,10 +96,19 @@ static_assert(sizeof(CornerForce) == kCornerDoubles * sizeof(double));
 
 // Rows of listed pairs, and then of lagged ones. forces are written where `acts`.
 struct SystemMemory {
+  int64_t listed, lagged;
   uint8_t* acts;             // [rows]
   CornerForce* forces;       // [rows]
   double *gradient, *block;  // [B, V, 3], [B, V, 6]  the blocks without inertia
-  int64_t listed, lagged;
+  int32_t *acting, *count;   // [4 rows], [B, V, 2]  entries of a vertex that act, where those of the lists begin
+
+  // take(pointer, items), for so many vertices of all scenes
+  template <class Take>
+  void parts(Take& take, int64_t vertices) {
+    const int64_t rows = listed + lagged;
+    take(forces, rows), take(gradient, 3 * vertices), take(block, 6 * vertices);
+    take(acting, 4 * rows), take(count, 2 * vertices), take(acts, rows);
+  }
 };
 
 template <class T>
@@ -130,18 +139,35 @@ DIFFVBD_FN bool force_of_lagged(const RigidInputs<T>& in, int64_t pair, CornerFo
   return true;
 }
 
-// Calls f(row, corner) for the pairs of a corner point that act.
+// Finds the entries of a vertex that act, and calls f(row, corner) for each.
+template <class T, class F>
+DIFFVBD_FN void find_acting(const RigidInputs<T>& in, const SystemMemory& m, int64_t scene, int64_t v, const F& f) {
+  for (int list = 0; list < 2; ++list) {
+    int32_t& found = m.count[2 * (scene * in.gate.vertices + v) + list];
+    found = 0;
+    if ((list == 0 ? m.listed : m.lagged) == 0) continue;
+    const PairList& pairs = list == 0 ? in.gate.listed : in.lagged;
+    const int64_t corner = scene * in.gate.corners + v, first = list == 0 ? 0 : m.listed;
+    for (int32_t e = pairs.ptr[corner]; e < pairs.ptr[corner + 1]; ++e) {
+      const int32_t entry = pairs.entry[e];
+      if (!m.acts[first + (entry >> 2)]) continue;
+      m.acting[4 * first + pairs.ptr[corner] + found++] = entry;
+      f(first + (entry >> 2), entry & 3);
+    }
+  }
+}
+// Calls f(force, corner, record) for those that were found.
 template <class T, class F>
 DIFFVBD_FN void each_acting(const RigidInputs<T>& in, const SystemMemory& m, int64_t scene, int64_t v, const F& f) {
-  const auto all = [&](const PairList& list, int64_t first) {
-    const PairList::Entries own = list.of(scene * in.gate.corners + v);
-    for (int e = 0; e < own.count; ++e) {
-      const int64_t row = first + (own.first[e] >> 2);
-      if (m.acts[row]) f(row, own.first[e] & 3, list.pairs + kPairRow * int64_t{own.first[e] >> 2});
+  for (int list = 0; list < 2; ++list) {
+    const PairList& pairs = list == 0 ? in.gate.listed : in.lagged;
+    const int32_t count = m.count[2 * (scene * in.gate.vertices + v) + list];
+    const int64_t first = list == 0 ? 0 : m.listed;
+    for (int32_t i = 0; i < count; ++i) {
+      const int32_t entry = m.acting[4 * first + pairs.ptr[scene * in.gate.corners + v] + i], pair = entry >> 2;
+      f(m.forces[first + pair], entry & 3, pairs.pairs + kPairRow * int64_t{pair});
     }
-  };
-  if (m.listed > 0) all(in.gate.listed, 0);
-  if (m.lagged > 0) all(in.lagged, m.listed);
+  }
 }
 
 // Energies of a vertex and its friction on planes: gradient and block, which are added to.
@@ -183,9 +209,8 @@ void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const
         Vector g = b.mass(v) * (b.position(v) - b.target(v)) + c.h2() * elastic_gradient(c, b, v);
         Sym3<double> H{};
         if (!c.in.gate.pinned[v]) add_vertex_energies(c, b, v, g, H);
-        each_acting(c.in, m, scene, v, [&](int64_t row, int k, const int32_t*) {
-          g += m.forces[row].w[k] * m.forces[row].force + m.forces[row].pull[k];
-        });
+        find_acting(c.in, m, scene, v,
+                    [&](int64_t row, int k) { g += m.forces[row].w[k] * m.forces[row].force + m.forces[row].pull[k]; });
         put(m.gradient + 3 * item, c.in.gate.pinned[v] ? Vector{} : g);
         const double entries[] = {H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
         for (int i = 0; i < 6; ++i) m.block[6 * item + i] = entries[i];
@@ -226,8 +251,7 @@ void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const
           const double* b = m.block + 6 * at;
           const Sym3<double> H{b[0], b[1], b[2], b[3], b[4], b[5]};
           if (b[0] != 0 || b[3] != 0 || b[5] != 0) add(v, weight, H);
-          each_acting(c.in, m, scene, v, [&](int64_t row, int k, const int32_t* record) {
-            const CornerForce& a = m.forces[row];
+          each_acting(c.in, m, scene, v, [&](const CornerForce& a, int k, const int32_t* record) {
             for (int j = 0; a.w[k] != 0 && j < 4; ++j) {
               if (record[j] < V) add(record[j], weight * a.w[k] * a.w[j], a.stiffness);
             }
@@ -242,17 +266,27 @@ void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const
 // Memory of the trials: of vertices, of bodies and of pairs.
 template <class T>
 struct TrialMemory {
+  int64_t listed, lagged;
+  T* move;                              // [B, V, 3], that of the inputs
+  double* fraction;                     // [B, bodies]
   double *displacement, *coefficients;  // [B, V, 3], [B, V, kDegree]  -P a; of the change of tets and inertia
   double *own, *size;                   // [B, V]  change of the energies of a vertex, and the sizes of their terms
   double *before, *after;               // [rows]  potentials of pairs
   double *body, *change;                // [B, bodies, kDegree + 1], [B, bodies, 2]  summed; the last one is the slope
-  double* fraction;                     // [B, bodies]
   int32_t* lead;                        // [B, bodies]  the first body of the island of each
   uint8_t* decided;                     // [B, bodies]
   AdvanceState<T> state;
   Motion<T>* motions;  // [B, V], that of `state`
-  T* move;             // [B, V, 3], that of the inputs
-  int64_t listed, lagged;
+
+  // take(pointer, items), for so many scenes, and vertices and bodies of all of them
+  template <class Take>
+  void parts(Take& take, int64_t scenes, int64_t vertices, int64_t units) {
+    take(displacement, 3 * vertices), take(coefficients, coarse::kDegree * vertices);
+    take(own, vertices), take(size, vertices), take(before, listed + lagged), take(after, listed + lagged);
+    take(body, (coarse::kDegree + 1) * units), take(change, 2 * units), take(motions, vertices), take(lead, units);
+    take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
+    take(state.failed, scenes), take(decided, units);
+  }
 };
 
 // The sides of a listed pair that may act within the trust regions, or of an active lagged one, are of one island.

@@ -1,4 +1,4 @@
-"""The coarse correction of bodies that touch (docs/method.md, section 18): one Newton step of the incremental potential
+"""The coarse correction of bodies that touch (docs/method.md, section 16): one Newton step of the incremental potential
 in the coarse functions of all bodies of a scene, with their pairs, friction and vertex energies."""
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def corrected_after(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, l
     """State after the corrections that follow the sweeps of a substep. last: Whether these are the last sweeps."""
     # coarse sweeps leave a stiff body rotated; after one Newton step a free body still gained spin
     least = 1 if of.prepared.coarse is None else 2
-    bodies = of.model.mesh.num_bodies
+    bodies = len(bodies_of(of.model)[2])
     grouped, captured = bodies <= most_grouped(bodies), is_captured(x)
 
     def more(count: int, end: Moved, groups: Tensor) -> Which | None:
