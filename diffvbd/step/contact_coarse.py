@@ -13,7 +13,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.contact import sum_of_scenes
 from ..model.system import System
-from ..ops import contact as raw
+from ..ops.contact import adjoints_of
 from ..ops.sums import one_thread
 from .contact_rigid import bodies_of, listed_of
 
@@ -39,7 +39,7 @@ class CoarseIndex(NamedTuple):
 class _Space(NamedTuple):
     """What the operators read of a Model."""
 
-    index: CoarseIndex
+    functions: CoarseIndex
     bodies: tuple[Tensor, ...]  # order to body of ops.TouchingFields; free: bodies with a vertex that moves
     of_matrix: Tensor  # int64, the body of each matrix
 
@@ -87,7 +87,7 @@ class Corrections:
         self.touching = [t.contiguous() for t in (*touching[:at], *self.space.bodies, *touching[at + 5 :])]
         rest = model.rest_scalars if fields.rest is None else fields.rest
         self.rest = [t.contiguous() for t in (fields.mu, fields.lam, rest, packed)]
-        self.constants = (self.space.index, (model._data_count, numbers.time_step, numbers.friction_eps))
+        self.constants = (self.space.functions, (model._data_count, numbers.time_step, numbers.friction_eps))
 
     def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """x [B, V, 3] after a correction, and its length for each matrix [B, matrices]."""
@@ -109,11 +109,11 @@ def _solved(factor: Tensor, right: Tensor) -> Tensor:
 def _run(*args: Any) -> tuple[Tensor, ...]:
     fields, (*shape, packed), (index, options) = args[:_FIELDS], args[_FIELDS:_INPUTS], args[_INPUTS:]
     given = (*fields, *index, *shape)
-    r, matrix = raw.raw.contact_coarse_system(*given, packed, *options)
+    r, matrix = ops.direct.contact_coarse_system(*given, packed, *options)
     with one_thread(matrix):
         factor, info = torch.linalg.cholesky_ex(matrix)
     a = _solved(factor, r)
-    x, fraction = raw.raw.contact_coarse_move(*given, a, r, info, *options)
+    x, fraction = ops.direct.contact_coarse_move(*given, a, r, info, *options)
     return x, fraction, a, factor
 
 
@@ -121,12 +121,12 @@ def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequ
     fields, (*shape, packed), (fraction, a, factor) = saved[:_FIELDS], saved[_FIELDS:_INPUTS], saved[_INPUTS:]
     index, options = rest
     given, f = (*fields, *index, *shape), ops.TouchingFields(*fields)
-    l = _solved(factor, raw.raw.contact_coarse_restrict(*given, bars[0], fraction, *options))  # noqa: E741
+    l = _solved(factor, ops.direct.contact_coarse_restrict(*given, bars[0], fraction, *options))  # noqa: E741
     data, (mu, lam, of_rest, of_packed) = needs[f._fields.index("energy_data")], needs[_FIELDS:]
     wants = [data, mu or lam, of_rest, of_packed]
-    *own, material, rest_bar, packed_bar = raw.raw.contact_coarse_reverse(*given, packed, a, l, fraction, bars[0],
+    *own, material, rest_bar, packed_bar = ops.direct.contact_coarse_reverse(*given, packed, a, l, fraction, bars[0],
                                                                          *options, wants)  # fmt: skip
-    touching = raw.adjoints_of(own, options[0], data)._asdict()
+    touching = adjoints_of(own, options[0], data)._asdict()
     by_kappa = touching.pop("by_kappa")
     touching["kappa"] = -sum_of_scenes(by_kappa, listed_of(f), len(f.x))
     return [*(touching.get(name) for name in f._fields), *material.unbind(-1), rest_bar, packed_bar]
