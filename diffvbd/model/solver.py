@@ -27,7 +27,7 @@ class SDIRK2:
     implicit Euler does. :class:`BDF2` keeps its order there.
 
     A body that may touch a floor, a collider, another body or itself takes implicit Euler for a step that does not
-    resolve the barrier, and wherever there is friction or damping of contact.
+    resolve the barrier, and wherever there is damping of contact. Friction is of first order.
 
     Source: Alexander (1977); docs/method.md, section 19.
     """

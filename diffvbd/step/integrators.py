@@ -183,9 +183,10 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
     midway = _at_fraction(given, x, GAMMA)
     x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), midway)
     feasible, carried, before = x1, math.sqrt(2) * v1, midway["colliders"]
-    if euler is not None and model.contact is not None:
-        # x1 keeps bodies apart that all are there; beside one that is still at x, which others may meet, all begin at x
-        mixed = euler.any(-1)[..., None, None]
+    if euler is not None and (model.contact is not None or model.friction is not None):
+        # x1 keeps bodies apart that all are there; beside one that is still at x, which others may meet, all begin at
+        # x, and so they do with friction, which is measured from there
+        mixed = euler.any(-1)[..., None, None] | (model.friction is not None)
         feasible = torch.where(mixed, x, x1)
         carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
         if isinstance(given["colliders_before"], Tensor):
@@ -293,11 +294,11 @@ def may_touch(model: System, begun: Begun, prepared: Prepared, where: tuple[Tens
 
 
 def _extrapolates(model: System, prepared: Prepared) -> bool:
-    """Whether contact has forces of gaps alone: those of velocities are measured from the start of a solve."""
+    """Whether contact is not damped: that takes its velocities from the start and the time of a solve."""
     damped = (
         input_name(e, "damping") in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e
     )
-    return model.friction is None and not any(damped)
+    return not any(damped)
 
 
 def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, displacement: Tensor, mass: Tensor, h: float) -> Tensor:
