@@ -265,14 +265,13 @@ PARTS = ("start", "first rigid correction", "sweeps", "coarse correction", "corr
 
 def friction_energy(of: Any, x: Tensor) -> float:
     """Potential of lagged friction and damping in a step of diffvbd.step.contact, times h^2. x: [B, V, 3] [m]."""
-    from diffvbd.adjoint.contact import at_corners
-
     numbers, total = of.prepared.settings.numbers, 0.0
     h, reach = numbers.time_step, numbers.friction_eps
     if len(of.lagged.pairs):
         load, rate, n, w = of.lag.split((1, 1, 3, 4), -1)
         moved = torch.cat([x - of.x_prev, torch.zeros_like(of.before)], 1)  # colliders rest
-        moved = (w[..., None] * at_corners(moved, of.lagged)).sum(1)
+        rows = of.lagged.pairs.long()
+        moved = (w[..., None] * moved[rows[:, 5:], rows[:, :4]]).sum(1)
         along = (n * moved).sum(-1, keepdim=True)
         total += float((h * h * load[:, 0] * smoothed((moved - along * n).T, reach)[0]).sum())
         total += float((0.5 * h * rate * along.clamp(max=0) ** 2).sum())

@@ -47,13 +47,10 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"corrected", rigid::kCorrected},
       {"tile", coarse::kTile},        // unknowns of a body beyond which it counts as large
       {"no_move", contact::kNoMove},  // exponent of a limit of 0
-      {"fractions", kFractions},      // of a motion: 1, 1/2, ..., 1/128
       {"workspace_budget", kWorkspaceBudget},
       {"roundings", static_cast<int64_t>(kRounding)},  // ulps of the terms by which a potential may rise
   };
   for (const auto& [name, value] : numbers) add("int", name, std::to_string(value));
-  add("float", "decrease", std::to_string(coarse::kDecrease));              // fraction of the decrease to first order
-  add("float", "resting_motion", std::to_string(contact::kRestingMotion));  // of that below which friction is smoothed
   add("bool", "tet_reads_x_prev", TetLayout::reads_x_prev ? "True" : "False");
   add("str", "sweep_adjoints", "\"" DIFFVBD_SWEEP_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");
   add("str", "step_adjoints", "\"" DIFFVBD_STEP_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");

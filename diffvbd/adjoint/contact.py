@@ -53,32 +53,8 @@ def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
     return Pairs(*kept), rows
 
 
-def _gather_corners(points: Tensor, listed: Pairs) -> Tensor:
-    rows = listed.pairs.clamp(min=0).long()
-    return points[rows[:, 5:], rows[:, :4]]
-
-
-def _add_corners(values: Tensor, listed: Pairs, scenes: int, points: int) -> Tensor:
-    rows = values.flatten(0, 1)[None].contiguous()
-    return segment_sum(rows, listed.entry, listed.ptr).reshape(scenes, points, values.shape[-1])
-
-
-_at_corners = ops.Linear(_gather_corners, lambda bar, shape, listed: sum_at_corners(bar, listed, *shape[:2]), 2)
-_sum_at_corners = ops.Linear(_add_corners, lambda bar, _, listed, scenes, points: at_corners(bar, listed), 4)
 _of_scene = ops.Linear(lambda value, listed: value[listed.pairs[:, 5].clamp(min=0).to(torch.int64)],
                        lambda bar, shape, listed: sum_of_scenes(bar, listed, shape[0]), 2)  # fmt: skip
-
-
-def at_corners(points: Tensor, listed: Pairs) -> Tensor:
-    """points [B, N, n] of all corner points at those of each pair [pairs, 4, n]; those of a row that no pair fills are
-    any, and pass no gradient on."""
-    return _at_corners(points, listed)
-
-
-def sum_at_corners(values: Tensor, listed: Pairs, scenes: int, points: int) -> Tensor:
-    """Sums of values at the corners of pairs [pairs, 4, n] over the pairs of each corner point, [B, N, n] of so many
-    scenes and corner points."""
-    return _sum_at_corners(values, listed, scenes, points)
 
 
 def sum_of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:

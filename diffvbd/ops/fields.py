@@ -26,10 +26,9 @@ UNKNOWNS, FEW, MOST_COUPLED, GROUP_MEMORY = (
 )  # of bodies that touch
 STARTS = {"inertia": _C["start_inertia"], "predictor": _C["start_predictor"], "auto": _C["start_lower"]}
 START_LOWER = STARTS["auto"]
-CORRECTED, TILE, NO_MOVE, FRACTIONS, WORKSPACE_BUDGET, ROUNDINGS, DECREASE, RESTING_MOTION = (
-    _C[name] for name in ("corrected", "tile", "no_move", "fractions", "workspace_budget", "roundings", "decrease",
-                          "resting_motion")
-)  # fmt: skip
+CORRECTED, TILE, NO_MOVE, WORKSPACE_BUDGET, ROUNDINGS = (
+    _C[name] for name in ("corrected", "tile", "no_move", "workspace_budget", "roundings")
+)
 # What a reverse differentiates, in the order of what it returns.
 SWEEP_ADJOINTS, STEP_ADJOINTS, TOUCHING_ADJOINTS = (
     tuple(_C[name].split()) for name in ("sweep_adjoints", "step_adjoints", "touching_adjoints")

@@ -12,8 +12,6 @@ from torch import Tensor
 from .autograd import Linear, direct, sum_to
 from .load import raw
 
-Order = tuple[Tensor, Tensor, Tensor]  # of rows by segment: order, ptr (int32) and the segment of each row
-
 
 @contextlib.contextmanager
 def one_thread(like: Tensor) -> Iterator[None]:
@@ -83,36 +81,12 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
     return direct.segment_sum(values, order, ptr)
 
 
-def _add_by(values: Tensor, index: Tensor, count: int) -> Tensor:
-    if not values.is_cuda:  # there they are added one after another
-        return values.new_zeros((count, values.shape[1])).index_add_(0, index, values)
+def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """Rows of ``values`` [n, ...] added up by ``index`` [n], [count, ...]. Not differentiable."""
+    out = values.new_zeros((count, *values.shape[1:]))
+    if not values.is_cuda or values.numel() == 0:  # on the CPU they are added one after another
+        return out.index_add_(0, index, values)
     ordered, order = torch.sort(index, stable=True)
     ptr = torch.searchsorted(ordered, torch.arange(count + 1, device=index.device))
-    return segment_sum(values.contiguous()[None], order.to(torch.int32), ptr.to(torch.int32))[0]
-
-
-_sum_by = Linear(_add_by, lambda bar, _, index, count: bar[index], 3)
-
-
-def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Rows of ``values`` [n, ...] added up by ``index`` [n], [count, ...]; differentiable in the values."""
-    if values.numel() == 0 or count == 0:
-        return values.new_zeros((count, *values.shape[1:]))
-    return _sum_by(values.reshape(values.shape[0], -1), index, count).reshape(count, *values.shape[1:])
-
-
-_sum_segments = Linear(lambda values, order, ptr, index: segment_sum(values.contiguous(), order, ptr),
-                       lambda bar, _, order, ptr, index: bar[:, index], 4)  # fmt: skip
-_of_segments = Linear(lambda values, order, ptr, index: values.index_select(1, index),
-                      lambda bar, _, order, ptr, index: sum_segments(bar, order, ptr, index), 4)  # fmt: skip
-
-
-def sum_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
-    """Sums of rows of ``values`` [B, V, n] by ``index`` [V], whose order is known: order, ptr int32. Differentiable in
-    the values; [B, segments, n]."""
-    return _sum_segments(values, order, ptr, index)
-
-
-def of_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
-    """``values`` [B, segments, n] of the segment of each row, [B, V, n]; arguments and order of sums as above."""
-    return _of_segments(values, order, ptr, index)
+    rows = values.reshape(1, len(values), -1).contiguous()
+    return segment_sum(rows, order.to(torch.int32), ptr.to(torch.int32))[0].reshape(out.shape)

@@ -9,7 +9,7 @@ from torch import Tensor
 from diffvbd import ops
 from diffvbd.adjoint.potential import of_vertices
 from diffvbd.ops import broadcast
-from diffvbd.ops.fields import RESTING_MOTION
+from diffvbd.reference.energies import RESTING
 
 
 class Scenes(NamedTuple):
@@ -28,7 +28,7 @@ def outer(n: Tensor) -> Tensor:
 def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
     """f1(|u|) / |u| of friction and the derivative of this quotient over |u|, of tangential motions u [..., 3]."""
     square = (u * u).sum(-1)
-    moves = square > (RESTING_MOTION * eps) ** 2
+    moves = square > (RESTING * eps) ** 2
     length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
     sticks = length < eps
     rate = torch.where(sticks, (2 - length / eps) / eps, 1 / torch.where(sticks, torch.ones_like(length), length))

@@ -16,7 +16,6 @@ from diffvbd.ops import broadcast
 from diffvbd.ops import contact as ops_rigid
 from diffvbd.ops.autograd import in_shape
 from diffvbd.ops.fields import MOST_COUPLED
-from diffvbd.ops.sums import Order, of_segments, sum_segments
 from diffvbd.reference.rigid_contact import LEAST_INERTIA
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import noise
@@ -83,7 +82,7 @@ def by_autograd(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor:
     body = f.body[: f.x.shape[1]].long()
     leaf = motion.to(f.x.dtype).requires_grad_()
     arm, whole = _arms(f, body)
-    end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, (f.order, f.ptr, body))
+    end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, body)
     wanted = [t for t, need in zip(f, needs, strict=True) if need]
     *first, bar = torch.autograd.grad(end, (*wanted, leaf), x_bar, allow_unused=True, retain_graph=True)
     solution = solved(factor, groups, bar.to(factor.dtype))
@@ -102,15 +101,20 @@ def _sum(parts: tuple[Tensor | None, ...], like: Tensor) -> Tensor:
     return out.detach()
 
 
+def _of_bodies(values: Tensor, f: ops.TouchingFields, body: Tensor) -> Tensor:
+    """Sums over the vertices of each body [B, bodies, n]."""
+    return values.new_zeros(len(values), len(f.free), values.shape[-1]).index_add(1, body, values)
+
+
 def _arms(f: ops.TouchingFields, body: Tensor) -> tuple[Tensor, Tensor]:
     """Where vertices are from the centers of mass of their bodies [B, V, 3], and the masses of these [B, bodies]."""
     mass = broadcast(f.mass, f.x.shape[:2])[..., None]
-    sums = sum_segments(torch.cat([mass, mass * f.x], -1), f.order, f.ptr, body)
+    sums = _of_bodies(torch.cat([mass, mass * f.x], -1), f, body)
     whole = sums[..., :1].clamp(min=torch.finfo(f.x.dtype).tiny)
-    return f.x - of_segments(sums[..., 1:] / whole, f.order, f.ptr, body), sums[..., 0]
+    return f.x - (sums[..., 1:] / whole)[:, body], sums[..., 0]
 
 
-def _displaced(motion: Tensor, arm: Tensor, of: Order) -> Tensor:
+def _displaced(motion: Tensor, arm: Tensor, body: Tensor) -> Tensor:
     """What a turn and a shift of each body [B, bodies, 6] do to its vertices, exactly, [B, V, 3]."""
     w, shift = motion.split(3, -1)
     square = (w * w).sum(-1, keepdim=True)
@@ -119,7 +123,7 @@ def _displaced(motion: Tensor, arm: Tensor, of: Order) -> Tensor:
     angle = safe.sqrt()
     first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
     second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
-    w, first, second, shift = of_segments(torch.cat([w, first, second, shift], -1), *of).split((3, 1, 1, 3), -1)
+    w, first, second, shift = torch.cat([w, first, second, shift], -1)[:, body].split((3, 1, 1, 3), -1)
     turned = torch.linalg.cross(w, arm)
     return first * turned + second * torch.linalg.cross(w, turned) + shift
 
@@ -142,7 +146,7 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     own, blocks = vertex_gradient(bare) + rubbed + mass * at_q, vertex_blocks(bare)
     if blocks is not None:
         own = own + (blocks * at_q[..., None, :]).sum(-1)
-    spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)
+    spread = _of_bodies(mass * arm.square().sum(-1, keepdim=True), f, body)
     least = (p * q)[..., :3].mul(spread).sum()
     work = (at_p * own).sum() + LEAST_INERTIA * least
     return work + _work_of_pairs(s, at_p, at_q, groups)
