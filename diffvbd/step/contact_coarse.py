@@ -102,7 +102,7 @@ _INPUTS = _FIELDS + 4  # and mu, lam, rest, packed
 def _solved(factor: Tensor, right: Tensor) -> Tensor:
     """(L L')^-1 b [B, F, 3]."""
     with one_thread(factor):
-        half = torch.linalg.solve_triangular(factor, right.reshape(len(right), -1, 1), upper=False)
+        half = torch.linalg.solve_triangular(factor, right.flatten(1)[..., None], upper=False)
         return torch.linalg.solve_triangular(factor.mT, half, upper=True).reshape(right.shape)
 
 

@@ -135,6 +135,15 @@ def test_scenes_of_a_batch_do_not_mix(device: str) -> None:
         assert relative_error(grad[k], own[k]) <= tolerance("contact_adjoint")
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_batch_of_no_scenes(device: str) -> None:
+    model, given = stack()
+    model = model.to(device)
+    x = model.rest_points.expand(0, -1, -1).clone().requires_grad_()
+    end = dv.step(model, x, torch.zeros_like(x), dv.VBD(TIME_STEP, 6, subspace="coarse"), **given)[0]
+    assert torch.autograd.grad(end.sum(), x)[0].shape == end.shape == x.shape
+
+
 def test_checkpoints_and_threads_change_no_bit() -> None:
     model, given = stack()
     solver = dv.VBD(TIME_STEP, 8, subspace="coarse")
