@@ -1,4 +1,4 @@
-// The coarse correction of bodies that touch (subspace/contact_coarse.h). Arguments as in cpu/contact_coarse.h.
+// The coarse correction of bodies that touch (subspace/contact_coarse.h), on CUDA.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -25,7 +25,7 @@ namespace diffvbd::contact {
 
 using rigid::Body;
 
-// The coarse functions of a Model, by vertex and by function (model/coarse.py, CoarseIndex).
+// The coarse functions of a Model, by vertex and by function (CoarseIndex in diffvbd/step/contact_coarse.py).
 struct CoarseSpace {
   const int32_t *vertex_ptr, *function;  // [V + 1], [entries]  functions of a vertex
   const int32_t *function_ptr, *entry;   // [F + 1], [entries]  entries of a function
@@ -91,8 +91,6 @@ struct CornerForce {
   double w[4];
   Vector pull[4];
 };
-constexpr int kCornerDoubles = 25;
-static_assert(sizeof(CornerForce) == kCornerDoubles * sizeof(double));
 
 // Rows of listed pairs, and then of lagged ones. forces are written where `acts`.
 struct SystemMemory {
@@ -520,8 +518,7 @@ void coarse_restrict(const Run& run, const CoarseInputs<T>& c, const T* x_bar, c
   run.each(
       c.scenes() * F, DIFFVBD_LAMBDA(int64_t item) {
         const int64_t scene = item / F, f = item % F;
-        const int32_t body = c.space.own[4 * f];
-        const double s = body < 0 ? 0 : fraction[scene * n + body];
+        const double s = fraction[scene * n + c.space.own[4 * f]];
         Vector sum{};
         for (int32_t e = c.space.function_ptr[f]; s > 0 && e < c.space.function_ptr[f + 1]; ++e) {
           const int32_t entry = c.space.entry[e];
@@ -630,7 +627,7 @@ void coarse_reverse(const Run& run, const CoarseInputs<T>& c, const double* a, c
           const int64_t scene = item / F, f = item % F;
           const int32_t* own = c.space.own + 4 * f;
           const int64_t width = 3 * (own[2] - own[1]), first = 3 * (scene * F + own[1]);
-          const bool moves = own[0] >= 0 && fraction[scene * n + own[0]] > 0;
+          const bool moves = fraction[scene * n + own[0]] > 0;
           for (int i = 0; i < 3; ++i) {
             T* to = out.packed + scene * 9 * c.space.cells + 9 * int64_t{own[3]} + (3 * (f - own[1]) + i) * width;
             lane.each(width, [&](int64_t j) { to[j] = moves ? T(l[3 * item + i] * a[first + j]) : T(0); });

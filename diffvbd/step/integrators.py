@@ -184,8 +184,8 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
     x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), midway)
     feasible, carried, before = x1, math.sqrt(2) * v1, midway["colliders"]
     if euler is not None and (model.contact is not None or model.friction is not None):
-        # x1 keeps bodies apart that all are there; beside one that is still at x, which others may meet, all begin at
-        # x, and so they do with friction, which is measured from there
+        # Bodies stay apart at x1 only if all begin there: where one takes implicit Euler, all begin at x. With friction
+        # they do, too, because it is measured from x.
         mixed = euler.any(-1)[..., None, None] | (model.friction is not None)
         feasible = torch.where(mixed, x, x1)
         carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
@@ -294,7 +294,7 @@ def may_touch(model: System, begun: Begun, prepared: Prepared, where: tuple[Tens
 
 
 def _extrapolates(model: System, prepared: Prepared) -> bool:
-    """Whether contact is not damped: that takes its velocities from the start and the time of a solve."""
+    """Whether no contact is damped: damping reads the start and the time step of a solve."""
     damped = (
         input_name(e, "damping") in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e
     )

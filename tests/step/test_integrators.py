@@ -191,8 +191,7 @@ def test_bodies_of_which_one_may_touch_stay_apart(integrator: Any, support: str)
 
 @pytest.mark.parametrize("integrator", SECOND, ids=str)
 def test_friction_leaves_the_vibrations_of_an_impact(integrator: Any) -> None:
-    """Friction, whose normal forces are those of a step's start, is of first order; bodies do not take implicit Euler
-    for it, which damps what vibrates."""
+    """Friction is of first order, but bodies with friction do not take implicit Euler, which damps vibrations."""
     model, x, v = falling(1, "rubbing plane")
     x, v = x[0] - torch.tensor([0.0, float(x[0, :, 1].min()) + 0.29, 0.0], dtype=x.dtype), 0.25 * v[0]
 
