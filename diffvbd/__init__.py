@@ -17,7 +17,7 @@ from .inspect.gradcheck import check_gradients
 from .inspect.record import record
 from .mesh import TetMesh
 from .model.coarse import CoarseSpace
-from .model.material import lame, young_poisson
+from .model.material import fibre_contraction, lame, young_poisson
 from .model.model import Model
 from .model.solver import BDF2, SDIRK2, VBD, ImplicitEuler
 from .rollout.checks import Checks
@@ -53,6 +53,7 @@ __all__ = [
     "contact",
     "diagnose",
     "error_budget",
+    "fibre_contraction",
     "lame",
     "memory",
     "mesh",

@@ -29,6 +29,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
+from ..step.damping import damped
 from ..step.predict import begin
 from ..step.residual import (
     UNBALANCED,
@@ -171,6 +172,7 @@ def diagnose(
         unbalanced, residuals, friction = _balance(model, x, previous, solver, given)
         if not model.touches and solver.sweeps and isinstance(solver.integrator, ImplicitEuler):
             prepared = prepare(system, lead, given, time_step=solver.time_step, sweeps=solver.sweeps)
+            prepared = damped(system, prepared, previous[0])
             errors = error_of(system, *previous, prepared, **loads)
     state = x.detach().to(torch.float64)
     mu, lam = (_as(a, state) for a in (mu, lam))
@@ -270,6 +272,7 @@ def _balance(
     with torch.no_grad():
         x0, v0 = (t.detach().double() for t in previous)
         force, gravity, prescribed = (wide(inputs.loads[name]) for name in LOADS)
+        prepared = damped(double, prepared, x0)
         begun = begin(double, x0, v0, prepared, force, acceleration_of(gravity, x0), prescribed)
         contact = contact_of_step(double, begun, prepared, (given.before, given.colliders) if model.touches else None)
         at = potential_of_step(double, x.detach().double().reshape(begun.y.shape), begun, prepared, contact)

@@ -13,12 +13,12 @@ from torch.linalg import cross
 
 from .. import ops
 from .._common.checks import check_kind, fail, name_value, real_array
-from .._common.context import looks_at, transformed
+from .._common.context import looks_at, replaced, transformed
 from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..energies import StableNeoHookean
-from ..model.material import shape_gradients
+from ..model.material import deformed, shape_gradients
 from ..model.model import Model
 from ..model.solver import VBD
 from ..model.system import System, system_of
@@ -35,6 +35,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
+from ..step.damping import damped
 from ..step.predict import energy_data
 
 # --- contact ----------------------------------------------------------------------------------------------------------
@@ -319,7 +320,13 @@ def reactions(
     given = widen(model, x, solver, given_inputs)
     _refuse_moduli(given.prepared.mu, given.prepared.lam)
     _refuse_below(given, {"x": x})
-    prepared, h = given.prepared, given.prepared.settings.numbers.time_step
+    prepared, h, drag = given.prepared, given.prepared.settings.numbers.time_step, None
+    if prepared.damping is not None:
+        if previous is None:
+            fail("previous", "the state (x, v) before the step with viscosity or drag, which act on motion", "None")
+        drag = prepared.damping.drag
+        no_drag = replaced(prepared, damping=replaced(prepared.damping, drag=None))
+        prepared = damped(given.model, no_drag, previous[0].double())
     flat = (x.shape[:-2].numel(), *x.shape[-2:])
 
     def full(value: Tensor) -> Tensor:
@@ -335,6 +342,8 @@ def reactions(
     if previous is not None:
         start, speed = (full(t) for t in previous)
         acceleration = acceleration + ((at - start) / h - speed) / h
+        if drag is not None:
+            acceleration = acceleration + drag[..., None] * (at - start) / h
     total = total + prepared.mass[..., None] * acceleration
     if force is not None:
         total = total - full(broadcastable("force", force, x))
@@ -349,14 +358,14 @@ class Stress(NamedTuple):
 
 
 def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
-    """Cauchy stress of each tet and the von Mises stress that follows from it.
+    """Elastic Cauchy stress of each tet and the von Mises stress that follows from it.
 
         cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
 
     Args:
         model: A scene with StableNeoHookean tets.
         x: Positions [m], shape [..., V, 3].
-        inputs: As in :func:`diffvbd.step`; moduli and rest_points are read.
+        inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read.
 
     Returns:
         A :class:`diffvbd.results.Stress` of x's dtype, differentiable by autograd in every tensor. The
@@ -372,11 +381,13 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     if not any(isinstance(energy, StableNeoHookean) for energy in model.energies):
         fail("model", "StableNeoHookean among its energies", "none")
     given_inputs = given_of(model, inputs)
-    rest_points = given_inputs.material["rest_points"]
+    rest_points, stress_free = (given_inputs.material[name] for name in ("rest_points", "stress_free"))
     given = widen(model, x, None, Given(given_inputs.material, {}, {}))
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)
-    gradients, _ = shape_gradients(points.expand(x.shape)[..., tets, :])
+    rest = points.expand(x.shape)[..., tets, :]
+    rest = rest if stress_free is None else deformed(rest, wide(stress_free).expand(*rest.shape[:-2], 3, 3))
+    gradients, _ = shape_gradients(rest)
     corners = x.double()[..., tets, :]
     edges = corners[..., 1:, :] - corners[..., :1, :]
     f = (edges[..., :, None] * gradients[..., 1:, None, :]).sum(-3)  # F_ij = sum_a e_ai (grad N_a)_j

@@ -49,12 +49,15 @@ def inputs_of(model: Any) -> Inputs:
         Input("colliders_before", "[..., Vc, 3]", "m", "colliders: they rest", "Model"),
         Input("rest_points", "[..., V, 3]", "m", "model.rest_points", "Model"),
         Input("density", "[..., T]", "kg/m^3", "model.density", "Model"),
+        Input("drag", "[..., V]", "1/s", "0", "Model"),
     ]
     if model.energy_mask & ELASTIC:
         pairs = (("mu", "Pa"), ("lam", "Pa"), ("young", "Pa"), ("poisson", "-"))
         defaults = ("or young, poisson", "or young, poisson", "or mu, lam", "or mu, lam")
         rows += [Input(name, "[..., T]", unit, given, "StableNeoHookean")
                  for (name, unit), given in zip(pairs, defaults, strict=True)]  # fmt: skip
+        rows += [Input("stress_free", "[..., T, 3, 3]", "-", "identity", "StableNeoHookean")]
+        rows += [Input(name, "[..., T]", "Pa s", "0", "StableNeoHookean") for name in ("viscosity", "volume_viscosity")]
     for name, (energy, key, own) in parameters_of(model).items():
         value = model.constants(energy)[key]
         shape = "".join(f", {n}" for n in value.shape[:own])

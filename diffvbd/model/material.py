@@ -40,16 +40,27 @@ def rest_metric(corners: Tensor) -> tuple[Tensor, Tensor]:
 
     Source: docs/method.md, section 2.
     """
+    normals, six_volumes = face_normals(corners)
+    c6 = 1.0 / six_volumes
+    return torch.stack([*stiffness_weights(normals, c6), c6], -1), six_volumes / 6.0
+
+
+def face_normals(corners: Tensor) -> tuple[list[_Vector], Tensor]:
+    """Normals n_a [m^2] of the faces opposite the corners of tets, by components, and 6 V [m^3].
+
+    grad N_a = n_a / (6 V); the four normals sum to zero. corners: [..., T, 4, 3].
+    """
     p = [tuple(corners[..., a, c].contiguous() for c in range(3)) for a in range(4)]
     e1, e2, e3 = (tuple(p[a][c] - p[0][c] for c in range(3)) for a in (1, 2, 3))
-    # grad N_a = n_a / (6 V); the normals n_a of the opposite faces sum to zero
     n1, n2, n3 = _cross(e2, e3), _cross(e3, e1), _cross(e1, e2)
     n0 = tuple(-(n1[c] + n2[c] + n3[c]) for c in range(3))
-    six_volumes = _dot(e1, n1)
-    c6 = 1.0 / six_volumes
+    return [n0, n1, n2, n3], _dot(e1, n1)
+
+
+def stiffness_weights(normals: list[_Vector], c6: Tensor) -> list[Tensor]:
+    """k01 k02 k03 k12 k13 k23 = c6 / 6 n_a . n_b [m]."""
     scale = c6 / 6.0
-    weights = [_dot(a, b) * scale for a, b in ((n0, n1), (n0, n2), (n0, n3), (n1, n2), (n1, n3), (n2, n3))]
-    return torch.stack([*weights, c6], -1), six_volumes / 6.0
+    return [_dot(normals[a], normals[b]) * scale for a, b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))]
 
 
 def lumped_mass(density: Tensor, volume: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
@@ -64,15 +75,67 @@ def shape_gradients(corners: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         corners: Rest positions of the tets' corners [m], shape [..., T, 4, 3].
     """
-    p = [tuple(corners[..., a, c].contiguous() for c in range(3)) for a in range(4)]
-    e1, e2, e3 = (tuple(p[a][c] - p[0][c] for c in range(3)) for a in (1, 2, 3))
-    n1, n2, n3 = _cross(e2, e3), _cross(e3, e1), _cross(e1, e2)
-    six_volumes = _dot(e1, n1)
+    normals, six_volumes = face_normals(corners)
     scale = 1.0 / six_volumes
-    rows = [tuple(n[c] * scale for c in range(3)) for n in (n1, n2, n3)]
-    first = tuple(-(rows[0][c] + rows[1][c] + rows[2][c]) for c in range(3))
-    flat = torch.stack([component for row in (first, *rows) for component in row], -1)
+    flat = torch.stack([component * scale for normal in normals for component in normal], -1)
     return flat.unflatten(-1, (4, 3)), six_volumes / 6.0
+
+
+# --- stress-free deformation ------------------------------------------------------------------------------------------
+
+
+def deformed(corners: Tensor, by: Tensor) -> Tensor:
+    """Corners of tets [B, T, 4, 3] whose edges from the first corner a deformation [B, T, 3, 3] has turned and
+    stretched; the first corner becomes the origin."""
+    edges = corners[..., 1:, :] - corners[..., :1, :]
+    out = sum(by[..., None, :, c] * edges[..., c, None] for c in range(3))
+    assert isinstance(out, Tensor)
+    return torch.cat([torch.zeros_like(out[..., :1, :]), out], -2)
+
+
+def determinant(matrix: Tensor) -> Tensor:
+    """Of matrices [..., 3, 3], without LAPACK."""
+    rows = [tuple(matrix[..., r, c] for c in range(3)) for r in range(3)]
+    return _dot(rows[0], _cross(rows[1], rows[2]))
+
+
+def fibre_contraction(directions: Tensor, activation: float | Tensor) -> Tensor:
+    """Stress-free deformation of contracting fibres, for the input ``stress_free``.
+
+        G = (1 - a) d d^T + (1 - a)^(-1/2) (I - d d^T)
+
+    At rest a tet is shorter by the fraction a along its fibre and thicker across it, at the same volume.
+
+    Args:
+        directions: Fibres d at rest, of any length but 0, shape [..., T, 3].
+        activation: a < 1 [-], a number or a tensor that broadcasts to directions.shape[:-1]; a < 0 extends.
+
+    Returns:
+        G [..., T, 3, 3], differentiable in both.
+
+    Raises:
+        ValueError, TypeError: Naming the argument, what was expected and what came. Values of tensors on CUDA are
+            looked at only inside debug_checks().
+
+    Source: multiplicative decomposition F = F_e G (Rodriguez, Hoger, McCulloch 1994).
+    """
+    if not isinstance(directions, Tensor) or not directions.is_floating_point():
+        raise TypeError(f"directions: expected a tensor of floating point, got {type(directions).__name__}")
+    if directions.dim() < 1 or directions.shape[-1] != 3:
+        fail("directions", "shape [..., T, 3]", f"shape {list(directions.shape)}")
+    square = directions.square().sum(-1, keepdim=True)
+    _check("directions", square, "directions of finite length > 0", square > 0)
+    activation = _value("activation", activation)
+    _check("activation", activation, "numbers below 1", activation < 1)
+    along = 1 - torch.as_tensor(activation, dtype=directions.dtype, device=directions.device)
+    try:
+        along = along.expand(torch.broadcast_shapes(along.shape, directions.shape[:-1]))[..., None, None]
+    except RuntimeError:
+        fail("activation", f"a shape that broadcasts to {list(directions.shape[:-1])}", f"shape {list(along.shape)}")
+    unit = directions / square.sqrt()
+    fibre = unit[..., :, None] * unit[..., None, :]
+    eye = torch.eye(3, dtype=unit.dtype, device=unit.device)
+    return along * fibre + along.rsqrt() * (eye - fibre)
 
 
 # --- young's modulus and poisson's ratio in place of the lame parameters ----------------------------------------------

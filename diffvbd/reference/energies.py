@@ -13,13 +13,14 @@ Vertex energies take what is per vertex from the full vectors by color.
 """
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from .distance import log_barrier
-from .scene import Color, Scene, add_at, cross, dot, outer6, take
+from .scene import Color, Scene, add_at, cross, dot, outer6, shape_functions, take
 
 ETA = 0.9  # a filtered step closes at most this fraction of a gap
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
@@ -90,6 +91,31 @@ class StableNeoHookean:
         weight = s.time_step**2 * s.volume
         split = (s.mu / 2 * norm, -s.mu * strain, (s.mu + s.lam) / 2 * strain**2)
         return torch.cat([weight * term for term in split], -1), s.layout.tets[0].repeat(3)
+
+
+class Viscosity(StableNeoHookean):
+    """A second law with the moduli viscosity / h and volume_viscosity / h, at rest where the step starts, times J^2
+    there; tets that start inside out have none."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.of = scene
+
+    def begin(self, x_prev: Tensor) -> None:
+        s = self.of
+        gradients, volume = shape_functions(x_prev, s.layout.tets)
+        upright = volume > 0
+        share = torch.where(upright, volume / s.volume, 0.0)
+        shear, bulk = rates(s)
+        at_start = replace(s, mu=shear, lam=bulk, volume=s.volume * share**2,
+                           shape_gradients=torch.where(upright[..., None, None, :], gradients, 0.0))  # fmt: skip
+        super().__init__(None, at_start)
+
+
+def rates(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Moduli of the viscosity [Pa], [..., T]."""
+    none = torch.zeros_like(scene.mu)
+    shear, bulk = (none if r is None else r / scene.time_step for r in (scene.viscosity, scene.volume_viscosity))
+    return shear, bulk
 
 
 def _combine(vectors: Any, weights: Any) -> Tensor:
@@ -289,6 +315,8 @@ def build_energies(scene: Scene, elsewhere: tuple[str, ...] = ()) -> list[Any]:
         if kind not in ENERGIES:
             raise ValueError(f"energies: no reference formula for {kind!r}; known are {sorted(ENERGIES)}")
         built.append(ENERGIES[kind](energy, scene))
+    if scene.viscosity is not None or scene.volume_viscosity is not None:
+        built.append(Viscosity(scene))
     return built
 
 

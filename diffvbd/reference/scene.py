@@ -118,6 +118,9 @@ class Scene:
     volume: Tensor  # [..., T]
     mass: Tensor  # [..., V]
     parameters: dict[str, Any]
+    viscosity: Tensor | None = None  # [..., T] [Pa s]
+    volume_viscosity: Tensor | None = None
+    slowing: Tensor | None = None  # [..., V, 1] of velocities and accelerations by drag [-]; the mass is larger by it
 
     def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
@@ -139,6 +142,10 @@ def build_scene(
     rest_points: Tensor | None,
     density: Any,
     parameters: dict[str, Any] | None,
+    stress_free: Tensor | None = None,
+    viscosity: Any = None,
+    volume_viscosity: Any = None,
+    drag: Any = None,
 ) -> Scene:
     """Resolve the inputs of a run (shapes as in `step`) for the dtype and device of `like`."""
 
@@ -154,6 +161,19 @@ def build_scene(
     mass = corner_mass.new_zeros(*corner_mass.shape[:-1], points.shape[-1])
     for corner in layout.tets:
         mass = mass.index_add(-1, corner, corner_mass)
+    if stress_free is not None:  # dN/dX = grad N G^-1, and the volume is that of the grown tet
+        by = torch.as_tensor(stress_free, dtype=like.dtype, device=like.device).movedim(-3, -1)  # [..., 3, 3, T]
+        by = by if layout.order is None or by.shape[-1] == 1 else by[..., layout.order]
+        by = by.movedim(-1, -3).expand(*by.shape[:-3], volume.shape[-1], 3, 3)
+        inverse = torch.linalg.inv(by).movedim(-3, -1)  # [..., 3, 3, T]
+        gradients = (gradients[..., :, :, None, :] * inverse[..., None, :, :, :]).sum(-3)
+        volume = volume * torch.linalg.det(by)
+    rates = [None if value is None else per_tet(value) for value in (viscosity, volume_viscosity)]
+    slowing = None
+    if drag is not None:
+        slowing = 1 / (1 + time_step * torch.as_tensor(drag, dtype=like.dtype, device=like.device))
+        slowing = slowing.expand(*slowing.shape[:-1], points.shape[-1])
+        mass, slowing = mass / slowing, slowing.unsqueeze(-1)
     return Scene(
         model=model,
         layout=layout,
@@ -166,6 +186,9 @@ def build_scene(
         volume=volume,
         mass=mass,
         parameters=dict(parameters or {}),
+        viscosity=rates[0],
+        volume_viscosity=rates[1],
+        slowing=slowing,
     )
 
 

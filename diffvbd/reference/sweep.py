@@ -1,16 +1,18 @@
 """One step and a rollout: predictor, colored block descent, velocity (paper, algorithm of the forward step)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
-from .energies import StableNeoHookean, build_energies, floor_friction
+from .energies import StableNeoHookean, Viscosity, build_energies, floor_friction, rates
 from .rigid import Correction
 from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
 
+MATERIAL = ("stress_free", "viscosity", "volume_viscosity", "drag")  # inputs of the scene among the keywords
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
 SOFT = 0.02  # h^2 times a tet's stiffness over the mass of its corners, below which it hardly acts within a step
 
@@ -52,13 +54,14 @@ def step(
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
     coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
     given; record: a list, to which the step appends the lengths that it took.
-    parameters: of energies, as `floor_kappa`. Raises ValueError when an unpinned vertex starts below a floor plane.
+    parameters: of energies, as `floor_kappa`, and those of MATERIAL. Raises ValueError when an unpinned vertex starts below a floor plane.
     Returns (x', v').
     """
     system = executed(model, solver)
     layout = build_layout(system, tet_order)
     numbers = solver.time_step, solver.sweeps
-    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
+    more = {name: parameters.pop(name) for name in MATERIAL if name in parameters}
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout, **more)
     return advance(x, v, force, gravity, prescribed, coarse_steps, record)
 
 
@@ -89,7 +92,8 @@ def rollout(
     system = executed(model, solver)
     layout = build_layout(system, tet_order)
     numbers = solver.time_step, solver.sweeps
-    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout)
+    more = {name: parameters.pop(name) for name in MATERIAL if name in parameters}
+    advance = stepper(system, x, mu, lam, *numbers, rest_points, density, parameters, layout, **more)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]
@@ -113,6 +117,7 @@ def stepper(
     parameters: dict[str, Any] | None,
     layout: Layout,
     lookback: float = 1.0,
+    **more: Any,
 ) -> Callable[..., tuple[Tensor, Tensor]]:
     """Do what is common to all steps of a run, and return the function
     (x, v, force, gravity, prescribed, given=(None, None), record=None) -> (x', v') that makes one.
@@ -128,12 +133,15 @@ def stepper(
         rest_points=rest_points,
         density=density,
         parameters=parameters,
+        **more,
     )
     energies = build_energies(scene, elsewhere=("friction",))
     energies += floor_friction(scene, energies)
     masses = color_masses(scene)
     correct = Correction(scene, energies)
-    coarse = Coarse(scene, energies) if getattr(model, "coarse", None) is not None else None
+    shear, bulk = rates(scene)
+    stiffer = replace(scene, mu=scene.mu + shear, lam=scene.lam + bulk)
+    coarse = Coarse(stiffer, energies) if getattr(model, "coarse", None) is not None else None
     last = min(model.relaxation, 1.0) if correct.bodies or coarse is not None else model.relaxation
 
     def advance(
@@ -146,8 +154,11 @@ def stepper(
         record: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         y = predictor(scene, x, v, force, gravity, prescribed)
-        inertial = torch.where(model.pinned[:, None], y, x + time_step * v)
+        inertial = torch.where(model.pinned[:, None], y, x + time_step * _slowed(scene, v))
         x_prev, y, inertial = (a.transpose(-1, -2).contiguous() for a in (x, y, inertial))
+        for energy in energies:
+            if isinstance(energy, Viscosity):
+                energy.begin(x_prev)
         check_start(energies, x_prev)
         begun = _start(scene, energies, x_prev, inertial if model.starts_from == "inertia" else y)
         if model.starts_from == "auto":
@@ -218,13 +229,18 @@ def color_masses(scene: Scene) -> list[Tensor]:
 
 def predictor(scene: Scene, x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> Tensor:
     h, pinned = scene.time_step, scene.model.pinned
-    acceleration = scene.tensor(gravity)
+    acceleration = _slowed(scene, scene.tensor(gravity))
     if force is not None:
         # A pinned vertex may have no mass; its predictor is overwritten below.
         mass = torch.where(pinned & (scene.mass == 0), 1.0, scene.mass)
         acceleration = acceleration + scene.tensor(force) / mass.unsqueeze(-1)
-    y = x + h * v + h**2 * acceleration
+    y = x + h * _slowed(scene, v) + h**2 * acceleration
     return torch.where(pinned.unsqueeze(-1), x if prescribed is None else scene.tensor(prescribed), y)
+
+
+def _slowed(scene: Scene, value: Tensor) -> Tensor:
+    """Velocities and accelerations with drag."""
+    return value if scene.slowing is None else scene.slowing * value
 
 
 def check_start(energies: list[Any], x: Tensor) -> None:
@@ -257,6 +273,10 @@ def _apart(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tenso
            bodies: list[Tensor], held: list[Tensor]) -> Tensor:  # fmt: skip
     """Two for each body that planes hold back, is soft within a step and has the lower potential there, else one."""
     elastic, out = [energy for energy in energies if isinstance(energy, StableNeoHookean)], one
+
+    def of_tets(x: Tensor) -> Tensor:
+        return sum(energy.of_tets(x) for energy in elastic)  # pyright: ignore[reportReturnType]
+
     for body, back in zip(bodies, held, strict=True):
         with torch.no_grad():
             exchanged = put(one, body, take(two, body))
@@ -264,13 +284,12 @@ def _apart(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tenso
             square = scene.mass * (displacement**2).sum(-2)
             inertia = torch.stack([square[..., corner] for corner in scene.layout.tets]).sum(0)
             size = weighed = none
-            for energy in elastic:
-                line = torch.func.jvp(
-                    energy.of_tets, (one.detach(),), (displacement,)
-                )  # the energy at one, and its slope
-                bend = 2 * (energy.of_tets(exchanged) - line[0] - line[1])  # d . K d, K averaged over the way
-                size = size + bend.abs().sum(-1)
-                weighed = weighed + torch.where(inertia > 0, bend**2 / inertia, 0.0).sum(-1)
+            if elastic:
+                # the energy at one, and its slope
+                line = torch.func.jvp(of_tets, (one.detach(),), (displacement,))
+                bend = 2 * (of_tets(exchanged) - line[0] - line[1])  # d . K d, K averaged over the way
+                size = bend.abs().sum(-1)
+                weighed = torch.where(inertia > 0, bend**2 / inertia, 0.0).sum(-1)
             parts = back & (weighed <= SOFT * size) & (_increase(scene, energies, one, exchanged, y, x_prev) < 0)
         out = torch.where(parts[..., None, None], put(out, body, take(two, body)), out)
     return out

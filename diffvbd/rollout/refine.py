@@ -18,7 +18,7 @@ from .._common.messages import percent
 from ..mesh import subdivide
 from ..model.model import Model
 from ..model.solver import VBD
-from ..step.arguments import MODULI
+from ..step.arguments import OF_TETS
 from ..step.integrators import History, is_step_of
 from ..step.residual import UNBALANCED, left_of_solve, share
 from .checks import check_checks
@@ -461,10 +461,14 @@ def _halved(model: Model) -> Halved:
     return Halved(fine, ends.to(model.device), model.num_vertices)
 
 
-def of_parts(value: Any, tets: int) -> Any:
+def each(value: Any, count: int, axis: int = -1) -> bool:
+    """Whether there is a value for each of so many vertices or tets, and not one for all."""
+    return isinstance(value, Tensor) and value.dim() >= -axis and value.shape[axis] == count
+
+
+def of_parts(value: Any, tets: int, axis: int = -1) -> Any:
     """A value of each tet for its eight parts; one of all of them as it is."""
-    each = isinstance(value, Tensor) and value.dim() and value.shape[-1] == tets
-    return value.repeat_interleave(TETS, -1) if each else value
+    return value.repeat_interleave(TETS, axis) if each(value, tets, axis) else value
 
 
 def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, Any]:
@@ -498,7 +502,9 @@ def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, An
 
     changes = {"force": pushed, "gravity": accelerated, "prescribed": moved,
                "rest_points": lambda points: None if points is None else fine.between(points)}  # fmt: skip
-    changes |= dict.fromkeys((*MODULI, "density"), lambda value: of_parts(value, tets))
+    changes |= dict.fromkeys(OF_TETS, lambda value: of_parts(value, tets))
+    changes["stress_free"] = lambda value: None if value is None else of_parts(value, tets, -3)
+    changes["drag"] = lambda value: fine.between(value[..., None])[..., 0] if each(value, count) else value
     return {name: changed(value, changes[name]) if name in changes else value for name, value in given.items()}
 
 

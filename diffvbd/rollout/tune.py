@@ -20,7 +20,7 @@ from .._contact.barrier import PairBarrier
 from ..model.model import Model
 from ..model.solver import BDF2, SDIRK2, VBD, ImplicitEuler, Integrator
 from ..model.system import system_of
-from ..step.arguments import GRAVITY, MODULI, Prepared, check_state, given_of, material_of, prepare
+from ..step.arguments import GRAVITY, MATERIAL, MODULI, OF_TETS, Prepared, check_state, given_of, material_of, prepare
 from ..step.integrators import SAME_TIME_STEP
 from ..step.residual import truncated_fraction
 from ..step.warnings import is_nearly_incompressible
@@ -386,7 +386,8 @@ class TrialRuns:
     @cached_property
     def conserves(self) -> bool:
         """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
-        other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
+        names = {*MATERIAL, "prescribed", "colliders"} - {*MODULI}
+        other = any(self.given.get(name) is not None for name in names)
         dampings = (torch.as_tensor(getattr(energy, "damping", 0.0)) for energy in self.model.energies)
         damped = self.model.friction is not None or any(bool((damping > 0).any()) for damping in dampings)
         return not (changes(self.given) or other or damped)
@@ -1153,9 +1154,9 @@ def finer_mesh(p: TrialRuns) -> TrialRuns:
     """TrialRun runs on the subdivided mesh, whose first vertices are those of the mesh."""
     given = dict(p.given)
     for name in given:
-        if given[name] is not None and name not in (*MODULI, "density", "gravity", "colliders", "colliders_before"):
+        if given[name] is not None and name not in (*OF_TETS, "gravity", "colliders", "colliders_before"):
             fail(name, "None with mesh=True, which has other vertices", type(given[name]).__name__)
     fine = halved(p.model)
-    for name in (*MODULI, "density"):
+    for name in OF_TETS:
         given[name] = mapped(given.get(name), lambda value: of_parts(value, p.model.num_tets))
     return replace(p, model=fine.model, x=fine.between(p.x), v=fine.between(p.v), given=given, quantity=None, wrt=None)

@@ -33,7 +33,7 @@ from .._contact.colliders import MOST_LENGTH, Plane
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..energies import VERTEX_ENERGIES
 from ..model.inputs import inputs_of, parameters_of
-from ..model.material import lumped_mass, moduli_of, rest_metric
+from ..model.material import deformed, determinant, lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
 from ..model.solver import SDIRK2, Integrator
 from ..model.system import System
@@ -41,6 +41,10 @@ from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 MODULI = ("mu", "lam", "young", "poisson")
+VISCOSITIES = ("viscosity", "volume_viscosity")
+OF_TETS = (*MODULI, "density", *VISCOSITIES)  # a value for each tet
+OF_ELASTIC = (*MODULI, "stress_free", *VISCOSITIES)  # inputs of a Model with an elastic law
+MATERIAL = (*MODULI, "rest_points", "density", "stress_free", *VISCOSITIES, "drag")
 LOADS = ("force", "gravity", "prescribed")
 COLLIDERS = ("colliders", "colliders_before")
 STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
@@ -52,9 +56,25 @@ LOOKBACK = 1.0  # of implicit Euler, whose velocities are (x - x_prev) / h
 class Given(NamedTuple):
     """Inputs of a call, sorted."""
 
-    material: dict[str, Any]  # moduli, rest_points, density
+    material: dict[str, Any]  # those of MATERIAL; None: not given
     parameters: dict[str, Any]  # of energies
     loads: dict[str, Any]  # force, gravity, prescribed, colliders, colliders_before; those not given are None
+
+
+class Damping(NamedTuple):
+    """Viscosities of tets and drag of vertices, None where not given."""
+
+    viscosity: Tensor | None  # [1 | B, 1 | T] [Pa s]
+    volume_viscosity: Tensor | None
+    drag: Tensor | None  # [1 | B, 1 | V] [1/s]
+    corners: Tensor | None  # of the tets' rest shapes [B, T, 4, 3]; None: the Model's
+
+
+class Drag(NamedTuple):
+    """Drag as begin() takes it: a velocity v becomes factor v + shift."""
+
+    factor: Tensor  # [1 | B, 1 | V, 1] [-]
+    shift: Tensor | None  # [B, V, 3] [m/s]
 
 
 class Prepared(NamedTuple):
@@ -71,6 +91,8 @@ class Prepared(NamedTuple):
     unrolled: Callable[[float, int, float], Callable[..., tuple[Tensor, Tensor]]] | None = None
     lookback: float = LOOKBACK  # over h v; see csrc/sweep/extrapolation.h
     euler: Tensor | None = None  # bool [B, V]: vertices that take implicit Euler in a step of another scheme
+    damping: Damping | None = None  # of the material, and drag; damped() has put them into the rest
+    drag: Drag | None = None
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -106,14 +128,14 @@ def given_of(model: Model, inputs: dict[str, Any]) -> Given:
     """The keywords of a call by what they are, with the default gravity. TypeError: the Model has no such input."""
     loads: dict[str, Any] = {"force": None, "gravity": GRAVITY, "prescribed": None, "colliders": None,
                              "colliders_before": None}  # fmt: skip
-    material: dict[str, Any] = dict.fromkeys((*MODULI, "rest_points", "density"))
+    material: dict[str, Any] = dict.fromkeys(MATERIAL)
     parameters: dict[str, Any] = {}
     elastic = bool(model.energy_mask & ELASTIC)
     known: dict[str, Any] | None = None
     for name, value in inputs.items():
         if name in loads:
             loads[name] = GRAVITY if name == "gravity" and value is None else value
-        elif name in material and (elastic or name not in MODULI):
+        elif name in material and (elastic or name not in OF_ELASTIC):
             material[name] = value
         else:
             known = parameters_of(model) if known is None else known
@@ -130,7 +152,7 @@ def _meant(model: Any, name: str) -> str:
     kinds = {
         input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
     }
-    if name in MODULI:
+    if name in OF_ELASTIC:
         return ", which has no elastic law among its energies"
     if name in kinds:
         return f", which has no {kinds[name].__name__} among its energies"
@@ -138,8 +160,8 @@ def _meant(model: Any, name: str) -> str:
 
 
 def material_of(**material: Any) -> Given:
-    """Moduli, rest_points and density as inputs."""
-    return Given({**dict.fromkeys((*MODULI, "rest_points", "density")), **material}, {}, {})
+    """Moduli, rest_points and the like as inputs."""
+    return Given({**dict.fromkeys(MATERIAL), **material}, {}, {})
 
 
 def step_settings(model: System, lead: tuple[int, ...], time_step: float, sweeps: int) -> ops.SweepSettings:
@@ -158,7 +180,7 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
-    mu, lam, young, poisson, rest_points, density = given_inputs.material.values()
+    mu, lam, young, poisson, rest_points, density, stress_free, *dampings = given_inputs.material.values()
     parameters = given_inputs.parameters
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
@@ -174,13 +196,17 @@ def prepare(
     rest, corners, mass, given_density = None, None, model._mass[None], density
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
-    if rest_points is not None or density is not None:
+    if stress_free is not None:
+        stress_free = _scenes_first("stress_free", stress_free, like, lead, (*tets, 3, 3))
+    if rest_points is not None or density is not None or stress_free is not None:
         points = model._rest_points if rest_points is None else rest_points
         points = _scenes_first("rest_points", points, like, lead, (model.num_vertices, 3))
         points = ops.broadcast(points, (points.shape[0], model.num_vertices, 3))
         gathered = ops.tet_gather(points, *model._topology)
         metric, volume = rest_metric(gathered)
         rest, corners = (None, None) if rest_points is None else (metric, gathered)
+        if stress_free is not None:
+            corners, rest = _stress_free(stress_free, gathered)
         if density is None:
             density = model._density[None]
         shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
@@ -209,11 +235,15 @@ def prepare(
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
-        unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, parameters, layout)
+        unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, parameters, layout,
+                           given_inputs.material)  # fmt: skip
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
+    damping = None
+    if any(value is not None for value in dampings):
+        damping = _damping(model, like, lead, *dampings, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],
@@ -223,14 +253,43 @@ def prepare(
         settings=settings,
         coarse=coarse,
         unrolled=unrolled,
+        damping=damping,
     )
 
 
+def _stress_free(given: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Corners of tets whose rest shape is deformed, and their rest metric; given [1 | B, 1 | T, 3, 3]."""
+    if looks_at(given):
+        size = determinant(given.detach())
+        name_value("stress_free", "deformations of positive determinant", size, size > 0, SCENE_TET)
+    scenes = max(len(given), len(corners))
+    corners = ops.broadcast(corners, (scenes, *corners.shape[1:]))
+    corners = deformed(corners, ops.broadcast(given, (scenes, corners.shape[1], 3, 3)))
+    return corners, rest_metric(corners)[0]
+
+
+def _damping(model: System, like: Tensor, lead: tuple[int, ...], viscosity: Any, volume_viscosity: Any, drag: Any,
+             corners: Tensor | None) -> Damping:  # fmt: skip
+    """corners: of the tets' rest shapes [B, T, 4, 3] where a step is given those."""
+    out: dict[str, Tensor | None] = {}
+    for name, value, own in (("viscosity", viscosity, (model.num_tets,)),
+                             ("volume_viscosity", volume_viscosity, (model.num_tets,)),
+                             ("drag", drag, (model.num_vertices,))):  # fmt: skip
+        out[name] = None if value is None else _scenes_first(name, value, like, lead, own)
+        if value is not None and not transformed() and (checking() or not like.is_cuda):
+            axes = ("scene", "vertex") if name == "drag" else SCENE_TET
+            name_value(name, "finite numbers >= 0", out[name], out[name] >= 0, axes)
+    if model.block == "paper" and not (viscosity is None and volume_viscosity is None):
+        fail("viscosity", 'a solver with block="exact"', 'one with block="paper"')
+    return Damping(**out, corners=corners)
+
+
 def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
-              layout: Any, time_step: float, sweeps: int, lookback: float
+              layout: Any, material: dict[str, Any], time_step: float, sweeps: int, lookback: float
               ) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
+    more = {name: material[name] for name in ("stress_free", *VISCOSITIES, "drag")}
     return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout,
-                             lookback)  # fmt: skip
+                             lookback, **more)  # fmt: skip
 
 
 def check_staged(integrator: Integrator, given: dict[str, Any]) -> None:

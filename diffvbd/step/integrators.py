@@ -29,6 +29,7 @@ from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import STAGED, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse import coarse_mass
 from .contact import ContactStep, motion_of
+from .damping import damped
 from .predict import Begun, begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
@@ -115,10 +116,11 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
 
     outer = {"x": x, "v": v, **_named(history, given)}
 
-    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any], begun: Tensor | None = None
-              ) -> tuple[Tensor, Tensor, Solve]:  # fmt: skip
-        """``begun``: where a solve before this one has ended."""
+    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any], reference: Tensor | None = None,
+              begun: Tensor | None = None) -> tuple[Tensor, Tensor, Solve]:  # fmt: skip
+        """``reference``: as of damped(); ``begun``: where a solve before this one has ended."""
         try:
+            prepared = damped(model, prepared, x, reference)
             return *run(model, x, v, prepared, **given), Solve(x, v, prepared, given)
         except ValueError:  # perhaps of what was made of several arguments for this solve
             if isinstance(integrator, ImplicitEuler):
@@ -172,7 +174,11 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
             weights, loads = _of_euler(model, weights, end, x, euler, fraction)
         else:
             loads = end
-        x_end, v_end, last = solve(feasible, start, weights, loads, begun)
+        reference = None
+        if weights.damping is not None:
+            reference = feasible + weights.settings.numbers.time_step * carried
+            reference = reference if euler is None else torch.where(euler[..., None], x, reference)
+        x_end, v_end, last = solve(feasible, start, weights, loads, reference, begun)
         v_end = v_end - carried if euler is None else torch.where(euler[..., None], fraction * v_end, v_end - carried)
         return Taken(x_end, v_end, remembered(x_end), last)
 
@@ -219,6 +225,7 @@ def _touching(model: System, x: Tensor, v: Tensor, prepared: Prepared, given: di
         return None
     with torch.no_grad():
         x, v = x.detach(), v.detach()
+        prepared = damped(model, prepared, x)
         begun = begin(model, x, v, prepared, given["force"], acceleration_of(given["gravity"], x), given["prescribed"])
         where = collider_state(model, x, given["colliders"], given["colliders_before"])
         return may_touch(model, begun, prepared, where).reshape(x.shape[:-1])
@@ -243,7 +250,14 @@ def _of_euler(model: System, prepared: Prepared, given: dict[str, Any], x: Tenso
             if name in parameters or energy.damping > 0:
                 parameters[name] = fraction * value
     gravity = acceleration_of(given["gravity"], x) / factor[..., None]
-    own = replaced(prepared, mass=mass, settings=settings, coarse=coarse, parameters=parameters,
+    damping = prepared.damping
+    if damping is not None:  # rates of the whole step
+        of_vertices = torch.where(euler, fraction, 1.0).to(x.dtype).reshape(-1, euler.shape[-1])
+        of_tets = of_vertices[:, model._topology[0][:, 0]]
+        changed = {"viscosity": of_tets, "volume_viscosity": of_tets, "drag": 1 / of_vertices}
+        old = damping._asdict()
+        damping = replaced(damping, **{k: old[k] * by for k, by in changed.items() if old[k] is not None})
+    own = replaced(prepared, mass=mass, settings=settings, coarse=coarse, parameters=parameters, damping=damping,
                    euler=euler.reshape(-1, euler.shape[-1]))  # fmt: skip
     return own, {**given, "gravity": gravity}
 

@@ -86,10 +86,13 @@ def begin(
     h = prepared.settings.numbers.time_step
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     start, velocity = x.reshape(flat), v.reshape(flat)
+    if (drag := prepared.drag) is not None:
+        velocity = drag.factor * velocity if drag.shift is None else drag.factor * velocity + drag.shift
+        gravity = ops.broadcast(gravity, shape).reshape(flat) * drag.factor
     if gravity.shape == (3,) and force is None:
         acceleration = gravity[None, None]
     else:
-        acceleration = ops.broadcast(gravity, shape).reshape(flat)
+        acceleration = ops.broadcast(gravity, shape).reshape(flat) if drag is None else gravity
     if force is not None:
         total = ops.broadcast(broadcastable("force", force, x), shape).reshape(flat)
         # A pinned vertex is moved by no force, whatever stands there.

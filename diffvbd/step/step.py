@@ -14,7 +14,7 @@ from .._common.checks import check_tensor, fail, to_float
 from .._common.context import refuse_refinement, refuse_transforms
 from ..adjoint.routes import Adjoint, TapedSweep, check_adjoint
 from ..model.model import Model
-from ..model.solver import BDF2, VBD, ImplicitEuler
+from ..model.solver import BDF2, VBD
 from .advance import advance
 from .arguments import check_prescribed, check_staged, check_state, given_of, prepare
 from .integrators import take
@@ -45,6 +45,10 @@ def step(
             x.shape[:-2] + (Vc, 3). None: the Model's collider_points. colliders_before: At its start; None: they rest.
             rest_points: Rest positions [m], broadcasts to x.shape. They enter through rest metric and mass.
             density: [kg/m^3], broadcasts to x.shape[:-2] + (T,).
+            stress_free: Deformation G of each tet's rest shape [-], broadcasts to x.shape[:-2] + (T, 3, 3), of positive
+            determinant: growth, prestrain, muscles (:func:`diffvbd.fibre_contraction`).
+            viscosity, volume_viscosity: Of shear and of volume [Pa s], broadcast to x.shape[:-2] + (T,). drag: Force
+            against the velocity over mass [1/s], broadcasts to x.shape[:-1]. All >= 0 and implicit.
             With SDIRK2, prescribed and colliders move evenly to where they end, or are a tuple of two, at the end of
             each of its solves.
 
@@ -75,13 +79,9 @@ def step(
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
         check_prescribed(system, value, x)
     warn_of_sweeps(system, prepared, scheme)
-    if isinstance(scheme, ImplicitEuler):
-        x_end, v_end = advance(system, x, v, prepared, adjoint=adjoint, **given.loads)
-    else:
-        taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
-        x_end, v_end = taken.x, taken.v
-    notice_loss(system, prepared, scheme, v, given.loads["force"], x_end)
-    return x_end, v_end
+    taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
+    notice_loss(system, prepared, scheme, v, given.loads["force"], taken.x)
+    return taken.x, taken.v
 
 
 @dataclass(frozen=True)
