@@ -119,6 +119,9 @@ class Case:
     saturation: float | None = None
     regularization: float = 0.0
     relaxation: float = 1.0
+    stress_free: float | None = None  # noise on the stress-free deformation of tets
+    viscosity: tuple[float, float] | None = None  # of shear and volume
+    drag: tuple[float, float] | None = None  # per vertex
 
 
 _NEAR = {"height": -0.06, "kappa": 2e4, "dhat": 0.1}  # the lowest vertices start inside dhat
@@ -156,7 +159,13 @@ CASES: dict[str, Case] = {
     "free_corner": Case(pinned=False, floor=_CORNER | {"height": (-0.1, -0.75, -0.4), "damping": 50.0}, fall=10.0),
     "free_batch": Case(pinned=False, batch=(3,), floor=_NEAR | {"damping": 50.0}, fall=2.0),
     "batch": Case(batch=(3,), floor=_NEAR | {"damping": 50.0}, fall=2.0),
-}
+    "grown": Case(stress_free=0.2),
+    "viscous": Case(viscosity=(50, 200), relaxation=1.6),
+    "viscous_inverted": Case(jitter=0.3, speed=5, viscosity=(50, 200)),
+    "dragged": Case(pinned=False, drag=(1, 10), floor=_NEAR, fall=1.0),
+    "damped_batch": Case(pinned=False, batch=(3,), floor=_NEAR, fall=2.0, stress_free=0.1, viscosity=(5, 500),
+                         drag=(1, 10)),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -233,6 +242,12 @@ def build_scene(case: str, kind: str = "structured", size: str = "small") -> Sce
         "prescribed": np.where(pinned[:, None], x + c.size * c.jitter * rng.uniform(-1, 1, full), np.nan),
         "rest_points": points,
     }
+    if c.stress_free is not None:
+        arrays["stress_free"] = np.eye(3) + c.stress_free * rng.uniform(-1, 1, (*c.batch, len(tets), 3, 3))
+    if c.viscosity is not None:
+        arrays |= {name: per_tet(c.viscosity, c.batch) for name in ("viscosity", "volume_viscosity")}
+    if c.drag is not None:
+        arrays["drag"] = c.drag[0] + (c.drag[1] - c.drag[0]) * rng.uniform(size=(*c.batch, len(points)))
     return Scene(f"{case}-{kind}-{size}", c, points, tets, pinned, arrays)
 
 
