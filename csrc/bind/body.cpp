@@ -202,7 +202,7 @@ DIFFVBD_OPERATOR(Tensor, potential_increase, In x, In to, In x_prev, In y, In ma
     in.corner = read.index("corner", corner, blocks * 4 * coarse::kBlockTets);
     in.block_ptr = read.index("block_ptr", block_ptr, bodies + 1);
     in.rest = read.batch("rest", rest, blocks * kRestScalars * coarse::kBlockTets);
-    in.material = read.batch("material", material, blocks * kTetScalars * coarse::kBlockTets);
+    in.material = read.batch("material", material, blocks * kMaterialScalars * coarse::kBlockTets);
     in.blocks = blocks, in.listed = order.numel();
 #ifndef USE_CUDA
     require(in.bodies.ptr[bodies] <= in.listed, "diffvbd::potential_increase: expected order with all vertices of ptr");

@@ -51,7 +51,6 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"roundings", static_cast<int64_t>(kRounding)},  // ulps of the terms by which a potential may rise
   };
   for (const auto& [name, value] : numbers) add("int", name, std::to_string(value));
-  add("bool", "tet_reads_x_prev", TetLayout::reads_x_prev ? "True" : "False");
   add("str", "sweep_adjoints", "\"" DIFFVBD_SWEEP_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");
   add("str", "step_adjoints", "\"" DIFFVBD_STEP_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");
   add("str", "touching_adjoints", "\"" DIFFVBD_TOUCHING_FIELDS(DIFFVBD_WORD, DIFFVBD_NONE) "\"");

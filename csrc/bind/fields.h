@@ -11,8 +11,7 @@
 // clang-format off
 // The predictor and the start; the body; data of the energies; contact, all empty without it: colliders, stiffness,
 // the pairs that repel, what friction and damping keep of the start of the step, and from where and how far a vertex may
-// go (contact/limit.h); then the tets' corners there, empty for a law that does not read them; last the corrections on a
-// coarse space (coarse/views.h), if any. The adjoint of a factor stands for that of the matrix that it is of.
+// go (contact/limit.h); last the corrections on a coarse space (coarse/views.h), if any. The adjoint of a factor stands for that of the matrix that it is of.
 #define DIFFVBD_SWEEP_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x_start) ADJOINT(x_prev) ADJOINT(y) \
   ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest) \
@@ -20,7 +19,6 @@
   ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
   INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
   ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(trust_radius) \
-  ADJOINT(corners_prev) \
   ADJOINT(coarse_factor) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
 
 // The matrix of a coarse space at the start of a step (coarse/matrix.h): plan int32, moments [n, 3] and volume [groups]

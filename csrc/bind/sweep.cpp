@@ -67,7 +67,6 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const Swe
                                 const StepInputs<T>& step, int64_t positions) {
   require((step.energies & (kContact | kPaperBlock)) == 0 && !step.parameters.saturates,
           "diffvbd::sweep: coarse corrections take no contact, no paper block and no saturation");
-  require(kPrevScalars == 0, "diffvbd::sweep: coarse corrections take no law that reads where a step began");
   const Reader<T> read(x);
   coarse::Inputs<T> in{};
   in.plan = coarse_plan(f.coarse_plan, x, q.coarse);
@@ -94,22 +93,12 @@ struct Given {
   Given(const HostPlan& host, const SweepFields& f, const Tensor& x, const SweepSettings& q) {
     set_body(host, f, x, q);
     const Reader<T> read(x);
-    const int64_t v = read.v, tets = view_of(host).num_tets;
+    const int64_t v = read.v;
     in.x_start = read.batch("x", x, 3 * v);
     in.x_prev = read.batch("x_prev", f.x_prev, 3 * v);
     in.y = read.batch("y", f.y, 3 * v);
     in.origin = read.batch_or_null("origin", f.origin, 3 * v);
     in.data = read.batch("energy_data", f.energy_data, in.data_size);
-    if constexpr (kPrevScalars > 0) {
-      const bool elastic = (in.energies & kElastic) != 0;
-      require(!elastic || f.corners_prev.numel() == kPrevScalars * in.scenes * tets,
-              "diffvbd::sweep: expected the corners' positions at the start of the step");
-      const Batched<const T> all =
-          batched_or_null<T>("corners_prev", f.corners_prev, x, kPrevScalars, in.scenes * tets);
-      for (int i = 0; elastic && i < kPrevScalars; ++i) {
-        in.material[kMaterialScalars + i] = {all.data + i * in.scenes * tets, tets, 1};
-      }
-    }
     if (f.coarse_plan.numel() > 0) {
       coarse = coarse_inputs<T>(f, x, q, in, int64_t{view_of(host).blocks} * kLanesOfPlan);
       if (!kOnCuda || coarse.plan.bodies > 0) in.coarse = &coarse;
@@ -367,7 +356,7 @@ DIFFVBD_OPERATOR(decltype(std::declval<SweepBars>().tensors()), sweep_backward, 
     Given<T> given(host, f, x, q);
     auto& in = given.in;
     const Reader<T> read(x);
-    const int64_t v = read.v, b = read.b, tets = view_of(host).num_tets;
+    const int64_t v = read.v, b = read.b;
     const T* x_bars = read.vectors("x_bar", x_bar);
     const T* taped = read.like("tape", tape, product(given.tape_shape(host, launch)));
     const uint8_t* limits = in.contact ? read.bytes("truncations", truncations, b * in.sweeps * v) : nullptr;
@@ -377,23 +366,16 @@ DIFFVBD_OPERATOR(decltype(std::declval<SweepBars>().tensors()), sweep_backward, 
     in.debug_step = -1;
 #endif
     const auto none = [&] { return device.empty({0}); };
-    SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(),
+    SweepBars bars{none(), none(), none(), none(), none(), none(), none(),
                    none(), none(), none(), none(), none(), none(), none()};
     bars.x_start = device.empty({b, v, 3}), bars.x_prev = device({b, v, 3}, !kOnCuda), bars.y = device.empty({b, v, 3});
     make_body_bars(bars, in, host, {wants[0], wants[1], wants[2]}, device);
-    if (wants[0] && kPrevScalars > 0) {
-      bars.corners_prev = device({kPrevScalars, b, tets}, !kOnCuda || (in.energies & kElastic) == 0);
-    }
     if (wants[4] && f.coarse_plan.numel() > 0) {
       bars.coarse_factor = device.zeros({b, f.coarse_factor.numel() / std::max<int64_t>(1, b)});
     }
     if (wants[3]) bars.energy_data = device({b, in.data_size}, !kOnCuda);
     StepAdjoints<T> out{};
     set_body_bars(out, bars, in);
-    const bool follows = bars.corners_prev.numel() > 0 && (in.energies & kElastic) != 0;
-    for (int i = 0; follows && i < kPrevScalars; ++i) {
-      out.material[kMaterialScalars + i] = data<T>(bars.corners_prev) + i * b * tets;
-    }
     out.x_start = data<T>(bars.x_start), out.x_prev = data<T>(bars.x_prev), out.y = data<T>(bars.y);
     out.data = data_or_null<T>(bars.energy_data);
     given.coarse.tape = data<T>(corrections);

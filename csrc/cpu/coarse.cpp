@@ -32,7 +32,7 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
       gradient_(size_t(plan.blocks) * kLanes * 4, true),
       displacement_(size_t(plan.blocks) * kLanes * 4, true),
       wanted_(size_t(plan.blocks) * kLanes * 4, true),
-      material_(size_t(c_.plan.tet_blocks) * kTetScalars * kLanes),
+      material_(size_t(c_.plan.tet_blocks) * kMaterialScalars * kLanes),
       coarse_(size_t(c_.plan.functions) * 4, true),
       rows_(size_t(c_.plan.functions) * 7, true),
       turns_(size_t(c_.matrix_bar ? c_.corrections : 1) * c_.plan.functions * 3, true),
@@ -43,11 +43,11 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
   const coarse::Plan& p = c_.plan;
   sums_ = Buffer<double>(size_t(p.parts) * coarse::kDegree);
   if (!(in.energies & kElastic)) return;
-  for (int m = 0; m < kTetScalars; ++m) {
+  for (int m = 0; m < kMaterialScalars; ++m) {
     const Batched<const T>& given = in.material[m];
     const T* of_tet = given.data + scene * given.scene;
     for (int64_t block = 0; block < p.tet_blocks; ++block) {
-      T* to = material_.get() + (block * kTetScalars + m) * kLanes;
+      T* to = material_.get() + (block * kMaterialScalars + m) * kLanes;
       for (int l = 0; l < kLanes; ++l) to[l] = of_tet[p.tet[block * kLanes + l] * given.item];
     }
   }

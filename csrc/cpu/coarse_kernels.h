@@ -199,9 +199,9 @@ __attribute__((flatten)) void line_of_tets(const int32_t* corner, const T* rest,
       at[a] = gather3(x, corner + (block * 4 + a) * kLanes);
       p[a] = gather3(displacement, corner + (block * 4 + a) * kLanes);
     }
-    R scalars[kRestScalars], m[kTetScalars];
+    R scalars[kRestScalars], m[kMaterialScalars];
     for (int i = 0; i < kRestScalars; ++i) scalars[i] = R::load(rest + (block * kRestScalars + i) * kLanes);
-    for (int i = 0; i < kTetScalars; ++i) m[i] = R::load(material + (block * kTetScalars + i) * kLanes);
+    for (int i = 0; i < kMaterialScalars; ++i) m[i] = R::load(material + (block * kMaterialScalars + i) * kLanes);
     TetLaw::line(at, p, scalars, m, sum);
   }
   for (int i = 0; i < TetLayout::line_degree; ++i) {

@@ -101,12 +101,12 @@ struct Scene {
     view.origin = origin.get();
     view.mass = mass.get();
     if (in.energies & kElastic) {
-      material = Buffer<T>(size_t(plan.slots) * kTetScalars * kLanes);
-      for (int m = 0; m < kTetScalars; ++m) {
+      material = Buffer<T>(size_t(plan.slots) * kMaterialScalars * kLanes);
+      for (int m = 0; m < kMaterialScalars; ++m) {
         for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
-          const Batched<const T>& given = in.material[TetLayout::scalar_index(plan.pair[i] & 3, m)];
+          const Batched<const T>& given = in.material[m];
           const int64_t tet = plan.pair[i] >> 2, slot = i / kLanes;
-          material.get()[(slot * kTetScalars + m) * kLanes + i % kLanes] =
+          material.get()[(slot * kMaterialScalars + m) * kLanes + i % kLanes] =
               given.data[scene * given.scene + tet * given.item];
         }
       }
@@ -192,7 +192,7 @@ void check_material(const StepInputs<T>& in, int64_t tets) {
   const int64_t count = one_for_items(in.material) ? std::min<int64_t>(tets, 1) : tets;
   for (int64_t b = 0; b < distinct; ++b) {
     for (int64_t i = 0; i < count; ++i) {
-      T material[kMaterialScalars];  // x_prev has been looked at
+      T material[kMaterialScalars];
       for (int m = 0; m < kMaterialScalars; ++m) {
         material[m] = in.material[m].data[b * in.material[m].scene + i * in.material[m].item];
       }
@@ -387,8 +387,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     const Buffer<T> x_rows(4 * lanes), y_bar(3 * lanes, true), mass_bar(lanes, true),
         rows(4 * (int64_t{plan.edge_slots} * kLanes + 1), true);
     const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true),
-        material_bar(wants_material ? kTetScalars * pairs : 0, true), rest_bar(out.rest ? kPairRest * pairs : 0, true),
-        data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
+        material_bar(wants_material ? kMaterialScalars * pairs : 0, true),
+        rest_bar(out.rest ? kPairRest * pairs : 0, true), data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
     pack(plan, x_bar + b * 3 * n, x_rows.get(), in_rows, false);
     s.x_bar = x_rows.get();
     s.y_bar = y_bar.get();
@@ -460,9 +460,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
           if (is_padding(plan, slot, block, l)) continue;
           const int64_t tet = plan.pair[slot * kLanes + l] >> 2;
           const int local = plan.pair[slot * kLanes + l] & 3;
-          for (int m = 0; wants_material && m < kTetScalars; ++m) {
-            out.material[TetLayout::scalar_index(local, m)][b * tets + tet] +=
-                s.material_bar[(slot * kTetScalars + m) * kLanes + l];
+          for (int m = 0; wants_material && m < kMaterialScalars; ++m) {
+            out.material[m][b * tets + tet] += s.material_bar[(slot * kMaterialScalars + m) * kLanes + l];
           }
           for (int i = 0; out.rest && i < kPairRest; ++i) {
             out.rest[(b * tets + tet) * kRestScalars + TetLayout::rest_index(local, i)] +=

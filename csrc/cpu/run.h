@@ -15,7 +15,7 @@ struct StepInputs {
   using Scalar = T;
   int64_t scenes;
   Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
-  Batched<const T> material[kTetScalars];       // [B, T], also item stride 0 for one value
+  Batched<const T> material[kMaterialScalars];  // [B, T], also item stride 0 for one value
   Batched<const T> mass;                        // [B, V]
   Batched<const T> rest;                        // [B, slots, kPairRest, kLanes]
   Batched<const T> data;                        // [B, N]
@@ -33,7 +33,7 @@ template <class T>
 struct StepAdjoints {
   using Scalar = T;
   T *x_start, *x_prev, *y;                     // [B, V, 3]
-  T* material[kTetScalars];                    // [B, T] each; null where not wanted, as below
+  T* material[kMaterialScalars];               // [B, T] each; null where not wanted, as below
   T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
   const contact::ContactAdjoints<T>* contact;  // with contact
   T* collider;                                 // [B, Vc, 3] with contact

@@ -37,7 +37,7 @@ struct SceneView {
   const T* x_prev;    // [blocks, 3, kLanes] or null
   const T* origin;    // [blocks, 3, kLanes] or null
   const T* mass;      // [blocks, kLanes]
-  const T* material;  // [slots, kTetScalars, kLanes]: gathered once a step, read in every sweep; null: no tets
+  const T* material;  // [slots, kMaterialScalars, kLanes]: gathered once a step, read in every sweep; null: no tets
   const T* rest;      // [slots, kPairRest, kLanes]
   const T* data;      // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
   int64_t data_start[kVertexEnergies];
@@ -54,7 +54,7 @@ struct SceneView {
   T* x_prev_bar;    // [blocks, 3, kLanes] or null
   T* mass_bar;      // [blocks, kLanes]
   T* rows;          // [edge_slots kLanes + 1, 4]  what the latest reversed update of a vertex adds to a neighbour
-  T* material_bar;  // [slots, kTetScalars, kLanes] or null
+  T* material_bar;  // [slots, kMaterialScalars, kLanes] or null
   T* rest_bar;      // [slots, kPairRest, kLanes] or null
   T* data_bar;      // [kMaxEnergyData, blocks kLanes] or null
   T* limit;         // [blocks, kLanes] or null: what limits let through of the update that is reversed
@@ -125,15 +125,15 @@ struct LaneStar {
     const int64_t slot = first + e;
     const int32_t* j = plan.neighbors + slot * 3 * kLanes;
     const T* r = s.rest + slot * kPairRest * kLanes;
-    const T* m = s.material + slot * kTetScalars * kLanes;
+    const T* m = s.material + slot * kMaterialScalars * kLanes;
     TetPair<Lanes<T>> out;
     out.xj = gather3(s.x, j);
     out.xk = gather3(s.x, j + kLanes);
     out.xl = gather3(s.x, j + 2 * kLanes);
     each_below<kPairRest>([&](auto i)
                               DIFFVBD_INLINE { out.rest[decltype(i)::value] = Lanes<T>::load(r + i * kLanes); });
-    each_below<kTetScalars>([&](auto i)
-                                DIFFVBD_INLINE { out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes); });
+    each_below<kMaterialScalars>(
+        [&](auto i) DIFFVBD_INLINE { out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes); });
     return out;
   }
 
@@ -180,8 +180,8 @@ struct LaneStar {
     scatter(edge + 2 * kLanes, a.xl);
   }
   DIFFVBD_FN void add_material(int e, const Lanes<T>* bar) const {
-    T* to = s.material_bar + (first + e) * kTetScalars * kLanes;
-    each_below<kTetScalars>([&](auto i) DIFFVBD_INLINE { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
+    T* to = s.material_bar + (first + e) * kMaterialScalars * kLanes;
+    each_below<kMaterialScalars>([&](auto i) DIFFVBD_INLINE { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
   }
   DIFFVBD_FN void add_rest(int e, const Lanes<T>* bar) const {
     T* to = s.rest_bar + (first + e) * kPairRest * kLanes;

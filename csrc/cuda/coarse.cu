@@ -149,14 +149,14 @@ __global__ void __launch_bounds__(kSumThreads)
       const int row = __ldg(p.corner + (static_cast<int64_t>(block) * 4 + corner) * kLanes + lane) / kRow;
       at[corner] = load_row(x, row, true), to[corner] = load_row(displacement, row, true);
     }
-    T rest[kRestScalars], material[kTetScalars], change[coarse::kDegree] = {};
+    T rest[kRestScalars], material[kMaterialScalars], change[coarse::kDegree] = {};
     const T* scalars =
         a.c.rest.data + user * a.c.rest.scene + static_cast<int64_t>(block) * kRestScalars * kLanes + lane;
 #pragma unroll
     for (int r = 0; r < kRestScalars; ++r) rest[r] = __ldg(scalars + r * kLanes);
     const int64_t tet = __ldg(p.tet + i);
 #pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) {
+    for (int m = 0; m < kMaterialScalars; ++m) {
       material[m] = __ldg(in.material[m].data + user * in.material[m].scene + tet * in.material[m].item);
     }
     TetLaw::line(at, to, rest, material, change);

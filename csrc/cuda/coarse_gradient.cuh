@@ -81,9 +81,9 @@ __device__ __noinline__ void scatter_to_pinned(const StepView<T>& s, int64_t sce
     for (int i = 0; i < kPairRest; ++i) {
       tet.rest[i] = __ldg(rest + i / width * width * kSlice + v * width + i % width);
     }
-    for (int m = 0; m < kTetScalars; ++m) {
+    for (int m = 0; m < kMaterialScalars; ++m) {
       tet.material[m] = s.one_material ? __ldg(s.material[m].data + scene * s.material[m].scene)
-                                       : __ldg(s.w.material + scene * s.material_scene + pair * kTetScalars + m);
+                                       : __ldg(s.w.material + scene * s.material_scene + pair * kMaterialScalars + m);
     }
     const TetAdjoint<T> bar = Law::block_vjp(tet, Law::view(tet, x, none, p), none, p, minus_h2);
     scatter(j, bar.xj);
@@ -160,8 +160,8 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
     }
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) star.total(star.material_bar);
-      for (int m = 0; s.one_material && m < kTetScalars; ++m) {
-        if (writes) s.w.material_bar[row * kTetScalars + m] += star.material_bar[m];
+      for (int m = 0; s.one_material && m < kMaterialScalars; ++m) {
+        if (writes) s.w.material_bar[row * kMaterialScalars + m] += star.material_bar[m];
       }
     }
     if (!writes) return;

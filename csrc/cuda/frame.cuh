@@ -98,9 +98,9 @@ __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __
   const int pair = max(0, __ldg(s.plan.pair + (i - local * pairs)));
   const int64_t tet = pair >> 2;
 #pragma unroll
-  for (int m = 0; m < kTetScalars; ++m) {
-    const Batched<const T>& given = in.material[TetLayout::scalar_index(pair & 3, m)];
-    s.w.material[kTetScalars * i + m] = given.data[scene * given.scene + tet * given.item];
+  for (int m = 0; m < kMaterialScalars; ++m) {
+    const Batched<const T>& given = in.material[m];
+    s.w.material[kMaterialScalars * i + m] = given.data[scene * given.scene + tet * given.item];
   }
 }
 
@@ -165,15 +165,15 @@ __global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
   if (i >= s.scenes * s.plan.num_tets) return;
   const int64_t local = i / s.plan.num_tets, scene = base + local, tet = i - local * s.plan.num_tets;
   const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice, to = scene * s.plan.num_tets + tet;
-  T material_bar[kTetScalars] = {}, rest[kRestScalars] = {};
+  T material_bar[kMaterialScalars] = {}, rest[kRestScalars] = {};
 #pragma unroll
   for (int a = 0; a < 4; ++a) {
     const int64_t at = __ldg(s.plan.tet_pair + 4 * tet + a);
     if (at < 0) continue;
     if (material) {
-      const T* m = s.w.material_bar + (local * pairs + at) * kTetScalars;
+      const T* m = s.w.material_bar + (local * pairs + at) * kMaterialScalars;
 #pragma unroll
-      for (int k = 0; k < kTetScalars; ++k) material_bar[TetLayout::scalar_index(a, k)] += m[k];
+      for (int k = 0; k < kMaterialScalars; ++k) material_bar[k] += m[k];
     }
     if (out.rest) {
       const T* r = s.w.rest_bar + (local * pairs + at) * kPairRest;
@@ -181,7 +181,7 @@ __global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
       for (int b = 0; b < kPairRest; ++b) rest[TetLayout::rest_index(a, b)] += r[b];
     }
   }
-  for (int k = 0; material && k < kTetScalars; ++k) out.material[k][to] = material_bar[k];
+  for (int k = 0; material && k < kMaterialScalars; ++k) out.material[k][to] = material_bar[k];
   for (int k = 0; out.rest && k < kRestScalars; ++k) out.rest[to * kRestScalars + k] = rest[k];
 }
 

@@ -148,12 +148,12 @@ struct GroupStar : Records<T, lanes_, reverse> {
 #pragma unroll
     for (int i = 0; i < kPairRest; ++i) out.rest[i] = now.rest[i];
 #pragma unroll
-    for (int i = 0; i < kTetScalars; ++i) out.material[i] = now.material[i];
+    for (int i = 0; i < kMaterialScalars; ++i) out.material[i] = now.material[i];
     if constexpr (reverse) {
       if (s.w.material_bar && !s.one_material && !Base::repeats) {  // loaded long before the addition
-        const T* before = s.w.material_bar + pair_index(e) * kTetScalars;
+        const T* before = s.w.material_bar + pair_index(e) * kMaterialScalars;
 #pragma unroll
-        for (int i = 0; i < kTetScalars; ++i) material_bar[i] = before[i];
+        for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] = before[i];
       }
     }
     return out;
@@ -169,7 +169,7 @@ struct GroupStar : Records<T, lanes_, reverse> {
   // Takes the sums of a copy.
   __device__ __forceinline__ void adopt(const GroupStar& a) const {
 #pragma unroll
-    for (int i = 0; i < kTetScalars; ++i) material_bar[i] = a.material_bar[i];
+    for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] = a.material_bar[i];
   }
   __device__ __forceinline__ const Vec3<T>& predictor(const Block<T>& b) const { return b.y; }
   PairTerm<T>* pairs = nullptr;
@@ -212,11 +212,11 @@ struct GroupStar : Records<T, lanes_, reverse> {
   __device__ __forceinline__ void add_material(int e, const T* bar) const {
     if (s.one_material) {
 #pragma unroll
-      for (int i = 0; i < kTetScalars; ++i) material_bar[i] += bar[i];
+      for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] += bar[i];
     } else if (real(e)) {
-      T* to = s.w.material_bar + pair_index(e) * kTetScalars;
+      T* to = s.w.material_bar + pair_index(e) * kMaterialScalars;
 #pragma unroll
-      for (int i = 0; i < kTetScalars; ++i) to[i] = (reverse ? material_bar[i] : to[i]) + bar[i];
+      for (int i = 0; i < kMaterialScalars; ++i) to[i] = (reverse ? material_bar[i] : to[i]) + bar[i];
     }
   }
   __device__ __forceinline__ void add_rest(int e, const T* bar) const {
@@ -225,7 +225,7 @@ struct GroupStar : Records<T, lanes_, reverse> {
 #pragma unroll
     for (int i = 0; i < kPairRest; ++i) to[i] += bar[i];
   }
-  mutable T material_bar[kTetScalars] = {};  // of a scene with one material; otherwise of the current pair
+  mutable T material_bar[kMaterialScalars] = {};  // of a scene with one material; otherwise of the current pair
 
   // Writes the rows of the vertex's edges: sums over its threads in their order. Pinned vertices have no turn; rows
   // that lead to them accumulate over the sweeps.

@@ -9,7 +9,7 @@ namespace diffvbd::cuda {
 template <class T>
 struct PairRecord {
   int where;  // indices of the other corners among the vertex's neighbours
-  T rest[kRestRow], material[kTetScalars];
+  T rest[kRestRow], material[kMaterialScalars];
 };
 
 // Records of a vertex: each thread has lane, lane + lanes, ... One record is prefetched in registers; in the reverse
@@ -30,7 +30,7 @@ class Records {
       : s(s), at(at), stages_(stages), first_(slots.begin), count_(s.has_tets ? slots.end - slots.begin : 0) {
     if (s.one_material) {
 #pragma unroll
-      for (int m = 0; m < kTetScalars; ++m) {
+      for (int m = 0; m < kMaterialScalars; ++m) {
         next_.material[m] = __ldg(s.material[m].data + at.scene * s.material[m].scene);
       }
     }
@@ -96,14 +96,14 @@ class Records {
   struct One {
     T v[1];
   };
-  using Part = std::conditional_t<kTetScalars % width == 0, Pack<T>, One>;
-  static constexpr int kParts = kTetScalars / (sizeof(Part) / sizeof(T));
+  using Part = std::conditional_t<kMaterialScalars % width == 0, Pack<T>, One>;
+  static constexpr int kParts = kMaterialScalars / (sizeof(Part) / sizeof(T));
 
   __device__ __forceinline__ const T* rest_of(int64_t base) const {
     return s.rest.data + at.scene * s.rest.scene + base * kRestRow + at.v * width;
   }
   __device__ __forceinline__ const T* material_of(int64_t base) const {
-    return s.w.material + at.scene * s.material_scene + (base + at.v) * kTetScalars;
+    return s.w.material + at.scene * s.material_scene + (base + at.v) * kMaterialScalars;
   }
   __device__ __forceinline__ void fetch(int e) const {
     const int64_t base = slot(e);
@@ -118,7 +118,7 @@ class Records {
     if (s.one_material) return;
     const T* m = material_of(base);
 #pragma unroll
-    for (int i = 0; i < kTetScalars; ++i) next_.material[i] = __ldg(m + i);
+    for (int i = 0; i < kMaterialScalars; ++i) next_.material[i] = __ldg(m + i);
   }
 
   // Stage: rest row in packs, material, and where, of all threads.
@@ -151,7 +151,7 @@ class Records {
 #pragma unroll
       for (int i = 0; i < kParts; ++i) copy(reinterpret_cast<Part*>(to) + i * kSlice + thread, m + i);
     }
-    copy(reinterpret_cast<int32_t*>(to + kTetScalars * kSlice) + thread, s.plan.local + base + at.v);
+    copy(reinterpret_cast<int32_t*>(to + kMaterialScalars * kSlice) + thread, s.plan.local + base + at.v);
   }
   __device__ __forceinline__ PairRecord<T> read(int number) const {
     const auto thread = static_cast<int>(threadIdx.x % kSlice);
@@ -166,14 +166,14 @@ class Records {
     from += kRestRow * kSlice;
     const auto* parts = reinterpret_cast<const Part*>(from) + thread;
 #pragma unroll
-    for (int i = 0; i < kTetScalars; ++i) {
+    for (int i = 0; i < kMaterialScalars; ++i) {
       if (s.one_material) {
         out.material[i] = next_.material[i];
       } else {
-        out.material[i] = parts[i * kParts / kTetScalars * kSlice].v[i % (kTetScalars / kParts)];
+        out.material[i] = parts[i * kParts / kMaterialScalars * kSlice].v[i % (kMaterialScalars / kParts)];
       }
     }
-    out.where = reinterpret_cast<const int32_t*>(from + kTetScalars * kSlice)[thread];
+    out.where = reinterpret_cast<const int32_t*>(from + kMaterialScalars * kSlice)[thread];
     return out;
   }
 

@@ -46,11 +46,11 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   Recalled<T> r = recall<Set, T>(full, get);
   const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, at.block, at.v);
   const bool writes = at.lane == 0 && real;
-  T material_bar[kTetScalars];  // of all updates so far
+  T material_bar[kMaterialScalars];  // of all updates so far
   if constexpr ((wanted & kMaterial) != 0) {
     if (s.one_material && writes) {
 #pragma unroll
-      for (int i = 0; i < kTetScalars; ++i) material_bar[i] = s.w.material_bar[row * kTetScalars + i];
+      for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] = s.w.material_bar[row * kMaterialScalars + i];
     }
   }
   GroupStar<T, lanes, true> star(s, at, spans, shared);
@@ -93,8 +93,8 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       if (s.one_material) {
         star.total(star.material_bar);
 #pragma unroll
-        for (int i = 0; i < kTetScalars; ++i) {
-          if (writes) s.w.material_bar[row * kTetScalars + i] = material_bar[i] + star.material_bar[i];
+        for (int i = 0; i < kMaterialScalars; ++i) {
+          if (writes) s.w.material_bar[row * kMaterialScalars + i] = material_bar[i] + star.material_bar[i];
         }
       }
     }

@@ -45,7 +45,7 @@ using rigid::Body, rigid::Vector;
 // Coefficients of h^2 times the energy of a lane's tet along the displacement.
 template <class T>
 __device__ void tet_line(const IncreaseInputs<T>& in, int64_t scene, int64_t block, int lane, double (&c)[kDegree]) {
-  constexpr int kRest = kRestScalars, kMaterial = kTetScalars;
+  constexpr int kRest = kRestScalars, kMaterial = kMaterialScalars;
   const T* rest = in.rest.data + scene * in.rest.scene + block * kRest * kBlockTets + lane;
   const T* material = in.material.data + scene * in.material.scene + block * kMaterial * kBlockTets + lane;
   double own_rest[kRest], own_material[kMaterial];

@@ -65,7 +65,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.y_bar = take(reverse, n * 3 * positions);
   w.x_prev_bar = take(reverse && lagged, n * 3 * positions);
   w.mass_bar = take(reverse && adjoints->mass, n * positions);
-  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * kTetScalars * (one ? positions : pairs));
+  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * kMaterialScalars * (one ? positions : pairs));
   w.rest_bar = take(elastic && (choice.wanted & kRest), n * kPairRest * pairs);
   w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
   *zeroed = take.used;
@@ -75,7 +75,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.x_prev = take(lagged, n * 3 * positions);
   w.origin = take(in.origin.data != nullptr, n * 3 * positions);
   w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
-  w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kTetScalars * pairs);
+  w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kMaterialScalars * pairs);
   const bool cooperative =
       possible_lanes<T>(host, choice, choice.lanes, reverse) == kManyLanes;  // blocks keep pair terms to themselves
   w.contact = take(in.contact && !cooperative, n * kContactScalars * positions);
@@ -133,7 +133,7 @@ struct Runner {
     if (in.contact) contact.in = *in.contact;
     if (in.contact && adjoints) contact.slots = *adjoints->contact;
     material_is_shared = one_for_scenes(in.material);
-    s.material_scene = material_is_shared ? 0 : int64_t{host.plan.slots} * kSlice * kTetScalars;
+    s.material_scene = material_is_shared ? 0 : int64_t{host.plan.slots} * kSlice * kMaterialScalars;
     int64_t start = 0;
     for (int k = 0; k < kVertexEnergies; ++k) {
       s.data_start[k] = start;
@@ -152,7 +152,7 @@ struct Runner {
     s.scenes = count;
     s.base = base;
     s.rest = at(in.rest);
-    for (int m = 0; m < kTetScalars; ++m) s.material[m] = at(in.material[m]);
+    for (int m = 0; m < kMaterialScalars; ++m) s.material[m] = at(in.material[m]);
     s.data = at(in.data);
     s.tape = tape + base * in.sweeps * s.tape_rows * host.plan.num_active;
   }
@@ -310,9 +310,9 @@ struct Runner {
       const int64_t items = s.scenes * host.plan.num_tets;
       if (auto error = per_item(store_tets<T>, items, s, base, out, per_tet)) return error;
     }
-    for (int m = 0; material && s.one_material && m < kTetScalars; ++m) {
-      const int64_t stride = kTetScalars * s.positions;
-      if (auto error = sum(s.w.material_bar + m, stride, kTetScalars, s.scenes, out.material[m] + base, 1)) {
+    for (int m = 0; material && s.one_material && m < kMaterialScalars; ++m) {
+      const int64_t stride = kMaterialScalars * s.positions;
+      if (auto error = sum(s.w.material_bar + m, stride, kMaterialScalars, s.scenes, out.material[m] + base, 1)) {
         return error;
       }
     }

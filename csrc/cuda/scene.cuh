@@ -133,13 +133,13 @@ struct SceneStar {
   T* x_bar;
   int64_t scene;
   int vertex, first, count;
-  T material[kTetScalars];  // of all tets, if they share it
+  T material[kMaterialScalars];  // of all tets, if they share it
 
   __device__ __forceinline__ SceneStar(const StepInputs<T>& in, const StepAdjoints<T>* out, const GroupPlan& plan,
                                        const Visits<T>& list, const T* x, T* x_bar, int64_t scene)
       : in(in), out(out), plan(plan), list(list), x(x), x_bar(x_bar), scene(scene) {
 #pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) {
+    for (int m = 0; m < kMaterialScalars; ++m) {
       const Batched<const T>& given = in.material[m];
       material[m] = given.data && given.item == 0 ? __ldg(given.data + scene * given.scene) : T(0);
     }
@@ -158,7 +158,7 @@ struct SceneStar {
   __device__ __forceinline__ void rewind() const {}
   __device__ __forceinline__ void adopt(const SceneStar& a) const {
 #pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) material_bar[m] = a.material_bar[m];
+    for (int m = 0; m < kMaterialScalars; ++m) material_bar[m] = a.material_bar[m];
   }
   // A block may lack its y (scene_reverse.cuh); the few ill-conditioned ones load it.
   __device__ __forceinline__ Vec3<T> predictor(const Block<T>& b) const {
@@ -179,10 +179,6 @@ struct SceneStar {
     const T* a = x + offset;
     return {a[0], a[kColumn], a[2 * kColumn]};
   }
-  // Corner of its tet that the vertex is, where the law depends on it.
-  __device__ __forceinline__ int corner(int e) const {
-    return kPrevScalars > 0 ? __ldg(plan.visit_pair + 4 * (first + e) + 3) : 0;
-  }
   __device__ __forceinline__ TetPair<T> pair(int e) const {
     const int4 row = list.pair[first + e];
     TetPair<T> p;
@@ -190,7 +186,7 @@ struct SceneStar {
     p.xk = at(row.y);
     p.xl = at(row.z);
 #pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) p.material[m] = material[m];
+    for (int m = 0; m < kMaterialScalars; ++m) p.material[m] = material[m];
     const Pack<T>* shared = reinterpret_cast<const Pack<T>*>(list.rest + kRestRow * (first + e));
     T rest[kRestRow];
 #pragma unroll
@@ -200,10 +196,9 @@ struct SceneStar {
         const int pair = __ldg(plan.visit_pair + 4 * (first + e) + 2);
         Visits<T>::load_rest(in.rest.data + scene * in.rest.scene, pair, rest);
       }
-      const int own = corner(e);
 #pragma unroll
-      for (int m = 0; m < kTetScalars; ++m) {
-        const Batched<const T>& given = in.material[TetLayout::scalar_index(own, m)];
+      for (int m = 0; m < kMaterialScalars; ++m) {
+        const Batched<const T>& given = in.material[m];
         if (given.item != 0) p.material[m] = __ldg(given.data + scene * given.scene + row.w);
       }
     }
@@ -234,12 +229,11 @@ struct SceneStar {
   }
   __device__ __forceinline__ void add_material(int e, const T* bar) const {
 #pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) material_bar[m] += bar[m];
+    for (int m = 0; m < kMaterialScalars; ++m) material_bar[m] += bar[m];
     if (!common && out->material[0] && !one_for_items(in.material)) {
       const int64_t tet = scene * plan.num_tets + list.pair[first + e].w;
-      const int own = corner(e);
 #pragma unroll
-      for (int m = 0; m < kTetScalars; ++m) out->material[TetLayout::scalar_index(own, m)][tet] += bar[m];
+      for (int m = 0; m < kMaterialScalars; ++m) out->material[m][tet] += bar[m];
     }
   }
   __device__ __forceinline__ void add_rest(int e, const T* bar) const {
@@ -248,7 +242,7 @@ struct SceneStar {
 #pragma unroll
     for (int a = 0; a < kPairRest; ++a) to[TetLayout::rest_index(own, a)] += bar[a];
   }
-  mutable T material_bar[kTetScalars] = {};
+  mutable T material_bar[kMaterialScalars] = {};
 };
 
 // y: null where nothing depends on it.

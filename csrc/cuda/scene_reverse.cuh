@@ -72,7 +72,7 @@ struct ReverseVisits {
     }
     if (left == 0 && out.material[0] && one_for_items(in.material)) {
 #pragma unroll
-      for (int m = 0; m < kTetScalars; ++m) out.material[m][scene] = star.material_bar[m];
+      for (int m = 0; m < kMaterialScalars; ++m) out.material[m][scene] = star.material_bar[m];
     }
     return left;
   }
@@ -118,7 +118,7 @@ __device__ void clear_scene(const StepInputs<T>& in, const StepAdjoints<T>& out,
   };
   clear(out.mass, plan.num_vertices);
   clear(out.x_prev, 3 * int64_t{plan.num_vertices});
-  for (int m = 0; !one_for_items(in.material) && m < kTetScalars; ++m) clear(out.material[m], plan.num_tets);
+  for (int m = 0; !one_for_items(in.material) && m < kMaterialScalars; ++m) clear(out.material[m], plan.num_tets);
   clear(out.rest, int64_t{plan.num_tets} * kRestScalars);
   clear(out.data, in.data_size);
 }

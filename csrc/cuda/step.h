@@ -27,7 +27,7 @@ struct StepInputs {
   using Scalar = T;
   int64_t scenes;
   Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
-  Batched<const T> material[kTetScalars];       // [B, T] or one value for a scene (item 0)
+  Batched<const T> material[kMaterialScalars];  // [B, T] or one value for a scene (item 0)
   Batched<const T> mass;                        // [B, V]
   Batched<const T> rest;                        // [B, slots, kRestRow / pack, kSlice, pack], see pack_rest
   Batched<const T> data;                        // [B, N]
@@ -57,7 +57,7 @@ struct StepAdjoints {
   using Scalar = T;
   const T *x_bar, *v_bar;                      // of the outputs; v_bar only of a fused step, either may be null there
   T *x_start, *x_prev, *y;                     // [B, V, 3]
-  T* material[kTetScalars];                    // [B, 1 | T] each; null where not wanted, as below
+  T* material[kMaterialScalars];               // [B, 1 | T] each; null where not wanted, as below
   T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
   T *x, *v, *acceleration, *prescribed;        // of a fused step, null where not wanted
   const contact::ContactAdjoints<T>* contact;  // on the host; with contact, as are the next
@@ -72,7 +72,7 @@ struct Workspace {
   T *y, *x_prev, *origin, *y_bar, *x_prev_bar;  // [blocks, 3, kSlice]
   T *mass, *mass_bar;                           // [positions]
   T *material,
-      *material_bar;  // [slots, kSlice, kTetScalars]; the bar [positions, ...] if a scene has one material
+      *material_bar;  // [slots, kSlice, kMaterialScalars]; the bar [positions, ...] if a scene has one material
   T* rest_bar;        // [slots, kSlice, kPairRest]
   T* data_bar;        // [scalars, positions]
   // with contact:
@@ -101,7 +101,7 @@ struct StepView {
   bool one_material;                   // `material` below; else w.material
   bool has_tets;                       // whether tets have an energy
   bool own;                            // whether a block has its scene to itself
-  Batched<const T> mass, rest, data, material[kTetScalars];
+  Batched<const T> mass, rest, data, material[kMaterialScalars];
   int64_t material_scene;
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies], data_row[kVertexEnergies];
@@ -179,7 +179,8 @@ constexpr int kFewStages = 2, kManyStages = 4;  // powers of two
 DIFFVBD_FN constexpr bool has_stages(int lanes, bool reverse) { return reverse && lanes < kManyLanes; }
 template <class T>
 DIFFVBD_FN constexpr int stage_scalars() {
-  return kSlice * (kRestRow + kTetScalars) + kSlice * static_cast<int>(sizeof(int32_t)) / static_cast<int>(sizeof(T));
+  return kSlice * (kRestRow + kMaterialScalars) +
+         kSlice * static_cast<int>(sizeof(int32_t)) / static_cast<int>(sizeof(T));
 }
 
 // Scalars of shared memory of a warp, for stars of up to `degree` neighbours and `valence` pairs.

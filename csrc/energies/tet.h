@@ -11,43 +11,25 @@ struct TetLayout {
   static constexpr int material = 2;   // of a tet: mu, lam [Pa]
   static constexpr int rest = 7;       // of a tet: the stiffness weights k01 k02 k03 k12 k13 k23 [m], c6 [1/m^3]
   static constexpr int pair_rest = 4;  // of them, as corner `local` sees them: k_ij, k_ik, k_il, c6
-  // Whether the law reads where its corners were at the start of the step (before()), as damping does; twin of
-  // TET_READS_X_PREV in diffvbd/ops/fields.py.
-  static constexpr bool reads_x_prev = false;
 
   DIFFVBD_FN static constexpr int rest_index(int local, int i) {
     return i == 3 ? 6 : weight_index(local, other_corner(local, i));
   }
   static constexpr int line_degree = 6;  // of the tet's energy along a line, a polynomial: StableNeoHookean::line()
 
-  // Which of a tet's scalars corner `local` has at `i`: the material is the same to all; of the twelve that follow,
-  // if the law reads them, its own corner's come first.
-  DIFFVBD_FN static constexpr int scalar_index(int local, int i) {
-    if (i < material) return i;
-    const int corner = (i - material) / 3, component = (i - material) % 3;
-    return material + 3 * (corner == 0 ? local : other_corner(local, corner - 1)) + component;
-  }
   template <class T>
   DIFFVBD_FN static T volume(const T* rest) {
     return 1 / (6 * rest[6]);
   }
 };
-constexpr int kPrevScalars = TetLayout::reads_x_prev ? 12 : 0;
-constexpr int kMaterialScalars = TetLayout::material, kTetScalars = kMaterialScalars + kPrevScalars;
+constexpr int kMaterialScalars = TetLayout::material;
 constexpr int kRestScalars = TetLayout::rest, kPairRest = TetLayout::pair_rest;
 
 // One (vertex, tet) pair as its vertex sees it; (j, i, k, l) is an even permutation of the tet.
 template <class R>
 struct TetPair {
   Vec3<R> xj, xk, xl;
-  R rest[kPairRest], material[kTetScalars];
-
-  // x_prev of corner c: 0 is i, then j, k, l
-  DIFFVBD_FN Vec3<R> before(int c) const {
-    static_assert(sizeof(R) > 0 && TetLayout::reads_x_prev, "TetLayout::reads_x_prev is false");
-    const R* p = material + kMaterialScalars + 3 * c;
-    return {p[0], p[1], p[2]};
-  }
+  R rest[kPairRest], material[kMaterialScalars];
 };
 
 // The adjoints of a tet's corners by one reversed update, with the sign and h^2 applied.
@@ -64,7 +46,7 @@ template <class Law, int wanted, class R, class Star, class View>
 DIFFVBD_FN void reverse_shape(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
                               const Vec3<R>& p, const R& minus_h2) {
   if (star.template wants<wanted>(kMaterial)) {
-    R material_bar[kTetScalars];
+    R material_bar[kMaterialScalars];
     Law::material_vjp(tet, view, d_raw, p, minus_h2, material_bar);
     star.add_material(e, material_bar);
   }

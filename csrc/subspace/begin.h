@@ -374,16 +374,11 @@ DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, c
     const int32_t* tet = in.tets + 5 * int64_t{first + i};
     rigid::Vector one[4], displacement[4];
     for (int c = 0; c < 4; ++c) one[c] = b.position(tet[1 + c]), displacement[c] = other(tet[1 + c]) - one[c];
-    double rest[kRestScalars], material[kTetScalars];
+    double rest[kRestScalars], material[kMaterialScalars];
     const T* of_tet = in.rest.data + b.scene * in.rest.scene + kRestScalars * int64_t{tet[0]};
     for (int c = 0; c < kRestScalars; ++c) rest[c] = of_tet[c];
     for (int m = 0; m < kMaterialScalars; ++m) {
       material[m] = in.material[m].data[b.scene * in.material[m].scene + in.material[m].item * tet[0]];
-    }
-    if constexpr (TetLayout::reads_x_prev) {
-      for (int c = 0; c < 4; ++c) {
-        put(material + kMaterialScalars + 3 * c, b.state(tet[1 + c], one[c]).x_prev);
-      }
     }
     double increase[TetLayout::line_degree]{};
     TetLaw::line(one, displacement, rest, material, increase);

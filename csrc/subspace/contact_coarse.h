@@ -609,7 +609,7 @@ void coarse_reverse(const Run& run, const CoarseInputs<T>& c, const double* a, c
             const Vector P = wide_at(given.p + 3 * (scene * N + v));
             const auto pair = c.pair_of(scene, tet, local, [&](int64_t u) { return b.position(u); });
             const auto view = TetLaw::view(pair, b.position(v), Vector{}, P);
-            double own_material[kTetScalars], own_rest[kPairRest];
+            double own_material[kMaterialScalars], own_rest[kPairRest];
             TetLaw::material_vjp(pair, view, Vector{}, P, minus_h2, own_material);
             TetLaw::rest_vjp(pair, view, Vector{}, P, minus_h2, own_rest);
             for (int k = 0; k < kMaterialScalars; ++k) material[k] += own_material[k];

@@ -67,8 +67,6 @@ class System(Model):
             return
         if not self.energy_mask & ELASTIC:
             fail("subspace", "no coarse space without StableNeoHookean", repr(self.coarse))
-        if ops.TET_READS_X_PREV:
-            fail("subspace", "no coarse space with a law of tets that reads where a step began", repr(self.coarse))
 
     def _arrange_coarse(self) -> None:
         """The coarse space, in float64, on the CPU, then placed."""

@@ -32,7 +32,6 @@ from .fields import (
     STARTS,
     STEP_ADJOINTS,
     SWEEP_ADJOINTS,
-    TET_READS_X_PREV,
     THREAD,
     TOUCHING_ADJOINTS,
     BeginFields,

@@ -13,9 +13,7 @@ from .load import raw
 
 _C: dict[str, Any] = {a.name: a.default_value for a in raw.constants.default._schema.arguments}
 LANES = {"cpu": _C["cpu_lanes"], "cuda": _C["cuda_lanes"]}  # vertices of a block of the plan
-PLAN_HEADER, ROW, REST_SCALARS, TET_READS_X_PREV = (
-    _C[name] for name in ("plan_header", "row", "rest_scalars", "tet_reads_x_prev")
-)
+PLAN_HEADER, ROW, REST_SCALARS = (_C[name] for name in ("plan_header", "row", "rest_scalars"))
 REST_ROW = {"cpu": _C["pair_rest"], "cuda": -(-_C["pair_rest"] // 4) * 4}  # of what a vertex sees; whole loads on CUDA
 LAG_SCALARS, PLANE_SCALARS = _C["lag_scalars"], _C["plane_scalars"]
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS, CROSSING_ROW = (
@@ -70,7 +68,6 @@ class SweepFields(NamedTuple):
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     center: Tensor | None = None  # [B, V, 3] from where a vertex may go,
     trust_radius: Tensor | None = None  # [B, V] as far as this [m]
-    corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
     # [B, 9 cells]  Cholesky factors (CUDA: inverses), with vertex energies the matrices; its adjoint is the matrix's
     coarse_factor: Tensor | None = None

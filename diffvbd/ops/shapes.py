@@ -29,7 +29,6 @@ from .fields import (
     REST_SCALARS,
     START_LOWER,
     SWEEP_ADJOINTS,
-    TET_READS_X_PREV,
     UNKNOWNS,
     CoarseSizes,
     corrections_shape,
@@ -73,7 +72,7 @@ def _sweep(a: Any) -> Any:
 
 def _body_adjoints(x: Tensor, a: Any, wants: Sequence[bool]) -> list[Tensor]:
     """Of mu, lam, mass, rest. CUDA sums the material that a scene shares."""
-    shares = a.mu.is_cuda and a.mu.shape[-1] == 1 and a.lam.shape[-1] == 1 and not TET_READS_X_PREV
+    shares = a.mu.is_cuda and a.mu.shape[-1] == 1 and a.lam.shape[-1] == 1
     (b, v), tets = x.shape[:2], a.sizes[1]
     material = (b, 1 if shares else tets)
     shapes = (material, material, (b, v), (b, tets, REST_SCALARS))
@@ -84,13 +83,13 @@ def _sweep_backward(a: Any) -> Any:
     x, wants = a.x, a.wants
     b, v = x.shape[:2]
     own = [*same(x, 3), *_body_adjoints(x, a, wants[:3]), wanted(wants[3], x, b, a.energy_data.shape[-1])]
-    last = [wanted(wants[0], x, *a.corners_prev.shape), wanted(wants[4], x, *a.coarse_factor.shape)]
+    last = wanted(wants[4], x, *a.coarse_factor.shape)
     if not a.energies & CONTACT:
-        return (*own, *(new(x, 0) for _ in range(len(SWEEP_ADJOINTS) - len(own) - len(last))), *last)
+        return (*own, *(new(x, 0) for _ in range(len(SWEEP_ADJOINTS) - len(own) - 1)), last)
     colliders = a.collider.shape[1] if a.collider.dim() == 3 else 0
     planes = a.floor_lag.numel() // max(1, a.floor_lag.shape[0] * 4 * v)
     shapes = ((b, colliders, 3), (b, colliders, 3), (b,), (a.lag_pairs.shape[0], LAG_SCALARS), (b, v, planes, 4))
-    return (*own, *(new(x, *shape) for shape in shapes), *last)
+    return (*own, *(new(x, *shape) for shape in shapes), last)
 
 
 def _fused_step(a: Any) -> Any:

@@ -114,7 +114,7 @@ def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, 
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
         x, tape, limits, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
-    material = wants["mu"] or wants["lam"] or wants["corners_prev"]
+    material = wants["mu"] or wants["lam"]
     flags = [material, wants["mass"], wants["rest"], wants["energy_data"], wants["coarse_factor"]]
     bars = raw.sweep_backward(
         *given, x_bar.contiguous(), x, tape, corrections, limits, plan, *settings, tape_policy, flags
@@ -176,8 +176,6 @@ def _vmap_reverse(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tu
 def _plain(fields: SweepFields) -> None:
     if fields.center is not None:
         no_transforms()
-    if fields.corners_prev is not None:
-        raise NotImplementedError("diffvbd: torch.func transforms of a law that reads x_prev are not supported")
     if fields.coarse_plan is not None:
         raise NotImplementedError("diffvbd: torch.func transforms of coarse corrections are not supported")
 

@@ -114,13 +114,7 @@ def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
-    simple = (
-        simple
-        and not model.corrects
-        and model.coarse is None
-        and model.starts_from == "predictor"
-        and not ops.TET_READS_X_PREV
-    )
+    simple = simple and not model.corrects and model.coarse is None and model.starts_from == "predictor"
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False
     return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]

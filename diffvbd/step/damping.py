@@ -1,4 +1,4 @@
-"""Viscosity and drag, as other values of what a solve reads anyway (docs/method.md, section 22).
+"""Viscosity and drag, as other values of what a solve reads anyway (docs/method.md, section 20).
 
 Viscosity: the dissipation potential of a solve over h is that of a second stable Neo-Hookean law with the moduli
 viscosity / h and volume_viscosity / h, whose rest shape is where the tets were at the start, times the square of their

@@ -24,7 +24,6 @@ from .._common.context import looks_at, recorders, refuse_transforms, replaced
 from ..energies import barrier_curvature
 from ..model.solver import BDF2, SDIRK2, ImplicitEuler, Integrator
 from ..model.system import System
-from ..ops import TET_READS_X_PREV
 from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import STAGED, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse import coarse_mass
@@ -136,9 +135,6 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
     if isinstance(integrator, ImplicitEuler):
         x_end, v_end, last = solve(x, v, whole, end)
         return Taken(x_end, v_end, None, last)
-    if TET_READS_X_PREV:  # whose rate is that of the reference
-        raise NotImplementedError(f"integrator: expected ImplicitEuler() with a law of tets that reads x_prev, got "
-                                  f"{integrator}")  # fmt: skip
     time_step = whole.settings.numbers.time_step
     if model.touches:
         refuse_transforms("a step with contact")

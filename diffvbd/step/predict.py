@@ -54,12 +54,8 @@ class Begun(NamedTuple):
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
-        fields = ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
-                                 prepared.rest, self.data, self.origin)  # fmt: skip
-        if not ops.TET_READS_X_PREV:
-            return fields
-        corners = self.x_prev[:, model.tets].flatten(2).permute(2, 0, 1).contiguous()
-        return replaced(fields, corners_prev=corners)
+        return ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
+                               prepared.rest, self.data, self.origin)  # fmt: skip
 
     def corrected(self, x: Tensor, model: System, prepared: Prepared) -> Tensor:
         """x [B, V, 3] after the rigid correction, where the Model has one."""
