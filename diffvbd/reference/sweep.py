@@ -54,8 +54,8 @@ def step(
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
     coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
     given; record: a list, to which the step appends the lengths that it took.
-    parameters: of energies, as `floor_kappa`, and those of MATERIAL. Raises ValueError when an unpinned vertex starts below a floor plane.
-    Returns (x', v').
+    parameters: of energies, as `floor_kappa`, and those of MATERIAL. Raises ValueError when an unpinned vertex starts
+    below a floor plane. Returns (x', v').
     """
     system = executed(model, solver)
     layout = build_layout(system, tet_order)

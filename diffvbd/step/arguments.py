@@ -180,7 +180,7 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
-    mu, lam, young, poisson, rest_points, density, stress_free, *dampings = given_inputs.material.values()
+    mu, lam, young, poisson, rest_points, density, stress_free, *_ = given_inputs.material.values()
     parameters = given_inputs.parameters
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
@@ -241,9 +241,6 @@ def prepare(
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
-    damping = None
-    if any(value is not None for value in dampings):
-        damping = _damping(model, like, lead, *dampings, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],
@@ -253,7 +250,7 @@ def prepare(
         settings=settings,
         coarse=coarse,
         unrolled=unrolled,
-        damping=damping,
+        damping=_damping(model, like, lead, given_inputs.material, corners),
     )
 
 
@@ -268,20 +265,21 @@ def _stress_free(given: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     return corners, rest_metric(corners)[0]
 
 
-def _damping(model: System, like: Tensor, lead: tuple[int, ...], viscosity: Any, volume_viscosity: Any, drag: Any,
-             corners: Tensor | None) -> Damping:  # fmt: skip
+def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str, Any], corners: Tensor | None
+             ) -> Damping | None:  # fmt: skip
     """corners: of the tets' rest shapes [B, T, 4, 3] where a step is given those."""
     out: dict[str, Tensor | None] = {}
-    for name, value, own in (("viscosity", viscosity, (model.num_tets,)),
-                             ("volume_viscosity", volume_viscosity, (model.num_tets,)),
-                             ("drag", drag, (model.num_vertices,))):  # fmt: skip
-        out[name] = None if value is None else _scenes_first(name, value, like, lead, own)
-        if value is not None and not transformed() and (checking() or not like.is_cuda):
-            axes = ("scene", "vertex") if name == "drag" else SCENE_TET
-            name_value(name, "finite numbers >= 0", out[name], out[name] >= 0, axes)
-    if model.block == "paper" and not (viscosity is None and volume_viscosity is None):
-        fail("viscosity", 'a solver with block="exact"', 'one with block="paper"')
-    return Damping(**out, corners=corners)
+    for name in (*VISCOSITIES, "drag"):
+        value, own = given[name], (model.num_vertices if name == "drag" else model.num_tets,)
+        if value is not None:
+            value = _scenes_first(name, value, like, lead, own)
+            if not transformed() and (checking() or not like.is_cuda):
+                axes = ("scene", "vertex") if name == "drag" else SCENE_TET
+                name_value(name, "finite numbers >= 0", value, value >= 0, axes)
+            if model.block == "paper" and name != "drag":
+                fail(name, 'a solver with block="exact"', 'one with block="paper"')
+        out[name] = value
+    return Damping(**out, corners=corners) if any(value is not None for value in out.values()) else None
 
 
 def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,

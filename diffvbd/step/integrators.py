@@ -170,11 +170,11 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
             weights, loads = _of_euler(model, weights, end, x, euler, fraction)
         else:
             loads = end
-        reference = None
+        began = None
         if weights.damping is not None:
-            reference = feasible + weights.settings.numbers.time_step * carried
-            reference = reference if euler is None else torch.where(euler[..., None], x, reference)
-        x_end, v_end, last = solve(feasible, start, weights, loads, reference, begun)
+            began = feasible + weights.settings.numbers.time_step * carried
+            began = began if euler is None else torch.where(euler[..., None], x, began)
+        x_end, v_end, last = solve(feasible, start, weights, loads, began, begun)
         v_end = v_end - carried if euler is None else torch.where(euler[..., None], fraction * v_end, v_end - carried)
         return Taken(x_end, v_end, remembered(x_end), last)
 

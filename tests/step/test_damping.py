@@ -80,7 +80,9 @@ class Mode:
 
     def amplitudes(self, solver: dv.VBD, steps: int, **damping: Any) -> Tensor:
         x = self.model.rest_points
-        motion = dv.rollout(self.model, x, 1e-5 * self.shape, solver, steps=steps, gravity=NO_GRAVITY, **MODULI, **damping)
+        motion = dv.rollout(
+            self.model, x, 1e-5 * self.shape, solver, steps=steps, gravity=NO_GRAVITY, **MODULI, **damping
+        )
         weight = self.model.mass[:, None] * self.shape
         return ((motion.x - x) * weight).sum((-2, -1)) * 1e5
 
@@ -186,19 +188,19 @@ def test_gradient_against_central_differences(device: str, integrator: Any, subs
     v[:, 1] = torch.where(x[:, 1] > 0.1, -0.5, 0.0)
     weight = randn(mesh.num_vertices, 3, seed=2).to(device)
 
-    def loss(**inputs: Tensor) -> Tensor:
-        start = {name: inputs.pop(name) for name in ("x", "v")}
-        motion = dv.rollout(model, **start, solver=dv.VBD(0.004, 4, subspace=subspace, integrator=integrator), steps=2,
-                            save="last", young=1e5, poisson=0.3, **inputs)  # fmt: skip
+    solver = dv.VBD(0.004, 4, subspace=subspace, integrator=integrator)
+
+    def loss(x: Tensor, v: Tensor, viscosity: Tensor, volume_viscosity: Tensor, drag: Tensor) -> Tensor:
+        motion = dv.rollout(model, x, v, solver, steps=2, save="last", young=1e5, poisson=0.3, viscosity=viscosity,
+                            volume_viscosity=volume_viscosity, drag=drag)  # fmt: skip
         return (weight * (motion.x[-1] + 0.01 * motion.v[-1])).sum()
 
     def between(low: float, high: float, count: int) -> Tensor:
         return torch.linspace(low, high, count, dtype=torch.float64, device=device)
 
-    arguments = {"x": x, "v": v, "viscosity": between(10, 200, mesh.num_tets),
-                 "volume_viscosity": between(200, 20, mesh.num_tets), "drag": between(1, 30, mesh.num_vertices)}  # fmt: skip
-    found = dv.check_gradients(lambda x, v, viscosity, volume_viscosity, drag: loss(
-        x=x, v=v, viscosity=viscosity, volume_viscosity=volume_viscosity, drag=drag), arguments, tolerance=1e-5, verbose=False)  # fmt: skip
+    viscosities = {"viscosity": between(10, 200, mesh.num_tets), "volume_viscosity": between(200, 20, mesh.num_tets)}
+    arguments = {"x": x, "v": v, **viscosities, "drag": between(1, 30, mesh.num_vertices)}
+    found = dv.check_gradients(loss, arguments, tolerance=1e-5, verbose=False)
     assert found.ok, str(found)
     assert all(row[1] > 0 for row in found.rows)
 
@@ -247,8 +249,8 @@ def test_bad_input() -> None:
     model = dv.Model(dv.mesh.cube(split="kuhn"))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 
-    def step(model: dv.Model = model, solver: dv.VBD = dv.VBD(0.01, 2), **inputs: Any) -> None:
-        dv.step(model, x, v, solver, **{**MODULI, **inputs})
+    def step(**inputs: Any) -> None:
+        dv.step(model, x, v, **{"solver": dv.VBD(0.01, 2), **MODULI, **inputs})
 
     for name in ("viscosity", "volume_viscosity", "drag"):
         for value in (-1.0, NAN, INF):

@@ -29,7 +29,9 @@ def test_growth_is_another_rest_shape(device: str) -> None:
     grown = matrix((1.2, 0.1, 0.0), (0.0, 1.1, -0.05), (0.05, 0.0, 0.9)).to(device)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     solver = dv.VBD(0.01, sweeps=6)
-    by_points = dv.step(model, x, v, solver, rest_points=x @ grown.T, density=1000 / torch.linalg.det(grown), **MATERIAL)
+    by_points = dv.step(
+        model, x, v, solver, rest_points=x @ grown.T, density=1000 / torch.linalg.det(grown), **MATERIAL
+    )
     by_tets = dv.step(model, x, v, solver, stress_free=grown, **MATERIAL)
     assert float((by_tets[0] - x).abs().max()) > 1e-3
     assert float((by_points[0] - by_tets[0]).abs().max()) < 1e-13
@@ -54,8 +56,8 @@ def test_fibres_contract_at_constant_volume() -> None:
     assert float((torch.linalg.det(contracted) - 1).abs().max()) < 1e-14
     assert float((contracted[:, 0, 0] - 0.8).abs().max()) < 1e-15
     x = model.rest_points
-    motion = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(0.05, sweeps=40, subspace="coarse"), steps=10, stress_free=contracted,
-                        gravity=NO_GRAVITY, **MATERIAL)  # fmt: skip
+    motion = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(0.05, sweeps=40, subspace="coarse"), steps=10,
+                        stress_free=contracted, gravity=NO_GRAVITY, **MATERIAL)  # fmt: skip
     tip = x[:, 0] > 0.39
     length = float(motion.x[-1][tip, 0].mean()) / 0.4
     assert 0.80 < length < 0.83  # the pinned face keeps the fibres near it long
@@ -73,7 +75,9 @@ def test_activation_recovered_from_a_motion() -> None:
 
     def frames(activation: Tensor) -> Tensor:
         g = dv.fibre_contraction(along, activation[muscle])
-        motion = dv.rollout(model, x, v, solver, steps=12, stress_free=lambda k, x, v: g, gravity=NO_GRAVITY, **MATERIAL)
+        motion = dv.rollout(
+            model, x, v, solver, steps=12, stress_free=lambda k, x, v: g, gravity=NO_GRAVITY, **MATERIAL
+        )
         return motion.x
 
     true = torch.tensor([0.05, 0.15, 0.25, 0.1], dtype=torch.float64)
@@ -108,7 +112,9 @@ def test_gradient_against_central_differences(subspace: Any) -> None:
     def loss(stress_free: Tensor, x: Tensor) -> Tensor:
         at, speed = x, v
         for _ in range(2):
-            at, speed = dv.step(model, at, speed, dv.VBD(0.005, 4, subspace=subspace), stress_free=stress_free, **MATERIAL)
+            at, speed = dv.step(
+                model, at, speed, dv.VBD(0.005, 4, subspace=subspace), stress_free=stress_free, **MATERIAL
+            )
         return (at * torch.linspace(-1, 1, at.numel(), dtype=torch.float64).reshape(at.shape)).sum()
 
     found = dv.check_gradients(loss, {"stress_free": g, "x": x}, verbose=False)
