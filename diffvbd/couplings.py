@@ -130,11 +130,11 @@ class _Differences(NamedTuple):
         corners = self.rows.gather(x).unflatten(1, tuple(self.weights.shape))
         return (corners * self.weights.to(x.dtype)[..., None]).sum(-2)
 
-    def load(self, pull: Tensor, stiffness: Tensor) -> Tensor:
-        """Of gradients with respect to d [B, N, M, 3] and bounds of the stiffness of d [B, N, M], as Coupling.load."""
+    def spread(self, pull: Tensor, stiffness: Tensor) -> Tensor:
+        """Gradients with respect to d [B, N, M, 3] and bounds of the stiffness of d [B, N, M, 1] as those of each
+        weight, [B, N M n, 4]; their sums by vertex are a load()."""
         weights, bounds = (t.to(pull.dtype)[..., None] for t in (self.weights, self.bounds))
-        parts = [weights * pull[..., None, :], bounds * stiffness[..., None, None]]
-        return self.rows.sum(torch.cat([*parts], -1).flatten(1, 3))
+        return torch.cat([weights * pull[..., None, :], bounds * stiffness[..., None]], -1).flatten(1, 3)
 
 
 @init_names_checked
@@ -215,7 +215,17 @@ class Springs(Coupling):
 
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         # k / 2 |d|^2 - k L |d|, of which the second part is concave: k bounds all of it
-        return self._ends.load(self.pull(x, values)[:, :, None], values["stiffness"][..., None])
+        spread = self._ends.spread(self.pull(x, values)[:, :, None], values["stiffness"][..., None, None])
+        return self._ends.rows.sum(spread)
+
+
+class _Own(NamedTuple):
+    """The vertices of each tendon, U of all of them."""
+
+    of_entries: Rows  # entries of segments, by such a vertex
+    of_tendons: Rows  # U, by tendon
+    of_vertices: Rows  # U, by vertex of the mesh
+    moving: Tensor  # [U] 1 where it is not pinned
 
 
 @init_names_checked
@@ -244,6 +254,7 @@ class Tendons(Coupling):
     units: ClassVar[dict[str, str]] = {"stiffness": "N/m", "rest_length": "m"}
 
     _segments: ClassVar[_Differences]
+    _own: ClassVar[_Own]
 
     points: Embedding
     routes: Sequence[Sequence[int]]
@@ -281,7 +292,13 @@ class Tendons(Coupling):
             a, b = list(route[:-1]), list(route[1:])
             index[k, : len(a)] = np.concatenate([vertices[b], vertices[a]], -1)
             w[k, : len(a)] = np.concatenate([weights[b], -weights[a]], -1)
-        return self._with(_segments=_Differences.of(index, w, pinned))
+        segments = _Differences.of(index, w, pinned)
+        entry = segments.rows.group.reshape(-1)[: segments.rows.rows].reshape(shape[0], -1)
+        own, of = torch.unique(entry + torch.arange(shape[0])[:, None] * mesh.num_vertices, return_inverse=True)
+        tendon, vertex = own // mesh.num_vertices, own % mesh.num_vertices
+        own = _Own(Rows.of(of.reshape(-1), len(own)), Rows.of(tendon, shape[0]), Rows.of(vertex, mesh.num_vertices),
+                   (~pinned[vertex]).double())  # fmt: skip
+        return self._with(_segments=segments, _own=own)
 
     def tension(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Tension of each tendon [N], [B, R]."""
@@ -291,11 +308,17 @@ class Tendons(Coupling):
         return values["stiffness"] * (length.sum(-1) - values["rest_length"]).clamp(min=0)
 
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
-        d = self._segments.take(x)
+        d, own = self._segments.take(x), self._own
         length, inverse = _length(d)
-        pull = (self._tension(length, values)[..., None] * inverse)[..., None] * d
-        # l^2 <= sum_m |d_m|^2 l0 / |d0_m| by Cauchy and Schwarz, equal at d0; -2 L l is concave
-        return self._segments.load(pull, (values["stiffness"] * length.sum(-1))[..., None] * inverse)
+        tension = self._tension(length, values)
+        # k n n' with n_i = dl / dx_i, whose rows are bounded by lengths, and what turns the segments, T / |d| at most
+        turns = (tension[..., None] * inverse)[..., None]
+        parts = own.of_entries.sum(self._segments.spread(inverse[..., None] * d, turns))
+        slope, turning = parts.split((3, 1), -1)
+        size = _length(slope)[0][..., None]
+        sums = own.of_tendons.sum(size * own.moving.to(x.dtype)[:, None]) * values["stiffness"][..., None]
+        pull = own.of_tendons.gather(tension[..., None]) * slope
+        return own.of_vertices.sum(torch.cat([pull, size * own.of_tendons.gather(sums) + turning], -1))
 
 
 class _Surfaces(NamedTuple):

@@ -76,11 +76,14 @@ class Tendons:
         return self.scene.time_step**2 * (self.k / 2 * (lengths - self.rest).clamp(min=0) ** 2).sum(-1)
 
     def bound(self, x: Tensor) -> Tensor:
-        total = torch.zeros_like(x[..., 0, :])
+        total, moving = torch.zeros_like(x[..., 0, :]), (~self.scene.model.pinned).to(x)
         for n, route in enumerate(self.routes):
-            lengths = _norm(x @ route.mT)
-            share = lengths.sum(-1, keepdim=True) / lengths
-            total = total + self.k[..., n, None] * (share @ _rows_of_products(route, self.scene))
+            d = x @ route.mT
+            lengths, k = _norm(d), self.k[..., n, None]
+            slope = _norm((d / lengths.unsqueeze(-2)) @ route)  # |dl / dx_i|
+            tension = k * (lengths.sum(-1, keepdim=True) - self.rest[..., n, None]).clamp(min=0)
+            total = total + k * slope * (slope * moving).sum(-1, keepdim=True)
+            total = total + (tension / lengths) @ _rows_of_products(route, self.scene)
         return total
 
 
