@@ -47,6 +47,12 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "contact_motion": (0.03, "motion in contact at few sweeps beside its reference: 3 % is what users are promised"),
     "float32_of_inputs": (200, "times what float32 inputs do to a gradient: rounding decides on damping; measured 126"),
     "dented_rest": (5e-3, "[m/s] sideways on a soft block at K = 5 beside K = 400; measured 2.4e-3, 1.7 where it sank"),
+    "coupled_forward": (
+        1e-13,
+        "a step with springs, tendons and pressure: two records of a vertex are one, and sums differ",
+    ),
+    "coupled_adjoint": (1e-11, "gradients through bounds that are renewed at every sweep; measured 2e-13"),
+    "coupled_float32": (1e-3, "the same in float32: stretches and volumes are differences of positions; measured 1e-4"),
     "contact_forward": (1e-13, "a step with contact: normals and weights lose eps L / gap, here a few digits"),
     "contact_adjoint": (1e-11, "floor of the bar on gradients of steps with contact; above it 10 times the spread"),
     "far_slip_adjoint": (5e-11, "measured 2.7e-11 on a GPU: a long way times stiff friction cancels in rigid motions"),
