@@ -164,11 +164,17 @@ def stepper(
         if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):
             state = _apart(scene, energies, state, _start(scene, energies, x_prev, y), y, x_prev, correct.bodies, held)
 
+        begun_sweeps: list[bool] = []  # with couplings free bodies are corrected before each sweep but the first
+
         def swept(state: Tensor, count: int, ends: bool) -> Tensor:
             if bound is not None and count > 1:
                 for n in range(count):
                     state = swept(state, 1, ends and n + 1 == count)
                 return state
+            if bound is not None and count:
+                renew(state)
+                state = correct(state, y, x_prev) if begun_sweeps else state
+                begun_sweeps.append(True)
             renew(state)
             usual = max(count - 1, 0) if ends else count
             state = run_sweeps(scene, energies, masses, y, state, x_prev, usual)

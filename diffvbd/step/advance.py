@@ -101,7 +101,8 @@ def swept(
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
             if begun.record is not None:
-                end, found = sweep_renewed(model, begun.record, fields, settings, policy, debug_step)
+                end, found = sweep_renewed(model, begun.record, fields, settings, policy, debug_step,
+                                           lambda x: begun.corrected(x, model, prepared))  # fmt: skip
                 corrections = torch.cat([end.new_empty((len(end), 0, 0)), *found][bool(found) :], 1)
             else:
                 end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,

@@ -58,9 +58,9 @@ def _refreshed(model: System, values: list[dict[str, Tensor]], data: Tensor, ori
 
 
 def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settings: ops.SweepSettings, policy: int,
-                  debug_step: int) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
-    """Positions after the sweeps and their coarse corrections, each with the record of the state that it begins at; and
-    what the corrections did."""
+                  debug_step: int, corrected: Callable[[Tensor], Tensor]) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
+    """Positions after the sweeps and their corrections, each with the record of the state that it begins at; and what
+    the coarse ones did. Free bodies are ``corrected`` before each sweep but the first: attached ones pull each other."""
     numbers, coarse = settings.numbers, settings.coarse
     last = replaced(settings, coarse=(), sweeps=1)
     within = replaced(last, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
@@ -75,13 +75,14 @@ def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settin
         corrections.extend([done] if done.numel() else [])
         return end
 
-    def corrected(x: Tensor) -> Tensor:
+    def coarsely(x: Tensor) -> Tensor:
         return run(x, fields, replaced(within, sweeps=0, coarse=replaced(coarse, begun=1)))
 
     for n in range(settings.sweeps):
         if coarse and n and (n - 1) % coarse.every == 0:
-            x = corrected(x)
+            x = coarsely(x)
+        x = corrected(x) if n else x
         x = run(x, plain, last if n + 1 == settings.sweeps else within)
     if coarse and settings.sweeps <= 1:
-        x = corrected(x)
+        x = coarsely(x)
     return x, corrections

@@ -107,8 +107,9 @@ def test_attached_bodies_touch(device: str) -> None:
 
 
 def test_without_couplings_nothing_changes_and_with_slack_ones_little() -> None:
-    """A spring of no stiffness, a slack tendon and no pressure leave the positions of the plain sweeps."""
-    model, solver = coupled(), dv.VBD(STEP, 4)
+    """A spring of no stiffness, a slack tendon and no pressure leave the positions of the plain sweeps; of one, since
+    more have more rigid corrections."""
+    model, solver = coupled(), dv.VBD(STEP, 1)
     values = inputs_of(model)
     none = {"spring_stiffness": 0.0, "tendon_stiffness": 0.0, "pressure": 0.0}
     bare = model.replace(energies=[dv.StableNeoHookean()])
