@@ -12,6 +12,7 @@ Source: Hunter and Lange (2004), "A tutorial on MM algorithms"; docs/method.md, 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -45,7 +46,6 @@ class Coupling:
     bit: ClassVar[int] = 0  # of a scene's mask: it reaches the kernels as the record of an Anchor
     parameters: ClassVar[dict[str, int]]  # as of VertexEnergy
     units: ClassVar[dict[str, str]]
-    signed: ClassVar[tuple[str, ...]] = ()  # parameters that may be negative
 
     def of_mesh(self, mesh: TetMesh, pinned: Tensor) -> Coupling:
         """A copy with the index data of a mesh; raises ValueError where it does not fit. pinned: bool [V]."""
@@ -70,6 +70,10 @@ class Coupling:
         own = {key: getattr(self, key).to(rest_points) for key in self.parameters}
         return {key: value if value.dim() == 2 else value.expand(self._count()) for key, value in own.items()}
 
+    def least(self, key: str) -> float:
+        """The least value of a parameter."""
+        return 0.0
+
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Gradient [N] and bound s [N/m] of each vertex, [B, V, 4]; differentiable.
 
@@ -82,8 +86,8 @@ class Coupling:
         refuse_gradients(self)
         for key in self.parameters:
             value = numbers_of(key, getattr(self, key))
-            if key not in self.signed and bool((value < 0).any()):
-                fail(key, f"numbers >= 0 {self.units[key]}", getattr(self, key))
+            if bool((value < self.least(key)).any()):
+                fail(key, f"numbers >= {self.least(key):g} {self.units[key]}", getattr(self, key))
             object.__setattr__(self, key, value)
 
     def _check_counts(self, noun: str) -> None:
@@ -161,7 +165,6 @@ class Springs(Coupling):
     name: ClassVar[str] = "spring"
     parameters: ClassVar[dict[str, int]] = {"stiffness": 1, "rest_length": 1, "points": 2}
     units: ClassVar[dict[str, str]] = {"stiffness": "N/m", "rest_length": "m", "points": "m"}
-    signed: ClassVar[tuple[str, ...]] = ("points",)
 
     points: ClassVar[Tensor]  # places that second has
     _ends: ClassVar[_Differences]
@@ -195,6 +198,9 @@ class Springs(Coupling):
 
     def _count(self) -> int:
         return len(self.first)
+
+    def least(self, key: str) -> float:
+        return -math.inf if key == "points" else 0.0
 
     def of_mesh(self, mesh: TetMesh, pinned: Tensor) -> Springs:
         ends = [(self.first, 1.0), (self.second, -1.0)] if isinstance(self.second, Embedding) else [(self.first, 1.0)]
@@ -363,7 +369,8 @@ class Pressure(Coupling):
     Args:
         triangles: A closed surface [F, 3], or a list of one for each of the C cavities, wound either way; None: all
             cavities of the mesh (:func:`diffvbd.mesh.cavities`).
-        pressure: p above ambient [Pa], a number or one for each cavity, shape [C]; it may be negative.
+        pressure: p above ambient [Pa], a number or one for each cavity, shape [C]. It may be negative, with ``gas`` down to
+            -ambient.
         gas: Whether the amount of gas is constant.
         ambient: Absolute pressure outside [Pa], which only ``gas`` reads.
 
@@ -379,7 +386,6 @@ class Pressure(Coupling):
     name: ClassVar[str] = "pressure"
     parameters: ClassVar[dict[str, int]] = {"pressure": 1}
     units: ClassVar[dict[str, str]] = {"pressure": "Pa"}
-    signed: ClassVar[tuple[str, ...]] = ("pressure",)
 
     surfaces: ClassVar[tuple[IntArray, ...]]  # in a Model: the triangles of each cavity, normals into the walls
     _surfaces: ClassVar[_Surfaces]
@@ -394,7 +400,8 @@ class Pressure(Coupling):
         check_bool("gas", self.gas)
         object.__setattr__(self, "ambient", check_positive("ambient", self.ambient, "Pa"))
         if self.triangles is not None:
-            several = isinstance(self.triangles, (list, tuple)) and np.ndim(self.triangles[0]) == 2  # pyright: ignore
+            first = next(iter(self.triangles), ()) if isinstance(self.triangles, (list, tuple)) else ()
+            several = np.ndim(first) == 2
             given = self.triangles if several else [self.triangles]
             names = [f"triangles[{k}]" if several else "triangles" for k in range(len(given))]
             found = [int_array(name, part, (None, 3)) for name, part in zip(names, given, strict=True)]
@@ -406,6 +413,9 @@ class Pressure(Coupling):
 
     def _count(self) -> int:
         return len(self._rest_volume)
+
+    def least(self, key: str) -> float:
+        return -self.ambient if self.gas else -math.inf
 
     def of_mesh(self, mesh: TetMesh, pinned: Tensor) -> Pressure:
         given = cavities(mesh) if self.triangles is None else self.triangles
@@ -476,7 +486,7 @@ class Pressure(Coupling):
         bound = torch.zeros_like(slope[..., :1])
         if self.gas:  # and (p + ambient) / V dV/dx_i dV/dx_j, whose rows are bounded by areas
             size = _length(normal)[0][..., None] / 6
-            stiff = (gauge + self.ambient) / volume * 3 * s.of_faces.sum(size)[..., 0]
+            stiff = ((gauge + self.ambient) / volume).clamp(min=0) * 3 * s.of_faces.sum(size)[..., 0]
             bound = size * s.of_faces.gather(stiff[..., None])
         faces = torch.cat([slope, bound], -1).repeat(1, 3, 1)
         edges = torch.cat([torch.zeros_like(bent).expand(-1, -1, 3), bent], -1)

@@ -207,8 +207,9 @@ def prepare(
         if energy in (model.contact, model.friction) and not transformed() and (checking() or not like.is_cuda):
             name_value(name, "finite numbers >= 0", given[name], given[name] >= 0)
         if isinstance(energy, Coupling) and looks_at(given[name]):
-            signed = key in energy.signed
-            name_value(name, f"finite numbers{'' if signed else ' >= 0'}", given[name], (given[name] >= 0) | signed)
+            least = energy.least(key)
+            wanted = f"finite numbers >= {least:g}" if least > -math.inf else "finite numbers"
+            name_value(name, wanted, given[name], given[name] >= least)
     materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")

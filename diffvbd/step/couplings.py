@@ -60,8 +60,8 @@ def _refreshed(model: System, values: list[dict[str, Tensor]], data: Tensor, ori
 def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settings: ops.SweepSettings, policy: int,
                   debug_step: int, corrected: Callable[[Tensor], Tensor]) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
     """Positions after the sweeps and their corrections, each with the record of the state that it begins at; and what
-    the coarse ones did. Free bodies are ``corrected`` before each sweep but the first: attached ones pull each other."""
-    numbers, coarse = settings.numbers, settings.coarse
+    the coarse ones did. Free bodies, which may pull each other, are ``corrected`` before each sweep but the first."""
+    numbers, coarse = settings.numbers, () if fields.coarse_plan is None else settings.coarse
     last = replaced(settings, coarse=(), sweeps=1)
     within = replaced(last, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     plain = replaced(fields, **dict.fromkeys(COARSE_FIELDS))
