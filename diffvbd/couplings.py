@@ -369,8 +369,7 @@ class Pressure(Coupling):
     Args:
         triangles: A closed surface [F, 3], or a list of one for each of the C cavities, wound either way; None: all
             cavities of the mesh (:func:`diffvbd.mesh.cavities`).
-        pressure: p above ambient [Pa], a number or one for each cavity, shape [C]. It may be negative, with ``gas`` down to
-            -ambient.
+        pressure: p above ambient [Pa], a number or one for each cavity, shape [C]; at least -ambient with ``gas``.
         gas: Whether the amount of gas is constant.
         ambient: Absolute pressure outside [Pa], which only ``gas`` reads.
 
