@@ -10,9 +10,11 @@ from . import colliders, contact, mesh, solvers, viz
 from ._contact.barrier import Friction, PairBarrier
 from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, ReverseSweep, Unrolled
+from .couplings import Pressure, Springs, Tendons
+from .embedding import Embedding
 from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .inspect.diagnose import diagnose
-from .inspect.forces import reactions, stress
+from .inspect.forces import coupling_forces, reactions, stress
 from .inspect.gradcheck import check_gradients
 from .inspect.record import record
 from .mesh import TetMesh
@@ -37,20 +39,25 @@ __all__ = [
     "BinomialCheckpoints",
     "Checks",
     "CoarseSpace",
+    "Embedding",
     "FloorBarrier",
     "Friction",
     "GlobalAdjoint",
     "ImplicitEuler",
     "Model",
     "PairBarrier",
+    "Pressure",
     "ReverseSweep",
+    "Springs",
     "StableNeoHookean",
+    "Tendons",
     "TetMesh",
     "Unrolled",
     "advise",
     "check_gradients",
     "colliders",
     "contact",
+    "coupling_forces",
     "diagnose",
     "error_budget",
     "fibre_contraction",

@@ -31,7 +31,7 @@ MAX_PLANES = 8
 FADE = 0.1  # of kappa dhat: the normal force from which a contact has half of its damping; twins in csrc and reference
 
 
-def _numbers(name: str, value: Any) -> Tensor:
+def numbers_of(name: str, value: Any) -> Tensor:
     """Finite numbers as a detached float64 tensor."""
     if isinstance(value, Tensor):
         check_readable(name, value)
@@ -191,7 +191,7 @@ class FloorBarrier(VertexEnergy):
 
     def __post_init__(self) -> None:
         refuse_gradients(self)
-        normal, height = _numbers("normal", self.normal), _numbers("height", self.height).reshape(-1)
+        normal, height = numbers_of("normal", self.normal), numbers_of("height", self.height).reshape(-1)
         normal = normal[None] if normal.dim() == 1 else normal
         if height.shape[0] == 0:
             fail("height", "at least one value", "none")
@@ -311,11 +311,11 @@ class Anchor(VertexEnergy):
         refuse_gradients(self)
         if self.vertices is not None:
             object.__setattr__(self, "vertices", mask_or_indices("vertices", self.vertices))
-        object.__setattr__(self, "stiffness", _numbers("stiffness", self.stiffness))
+        object.__setattr__(self, "stiffness", numbers_of("stiffness", self.stiffness))
         if bool((self._spring < 0).any()):
             fail("stiffness", "numbers >= 0 N/m", self.stiffness)
         if self.points is not None:
-            object.__setattr__(self, "points", _numbers("points", self.points))
+            object.__setattr__(self, "points", numbers_of("points", self.points))
 
     def __repr__(self) -> str:
         """One line: tensors by their shapes."""

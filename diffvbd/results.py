@@ -2,7 +2,7 @@
 
 from .adjoint.routes import LinearSolve
 from .inspect.diagnose import Diagnosis
-from .inspect.forces import Stress
+from .inspect.forces import CouplingForces, Stress
 from .inspect.gradcheck import GradientCheck
 from .rollout.refine import GradientTest, Refinement
 from .rollout.solve import Solution
@@ -14,6 +14,7 @@ from .step.step import Tape
 
 __all__ = [
     "Candidate",
+    "CouplingForces",
     "Diagnosis",
     "ErrorBudget",
     "ErrorEstimate",

@@ -266,8 +266,8 @@ def refuse_gradients(energy: Any) -> None:
 
 
 def input_name(energy: Any, key: str) -> str:
-    """The keyword by which a step takes a parameter of an energy: floor_kappa, pair_damping, friction."""
-    return energy.name if key == "coefficient" else f"{energy.name}_{key}"
+    """The keyword by which a step takes a parameter of an energy: floor_kappa, friction, pressure."""
+    return energy.name if key in ("coefficient", energy.name) else f"{energy.name}_{key}"
 
 
 def check_number(

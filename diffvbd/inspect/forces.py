@@ -17,6 +17,7 @@ from .._common.context import looks_at, replaced, transformed
 from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
+from ..couplings import Pressure, Springs, Tendons
 from ..energies import StableNeoHookean
 from ..model.material import deformed, shape_gradients
 from ..model.model import Model
@@ -35,6 +36,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
+from ..step.couplings import load_of, parameters_at
 from ..step.damping import damped
 from ..step.predict import energy_data
 
@@ -294,9 +296,9 @@ def reactions(
 ) -> Tensor:
     """Forces that hold the pinned vertices where they are: what a support must bear, with the opposite sign.
 
-    The sum of a pinned vertex's reaction, its weight, the external force, elasticity and contact is its mass times its
-    acceleration, which is zero unless ``previous`` tells another. Differentiable by autograd in every tensor; computed
-    in float64.
+    The sum of a pinned vertex's reaction, its weight, the external force, elasticity, springs, tendons, pressure and
+    contact is its mass times its acceleration, which is zero unless ``previous`` tells another. Differentiable by
+    autograd in every tensor; computed in float64.
 
     Args:
         model, inputs: As in :func:`diffvbd.step`. A force on a pinned vertex goes into its support.
@@ -338,6 +340,8 @@ def reactions(
     if given.model.contact is not None:  # planes do not act on pinned vertices
         normal, friction = _contact_at(given, x, previous).on_vertices()
         total = total - normal - friction
+    if given.model.couplings:
+        total = total + load_of(given.model, given.parameters(len(at)), at)[..., :3]
     acceleration = -full(pull)
     if previous is not None:
         start, speed = (full(t) for t in previous)
@@ -348,6 +352,59 @@ def reactions(
     if force is not None:
         total = total - full(broadcastable("force", force, x))
     return torch.where(given.model._pinned[:, None], total, 0.0).reshape(x.shape).to(x.dtype)
+
+
+class CouplingForces(NamedTuple):
+    """What springs, tendons and gas do at a state; None for what a Model has not.
+
+    Attributes:
+        springs: Force of each spring on its first point [N], shape [..., S, 3].
+        tendons: Tension of each tendon [N], shape [..., R].
+        pressure, volume: Pressure above ambient [Pa] and volume [m^3] of each cavity, shape [..., C].
+        vertices: Their force on every vertex [N], shape [..., V, 3].
+    """
+
+    springs: Tensor | None
+    tendons: Tensor | None
+    pressure: Tensor | None
+    volume: Tensor | None
+    vertices: Tensor
+
+
+def coupling_forces(model: Model, x: Tensor, **inputs: Any) -> CouplingForces:
+    """Forces of springs and tendons, and pressure and volume of cavities, at x. Differentiable by autograd in every
+    tensor; computed in float64.
+
+    Args:
+        model: A scene with Springs, Tendons or Pressure.
+        x: Positions [m], shape [..., V, 3].
+        inputs: As in :func:`diffvbd.step`; those of springs, tendons and pressure are read.
+
+    Returns:
+        A :class:`diffvbd.results.CouplingForces` of x's dtype.
+
+    Raises:
+        ValueError, TypeError: As :func:`diffvbd.step`; also for a Model without such an energy.
+
+    Source: docs/method.md, section 21.
+    """
+    given_inputs = _checked(model, x, None, None, inputs)
+    if not model.couplings:
+        fail("model", "Springs, Tendons or Pressure among its energies", "none")
+    _refuse_non_finite(model, {"x": x, **given_inputs.parameters})
+    given = widen(model, x, None, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, {}))
+    at = x.double().reshape(x.shape[:-2].numel(), *x.shape[-2:])
+    values = given.parameters(len(at))
+    found: dict[str, Tensor] = {"vertices": -load_of(given.model, values, at)[..., :3]}
+    for energy, own in zip(given.model.couplings, values, strict=True):
+        if isinstance(energy, Springs):
+            found["springs"] = -energy.pull(at, own)
+        elif isinstance(energy, Tendons):
+            found["tendons"] = energy.tension(at, own)
+        elif isinstance(energy, Pressure):
+            found["pressure"], found["volume"] = energy.state(at, own)
+    shaped = {name: t.reshape(*x.shape[:-2], *t.shape[1:]).to(x.dtype) for name, t in found.items()}
+    return CouplingForces(**{**dict.fromkeys(CouplingForces._fields), **shaped})  # pyright: ignore[reportArgumentType]
 
 
 class Stress(NamedTuple):
@@ -422,6 +479,10 @@ class Wide(NamedTuple):
     def data(self) -> Tensor:
         """Data of the energies [1 | B, n]."""
         return energy_data(self.model, self.prepared, None)
+
+    def parameters(self, scenes: int) -> list[dict[str, Tensor]]:
+        """Parameters of each coupling by key, [B, ...]."""
+        return parameters_at(self.model, self.prepared.parameters, scenes)
 
 
 def widen(model: Model, x: Tensor, solver: VBD | None, given: Given) -> Wide:

@@ -3,46 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad, softplus
+from torch.nn.functional import softplus
 
 from .. import ops
 from .._common.checks import check_count, check_dense, check_positive, check_tensor, fail
 from .._common.context import lasting_tensors, looks_at
 from ..model.model import Model
 from ..ops.contact import neighbor_pairs, unread
+from ..ops.sums import Rows
 
 PAIRS_PER_BODY = 16  # room for pairs where max_pairs is not given; equal balls in contact have 6 (12 neighbors each)
 EXACT_SOFTPLUS = 50.0  # from there on softplus(t) = t in either dtype
-
-
-class _Rows(NamedTuple):
-    """Rows of values, each of which belongs to one group; sums and gathers in a fixed order."""
-
-    group: Tensor  # of each row, [rows / 4, 4]: filled up with 0, because the operators work on corners of tets
-    ptr: Tensor  # [groups + 1]
-    entry: Tensor  # [rows]: those of each group, ascending
-    rows: int
-
-    @classmethod
-    def of(cls, group: Tensor, groups: int) -> _Rows:
-        """group [rows] int64; rows of group ``groups`` belong to none."""
-        key, order = torch.sort(group.to(torch.int32), stable=True)
-        ptr = torch.searchsorted(key, torch.arange(groups + 1, dtype=torch.int32, device=group.device))
-        filled = pad(torch.where(group < groups, group, 0), (0, -group.shape[0] % 4))
-        return cls(filled.reshape(-1, 4), ptr, order.to(torch.int32), group.shape[0])
-
-    def gather(self, values: Tensor) -> Tensor:
-        """Values of the groups [B, groups, C] -> of their rows [B, rows, C]; rows of no group get some group's."""
-        return ops.tet_gather(values, self.group, self.ptr, self.entry).flatten(1, 2)[:, : self.rows]
-
-    def sum(self, values: Tensor) -> Tensor:
-        """Values of rows [B, rows, C] -> sums of the groups [B, groups, C]."""
-        corners = pad(values, (0, 0, 0, 4 * self.group.shape[0] - self.rows)).unflatten(1, (-1, 4))
-        return ops.star_sum(corners, self.group, self.ptr, self.entry)
 
 
 class Bodies:
@@ -83,7 +58,7 @@ class Bodies:
             group, torch.arange(self.count, device=group.device).repeat_interleave(size)
         )
         self._size = size if contiguous else None
-        self._rows = None if contiguous else _Rows.of(group, self.count)
+        self._rows = None if contiguous else Rows.of(group, self.count)
         self.mass = self._sum(mass[None, :, None])[0, :, 0]
         if not bool((self.mass > 0).all()):
             empty = int(labels[(~(self.mass > 0)).nonzero()[0, 0]])
@@ -184,7 +159,7 @@ def _unit_forces(centers: Tensor, pairs: Tensor, radius: float, sharpness: float
     """Sums of the forces of the pairs on each body for a stiffness of 1 N/m, shape [B, N, 3]."""
     scenes, bodies, _ = centers.shape
     group = (pairs[:, :1].to(torch.int64) * bodies + pairs[:, 1:]).reshape(-1)
-    rows = _Rows.of(torch.where(group < 0, scenes * bodies, group), scenes * bodies)
+    rows = Rows.of(torch.where(group < 0, scenes * bodies, group), scenes * bodies)
     ends = rows.gather(centers.reshape(1, -1, 3)).reshape(-1, 2, 3)
     apart = ends[:, 0] - ends[:, 1]
     squared = apart.square().sum(-1)

@@ -11,7 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, IntArray, connected, count, float_array, int_array, positive, warn
+from diffvbd.mesh.arrays import (
+    FloatArray,
+    IntArray,
+    check_mesh,
+    connected,
+    count,
+    float_array,
+    int_array,
+    positive,
+    warn,
+)
 from diffvbd.mesh.io import Source, read_triangles
 from diffvbd.mesh.tet_mesh import TetMesh
 
@@ -233,6 +243,25 @@ def _volume(corners: FloatArray, middle: bool = False) -> float:
     without."""
     a, b, c = (corners - (corners.mean((0, 1)) if middle else 0.0)).transpose(1, 0, 2)
     return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)
+
+
+def cavities(mesh: TetMesh) -> list[IntArray]:
+    """Closed inner surfaces of a mesh, as of a balloon: triangles [F, 3] of each, whose normals point into the walls.
+
+    Raises:
+        TypeError: No TetMesh.
+    """
+    check_mesh(mesh)
+    triangles = mesh.surface
+    if not len(triangles):
+        return []
+    ends = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    edges, of_edge = np.unique(ends, axis=0, return_inverse=True)
+    edge = of_edge.reshape(3, -1).T  # those of each triangle
+    label = connected(edge, len(edges))[edge[:, 0]]
+    parts = [triangles[label == k] for k in np.unique(label)]
+    # outward of the material is into a cavity: its volume is negative
+    return [part[:, ::-1].copy() for part in parts if _volume(mesh.points[part], middle=True) < 0]
 
 
 LOG = logging.getLogger("diffvbd")  # as said.LOGGER, without torch

@@ -12,11 +12,12 @@ from .. import ops
 from .._common.checks import check_readable, fail, refuse_gradient, to_float
 from .._common.messages import warn
 from .._contact.barrier import Friction, PairBarrier
+from ..couplings import COUPLINGS, Coupling
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
 from ..mesh import TetMesh
 
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
-Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
+Energy = StableNeoHookean | VertexEnergy | Coupling | PairBarrier | Friction
 
 
 def checked_device(device: torch.device | str) -> torch.device:
@@ -36,7 +37,7 @@ def checked_device(device: torch.device | str) -> torch.device:
 
 def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
     """At most one energy of each kind, with detached tensors that fit the mesh."""
-    kinds = (StableNeoHookean, *VERTEX_ENERGIES, PairBarrier, Friction)
+    kinds = (StableNeoHookean, *VERTEX_ENERGIES, *COUPLINGS, PairBarrier, Friction)
     if isinstance(energies, kinds):
         energies = (energies,)
     out: list[Energy] = []

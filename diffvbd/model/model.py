@@ -16,7 +16,8 @@ from .._common.context import is_captured, lasting, lasting_tensors
 from .._contact.barrier import Friction, PairBarrier
 from .._contact.colliders import Collider
 from .._contact.surface import ContactSurface, build_surface, check_colliders
-from ..energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
+from ..couplings import Coupling
+from ..energies import VERTEX_ENERGIES, Anchor, FloorBarrier, StableNeoHookean, VertexEnergy
 from ..mesh import TetMesh
 from .arguments import Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
 from .bodies import find_bodies, first_of_body
@@ -25,6 +26,7 @@ from .material import lumped_mass, rest_metric
 from .moving import moving_bodies
 from .solver import VBD
 
+PLACED = (VertexEnergy, Coupling)  # energies that hold tensors
 DEFAULT = VBD(1.0, 1)  # of solvers without options of their own
 
 
@@ -85,7 +87,7 @@ class Model:
         self._derived: dict[str, Any] = {}
         self._set_energies(checked_energies(energies, mesh.num_vertices))
         self.energy_mask = 0
-        for energy in self.energies:
+        for energy in (*self.energies, *self.vertex_energies):
             self.energy_mask |= energy.bit
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
@@ -94,6 +96,7 @@ class Model:
         tets = torch.from_numpy(mesh.tets.copy())
         mask = vertex_mask(pinned, mesh.num_vertices)
         check_isolated(tets, mask)
+        self._set_energies(tuple(e.of_mesh(mesh, mask) if isinstance(e, Coupling) else e for e in self.energies))
         self._density = per_tet_density(density, mesh.num_tets)
         self._given_contact = self.contact
         if self.contact is not None:  # defaults that follow from mesh and mass
@@ -117,6 +120,10 @@ class Model:
         self.energies = energies
         # the energies of single vertices, in the order in which kernels and data keep them
         present = [e for e in energies if isinstance(e, VertexEnergy)]
+        self.couplings = tuple(e for e in energies if isinstance(e, Coupling))
+        if self.couplings and not any(isinstance(e, Anchor) for e in present):
+            # their record, where a step reads it
+            present.append(Anchor(0.0).placed(self.mesh.num_vertices, getattr(self, "device", torch.device("cpu"))))
         self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
         self.floor = next((e for e in energies if isinstance(e, FloorBarrier)), None)
         self.contact = next((e for e in energies if isinstance(e, PairBarrier)), None)
@@ -207,12 +214,13 @@ class Model:
         return float(surface.max_trust_radius.max())
 
     @property
-    def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:
+    def parametric_energies(self) -> tuple[VertexEnergy | Coupling | PairBarrier | Friction, ...]:
         """The energies whose parameters are inputs of a step."""
         contact = [e for e in (self.contact, self.friction) if e is not None]
-        return (*self.vertex_energies, *contact)
+        own = sorted((e for e in self.energies if isinstance(e, VertexEnergy)), key=lambda e: e.bit)
+        return (*own, *self.couplings, *contact)
 
-    def constants(self, energy: VertexEnergy | PairBarrier | Friction) -> dict[str, Tensor]:
+    def constants(self, energy: VertexEnergy | Coupling | PairBarrier | Friction) -> dict[str, Tensor]:
         """The parameters of one of the Model's energies, as tensors of its dtype and device."""
         if energy.name not in self._constants:
             self._constants[energy.name] = check_held(energy.constants(self._rest_points), energy)
@@ -244,7 +252,7 @@ class Model:
                 setattr(self, name, value.to(device, dtype) if value.is_floating_point() else value.to(device))
         self._topology = tuple(t.to(device) for t in self._topology)
         self._bodies, self._other_bodies = self._bodies.to(device), self._other_bodies.to(device)
-        placed = [e.placed(self.num_vertices, device) if isinstance(e, VertexEnergy) else e for e in self.energies]
+        placed = [e.placed(self.num_vertices, device) if isinstance(e, PLACED) else e for e in self.energies]
         self._set_energies(tuple(placed))
         if hasattr(self, "_rest"):
             self._packed_rest = ops.pack_rest(self._rest, self._plan, self._sizes)
@@ -253,7 +261,7 @@ class Model:
             self.surface_of_contact = self.surface_of_contact.to(device, dtype)
         if self.contact is not None:
             self._moving = self._moving.to(device, dtype)
-        for energy in self.parametric_energies:
+        for energy in (*self.parametric_energies, *self.vertex_energies):
             self.constants(energy)
 
     @lasting_tensors()
@@ -283,7 +291,7 @@ class Model:
         own = {
             "density": self._density.cpu(),
             "pinned": self._pinned.cpu() if self._pinned.any() else None,
-            "energies": [e.placed(self.num_vertices, cpu) if isinstance(e, VertexEnergy) else e for e in given],
+            "energies": [e.placed(self.num_vertices, cpu) if isinstance(e, PLACED) else e for e in given],
             "colliders": self.colliders,
             "dtype": self.dtype,
             "device": self.device,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from .autograd import Linear, direct, sum_to
 from .load import raw
@@ -90,3 +91,33 @@ def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
     ptr = torch.searchsorted(ordered, torch.arange(count + 1, device=index.device))
     rows = values.reshape(1, len(values), -1).contiguous()
     return segment_sum(rows, order.to(torch.int32), ptr.to(torch.int32))[0].reshape(out.shape)
+
+
+class Rows(NamedTuple):
+    """Rows of values, each of which belongs to one group; sums and gathers in a fixed order."""
+
+    group: Tensor  # of each row, [rows / 4, 4]: filled up with 0, because the operators work on corners of tets
+    ptr: Tensor  # [groups + 1]
+    entry: Tensor  # [rows]: those of each group, ascending
+    rows: int
+
+    @classmethod
+    def of(cls, group: Tensor, groups: int) -> Rows:
+        """group [rows] int64; rows of group ``groups`` belong to none."""
+        key, order = torch.sort(group.to(torch.int32), stable=True)
+        ptr = torch.searchsorted(key, torch.arange(groups + 1, dtype=torch.int32, device=group.device))
+        filled = pad(torch.where(group < groups, group, 0), (0, -group.shape[0] % 4))
+        return cls(filled.reshape(-1, 4), ptr, order.to(torch.int32), group.shape[0])
+
+    def to(self, device: torch.device) -> Rows:
+        """A copy on a device."""
+        return Rows(self.group.to(device), self.ptr.to(device), self.entry.to(device), self.rows)
+
+    def gather(self, values: Tensor) -> Tensor:
+        """Values of the groups [B, groups, C] -> of their rows [B, rows, C]; rows of no group get some group's."""
+        return tet_gather(values, self.group, self.ptr, self.entry).flatten(1, 2)[:, : self.rows]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Values of rows [B, rows, C] -> sums of the groups [B, groups, C]."""
+        corners = pad(values, (0, 0, 0, 4 * self.group.shape[0] - self.rows)).unflatten(1, (-1, 4))
+        return star_sum(corners, self.group, self.ptr, self.entry)

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from .coarse import Coarse
+from .couplings import Bound, energies_of_sweeps
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import FADE, build_energies, floor_friction, smoothed, tangential6
+from .energies import FADE, floor_friction, smoothed, tangential6
 from .rigid_contact import Correction
 from .scene import Scene, build_layout, build_scene, outer6
 from .sweep import check_start, color_masses, executed, predictor, run_sweeps
@@ -264,7 +265,8 @@ def contact_step(
         density=density,
         parameters=parameters,
     )
-    energies = build_energies(scene, elsewhere=("pair", "friction"))
+    energies, bound = energies_of_sweeps(scene, elsewhere=("pair", "friction"))
+    renew = bound.renew if bound is not None else lambda state: None
     energies += floor_friction(scene, energies)
     masses = color_masses(scene)
     end = _collider_rows(scene, model.collider_points if colliders is None else colliders)
@@ -293,11 +295,13 @@ def contact_step(
         begun, at = state, torch.where(pinned, state + move, state + u + fraction * (move - u))
         forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
         correct = Correction(scene, energies, forces, y, x_prev)
+        renew(at)
         state = correct(at, substep.corrections[0])
         number = sweeps // count + (1 if r < sweeps % count else 0) if substep.sweeps is None else substep.sweeps
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
-            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, substep)
+            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, substep, bound)
+            renew(state)
             for fractions in substep.corrections[1:]:  # of those that do not move again it is 0
                 state = correct(state, fractions)
         if substep.going is not None:
@@ -328,6 +332,7 @@ def in_cycles(
     x_prev: Tensor,
     number: int,
     substep: Any,
+    bound: Bound | None = None,
 ) -> Tensor:
     """The state [..., 3, V] after so many sweeps.
 
@@ -342,6 +347,8 @@ def in_cycles(
     lengths: Any = substep.lengths
     done, corrected = 0, 0
     while done < number:
+        if bound is not None:
+            bound.renew(state)
         if corrections is not None and done:
             state = corrections(state, lengths[corrected].reshape(*lead, -1))
             corrected += 1
@@ -350,6 +357,8 @@ def in_cycles(
         for _ in range(count):
             own = None if limits is None else limits[done : done + 1]
             done += 1
+            if bound is not None:
+                bound.renew(state)
             state = swept(state, x_prev, 1, own, last if done == number else None)
     return state
 

@@ -124,7 +124,7 @@ class Scene:
 
     def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
-        name = energy.name if key == "coefficient" else f"{energy.name}_{key}"
+        name = energy.name if key in ("coefficient", energy.name) else f"{energy.name}_{key}"
         return self.tensor(self.parameters.get(name, getattr(energy, key)))
 
     def tensor(self, value: Any) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
+from .couplings import Bound, energies_of_sweeps
 from .energies import StableNeoHookean, Viscosity, build_energies, floor_friction, rates
 from .rigid import Correction
 from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
@@ -135,7 +136,8 @@ def stepper(
         parameters=parameters,
         **more,
     )
-    energies = build_energies(scene, elsewhere=("friction",))
+    energies, bound = energies_of_sweeps(scene, elsewhere=("friction",))
+    renew = bound.renew if bound is not None else lambda state: None
     energies += floor_friction(scene, energies)
     masses = color_masses(scene)
     correct = Correction(scene, energies)
@@ -160,6 +162,7 @@ def stepper(
             if isinstance(energy, Viscosity):
                 energy.begin(x_prev)
         check_start(energies, x_prev)
+        renew(y)
         begun = _start(scene, energies, x_prev, inertial if model.starts_from == "inertia" else y)
         if model.starts_from == "auto":
             begun = _lower(scene, energies, begun, _start(scene, energies, x_prev, inertial), y, x_prev, correct.others)
@@ -172,14 +175,26 @@ def stepper(
         if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):
             state = _apart(scene, energies, state, _start(scene, energies, x_prev, y), y, x_prev, correct.bodies, held)
 
+        begun_sweeps: list[bool] = []  # with couplings free bodies are corrected before each sweep but the first
+
         def swept(state: Tensor, count: int, ends: bool) -> Tensor:
+            if bound is not None and count > 1:
+                for n in range(count):
+                    state = swept(state, 1, ends and n + 1 == count)
+                return state
+            if bound is not None and count:
+                renew(state)
+                state = correct(state, y, x_prev) if begun_sweeps else state
+                begun_sweeps.append(True)
+            renew(state)
             usual = max(count - 1, 0) if ends else count
             state = run_sweeps(scene, energies, masses, y, state, x_prev, usual)
             return run_sweeps(scene, energies, masses, y, state, x_prev, count - usual, relaxation=last)
 
-        state, lengths = _in_cycles(coarse, swept, sweeps, state, y, x_prev, coarse_steps)
+        state, lengths = _in_cycles(coarse, swept, sweeps, state, y, x_prev, coarse_steps, bound)
         if record is not None:
             record.append(lengths)
+        renew(state)
         state = correct(state, y, x_prev)
         x_new = state.transpose(-1, -2).contiguous()
         return x_new, (x_new - x) / time_step
@@ -195,6 +210,7 @@ def _in_cycles(
     y: Tensor,
     x_prev: Tensor,
     steps: Tensor | None,
+    bound: Bound | None = None,
 ) -> tuple[Tensor, Tensor]:
     """All sweeps of a step. With corrections a sweep, then a correction and up to `every` sweeps, until all are done;
     or a correction alone.
@@ -214,6 +230,9 @@ def _in_cycles(
     for n, count in enumerate(cycles):
         if coarse is not None:
             given = None if steps is None else steps[n]
+            if bound is not None:  # each is an operator of its own, which knows of no refusal before it
+                bound.renew(state)
+                refused = torch.zeros_like(refused)
             state, s = coarse.correct(state, y, x_prev, matrix, given, refused >= REFUSALS)
             refused = refused + (s == 0)
             lengths.append(s)

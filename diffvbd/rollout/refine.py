@@ -447,7 +447,8 @@ def halved(model: Model) -> Halved:
     """Raises ValueError for a Model with an energy that has data of each vertex, such as an Anchor."""
     for energy in model.vertex_energies:
         if energy.per_vertex:
-            fail("mesh", f"False: the {type(energy).__name__} acts on vertices, which a finer mesh has not", "True")
+            kind = type(model.couplings[0] if model.couplings else energy).__name__
+            fail("mesh", f"False: the {kind} acts on vertices, which a finer mesh has not", "True")
     return model.derived("halved", lambda: _halved(model))
 
 

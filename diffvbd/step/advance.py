@@ -32,6 +32,7 @@ from .arguments import (
 )
 from .coarse import lengths_of, with_corrections
 from .contact import run_contact
+from .couplings import sweep_renewed
 from .predict import Begun, begin
 
 TAPED = TapedSweep()
@@ -93,14 +94,19 @@ def swept(
         if colliders is not None:
             with out_of_memory_named(model, begun.x_start, settings, policy):
                 return run_contact(model, begun, prepared, *colliders, policy, debug_step)
-        if checking() and begun.y.is_cuda:
+        if checking() and begun.y.is_cuda and begun.record is None:
             check_on_cpu(model, fields, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
-                                        debug_step=debug_step)  # fmt: skip
+            if begun.record is not None:
+                end, found = sweep_renewed(model, begun.record, fields, settings, policy, debug_step,
+                                           lambda x: begun.corrected(x, model, prepared))  # fmt: skip
+                corrections = torch.cat([end.new_empty((len(end), 0, 0)), *found][bool(found) :], 1)
+            else:
+                end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                                            debug_step=debug_step)  # fmt: skip
             if corrections.numel():
                 for found in recorders("subspace"):
                     found.append(lengths_of(model, corrections))

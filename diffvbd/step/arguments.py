@@ -31,6 +31,7 @@ from .._common.context import checking, looks_at, refuse_forward_mode, transform
 from .._contact.barrier import Friction, PairBarrier
 from .._contact.colliders import MOST_LENGTH, Plane
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
+from ..couplings import COUPLINGS, Coupling
 from ..energies import VERTEX_ENERGIES
 from ..model.inputs import inputs_of, parameters_of
 from ..model.material import deformed, determinant, lumped_mass, moduli_of, rest_metric
@@ -150,7 +151,9 @@ def given_of(model: Model, inputs: dict[str, Any]) -> Given:
 def _meant(model: Any, name: str) -> str:
     """The energy that would declare an input, the call that has it as an argument, or the nearest name."""
     kinds = {
-        input_name(kind, key): kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
+        input_name(kind, key): kind
+        for kind in (*VERTEX_ENERGIES, *COUPLINGS, PairBarrier, Friction)
+        for key in kind.parameters
     }
     if name in OF_ELASTIC:
         return ", which has no elastic law among its energies"
@@ -229,9 +232,16 @@ def prepare(
             given[name] = ops.broadcast(given[name], (given[name].shape[0], *shape))
         if energy in (model.contact, model.friction) and not transformed() and (checking() or not like.is_cuda):
             name_value(name, "finite numbers >= 0", given[name], given[name] >= 0)
+        if isinstance(energy, Coupling) and looks_at(given[name]):
+            least = energy.least(key)
+            wanted = f"finite numbers >= {least:g}" if least > -math.inf else "finite numbers"
+            name_value(name, wanted, given[name], given[name] >= least)
     materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
+    if model.couplings and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
+        raise NotImplementedError(f"adjoint: expected ReverseSweep or Unrolled with {model.couplings[0]}, got "
+                                  "GlobalAdjoint")  # fmt: skip
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))

@@ -269,10 +269,18 @@ class ContactStep:
     def _sweep(self, x: Tensor, center: Tensor, trust_radius: Tensor, collider: Tensor, listed: Pairs,
                settings: SweepSettings, policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
-        fields = replaced(self.fields, x_start=x, center=center, trust_radius=trust_radius, collider=collider,
-                          collider_prev=self.before, kappa=self.kappa, **listed._asdict(), lag=self.lag,
-                          lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
-                          floor_lag=self.floor_lag)  # fmt: skip
+        if self.begun.record is not None and settings.sweeps > 1:  # each with the couplings about its own start
+            numbers, limits = settings.numbers, []
+            within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
+            for n in range(settings.sweeps):
+                one = replaced(settings if n + 1 == settings.sweeps else within, sweeps=1)
+                x, limit = self._sweep(x, center, trust_radius, collider, listed, one, policy, debug_step)
+                limits.append(limit)
+            return x, torch.cat(limits, 1)
+        fields = replaced(self.fields, x_start=x, energy_data=self.begun.at(x).data, center=center,
+                          trust_radius=trust_radius, collider=collider, collider_prev=self.before, kappa=self.kappa,
+                          **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr,
+                          lag_entry=lagged.entry, floor_lag=self.floor_lag)  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
     def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> Detection:
@@ -431,16 +439,16 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
     cycles = _cycles(of.model, settings.sweeps)
     if len(cycles) <= 1:
         return SweptSubstep(*sweep(x, settings))
-    corrections = None
-    if of.coarse_matrix is not None:
-        fields = touching(of, x, collider, start, listed)
-        corrections = Corrections(of.model, of.fields, fields, of.coarse_matrix, settings.numbers)
+    corrections, matrix = None, of.coarse_matrix
     numbers = settings.numbers
     within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     limits, lengths = [], []
     for n, count in enumerate(cycles):
         ends = n + 1 == len(cycles)
-        if corrections is not None and n:
+        if matrix is not None and n:
+            if corrections is None or of.begun.record is not None:
+                fields = touching(of, x, collider, start, listed)
+                corrections = Corrections(of.model, of.fields, fields, matrix, settings.numbers)
             x, length = corrections.correct(x)
             lengths.append(length)
         x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))

@@ -148,8 +148,8 @@ def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: 
     """Fields of the rigid correction, at x [B, V, 3]."""
     lagged = of.lagged
     return ops.TouchingFields(
-        x, of.x_prev, of.begun.y, of.fields.mass, of.begun.data, of.origin, *bodies_of(of.model), collider, of.before,
-        of.kappa, *listed, of.lag, lagged.pairs, lagged.ptr, lagged.entry, of.floor_lag, start.center,
+        x, of.x_prev, of.begun.y, of.fields.mass, of.begun.at(x).data, of.origin, *bodies_of(of.model), collider,
+        of.before, of.kappa, *listed, of.lag, lagged.pairs, lagged.ptr, lagged.entry, of.floor_lag, start.center,
         start.trust_radius,
     )  # fmt: skip
 

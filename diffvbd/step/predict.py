@@ -19,6 +19,7 @@ from ..model.system import System
 from ..ops import STARTS, distinct
 from ..ops.contact import join_data
 from .arguments import LOOKBACK, Prepared, broadcastable
+from .couplings import Record, record_of
 
 
 def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -46,11 +47,16 @@ class Begun(NamedTuple):
     data: Tensor  # [1 | B, n], of the energies
     origin: Tensor | None
     h2a: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
+    record: Record | None = None  # of a Model with couplings: data with their bound about a state
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
-                     self.h2a.detach())  # fmt: skip
+                     self.h2a.detach(), self.record)  # fmt: skip
+
+    def at(self, x: Tensor) -> Begun:
+        """The same with the bound of couplings about a state x [B, V, 3]."""
+        return self if self.record is None else replaced(self, data=self.record(x))
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
@@ -63,7 +69,7 @@ class Begun(NamedTuple):
 
     def _correct(self, x: Tensor, model: System, prepared: Prepared) -> tuple[Tensor, Tensor]:
         settings = prepared.settings
-        return correct(x, self.x_prev, self.y, prepared.mass, self.data, self.origin, model._bodies,
+        return correct(x, self.x_prev, self.y, prepared.mass, self.at(x).data, self.origin, model._bodies,
                        model._other_bodies, settings.data_count, settings.numbers.time_step)  # fmt: skip
 
     def finish(self, end: Tensor, model: System, prepared: Prepared, corrects: bool = True) -> tuple[Tensor, Tensor]:
@@ -105,6 +111,10 @@ def begin(
         prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
+    record = record_of(model, prepared.parameters, data, origin, flat[0])
+    if record is not None:  # at the predictor a body that flies or falls as a whole has the right forces
+        held = start if prescribed is None else prescribed
+        data = record(torch.where(model._pinned[:, None], held, start + h * velocity + (h * h) * acceleration))
     filters = model.floor is not None and model.contact is None
     # one sweep would not bring the vertices of a body together again
     sweeps = prepared.settings.sweeps * min(model.relaxation, 1.0)
@@ -120,7 +130,7 @@ def begin(
     x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
         x_start = torch.where(prepared.euler[..., None], begins(lookback=LOOKBACK)[0], x_start)
-    return Begun(x_start, start, y, data, origin, (h * h) * acceleration)
+    return Begun(x_start, start, y, data, origin, (h * h) * acceleration, record)
 
 
 # --- start of a step --------------------------------------------------------------------------------------------------

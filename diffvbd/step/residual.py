@@ -23,6 +23,7 @@ from ..ops.sweep import sweep
 from .arguments import Prepared, acceleration_of, collider_state
 from .coarse import lengths_of, with_corrections
 from .contact import outcomes
+from .couplings import COARSE_FIELDS
 from .integrators import Solve
 from .predict import Begun, begin
 
@@ -49,7 +50,7 @@ def potential_of_step(
     model: System, x: Tensor, begun: Begun, prepared: Prepared, contact: StepContact | None
 ) -> IncrementalPotential:
     """The potential of a step that has begun, at x [B, V, 3], relative to the step's origin where there is one."""
-    fields = begun.fields(model, prepared)
+    fields = begun.at(x).fields(model, prepared)
     if contact is None:
         return IncrementalPotential(model, x, fields, prepared.settings.numbers.time_step)
     return ContactPotential(model, x, fields, contact)
@@ -293,7 +294,6 @@ def what_helps(model: System) -> str:
 # --- how far from converged a step ends, estimated from the changes of its last iterates (docs/ -----------------------
 
 LARGEST_RATIO = 0.98  # of two changes: what shrinks more slowly cannot be told from what does not shrink
-COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 
 
 class ErrorEstimate(NamedTuple):
@@ -326,8 +326,9 @@ class ErrorEstimate(NamedTuple):
 
 def check_estimable(model: Model, name: str) -> None:
     """Raises where steps of the Model have no estimate; ``name``: of the argument that asks for one."""
-    if model.touches:
-        raise NotImplementedError(f"{name}: the error of a step with contact or friction is not estimated")
+    if model.touches or model.couplings:
+        what = "contact or friction" if model.touches else "springs, tendons or pressure"
+        raise NotImplementedError(f"{name}: the error of a step with {what} is not estimated")
 
 
 def error_of(model: System, x: Tensor, v: Tensor, prepared: Prepared, *, force: Any, gravity: Any, prescribed: Any

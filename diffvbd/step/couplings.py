@@ -1,0 +1,88 @@
+"""Couplings in a step: their bound about a state as data of the sweeps, and sweeps that renew it (couplings.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from .._common.checks import input_name
+from .._common.context import replaced
+from ..model.system import System
+from ..ops.sweep import sweep
+
+COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
+Record = Callable[[Tensor], Tensor]  # of a state [B, V, 3]: data of the energies [B, n]
+
+
+def parameters_at(model: System, given: dict[str, Tensor], scenes: int) -> list[dict[str, Tensor]]:
+    """The parameters of each coupling by key, [B, ...]; given: as in Prepared."""
+    return [
+        {key: ops.broadcast(given.get(input_name(energy, key), own[None]), (scenes, *own.shape))
+         for key, own in model.constants(energy).items()} for energy in model.couplings
+    ]  # fmt: skip
+
+
+def load_of(model: System, values: list[dict[str, Tensor]], x: Tensor) -> Tensor:
+    """Gradient [N] and bound [N/m] of all couplings at x [B, V, 3], [B, V, 4]."""
+    parts = [energy.load(x, own) for energy, own in zip(model.couplings, values, strict=True)]
+    return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
+
+
+def record_of(model: System, given: dict[str, Tensor], data: Tensor, origin: Tensor | None, scenes: int
+              ) -> Record | None:  # fmt: skip
+    """The record of a Model's couplings for a step; None: it has none.
+
+    Args:
+        given: Parameters of energies, as in Prepared.  data: Of the other energies [1 | B, n], the anchors last.
+    """
+    if not model.couplings:
+        return None
+    data = ops.broadcast(data, (scenes, data.shape[1]))
+    return partial(_refreshed, model, parameters_at(model, given, scenes), data, origin)
+
+
+def _refreshed(model: System, values: list[dict[str, Tensor]], data: Tensor, origin: Tensor | None, x: Tensor
+               ) -> Tensor:  # fmt: skip
+    load = load_of(model, values, x if origin is None else x + origin)
+    others = data.shape[1] - 4 * model.num_vertices
+    stiffness, point = data[:, others:].unflatten(1, (-1, 4)).split((1, 3), -1)
+    # two springs of a vertex are one, but for a constant
+    total = stiffness + load[..., 3:]
+    step = (stiffness * (point - x) - load[..., :3]) / torch.where(total > 0, total, 1.0)
+    anchors = torch.cat([total, x + torch.where(total > 0, step, 0.0)], -1)
+    return torch.cat([data[:, :others], anchors.flatten(1)], 1)
+
+
+def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settings: ops.SweepSettings, policy: int,
+                  debug_step: int, corrected: Callable[[Tensor], Tensor]) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
+    """Positions after the sweeps and their corrections, each with the record of the state that it begins at; and what
+    the coarse ones did. Free bodies, which may pull each other, are ``corrected`` before each sweep but the first."""
+    numbers, coarse = settings.numbers, () if fields.coarse_plan is None else settings.coarse
+    last = replaced(settings, coarse=(), sweeps=1)
+    within = replaced(last, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
+    plain = replaced(fields, **dict.fromkeys(COARSE_FIELDS))
+    x, corrections = fields.x_start, []
+
+    def run(x: Tensor, fields: ops.SweepFields, settings: ops.SweepSettings) -> Tensor:
+        now = replaced(fields, x_start=x, energy_data=record(x))
+        first = x is fields.x_start  # looks at the values that all others have, too
+        end, _, done = sweep(now, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
+                             checked=first)  # fmt: skip
+        corrections.extend([done] if done.numel() else [])
+        return end
+
+    def coarsely(x: Tensor) -> Tensor:
+        return run(x, fields, replaced(within, sweeps=0, coarse=replaced(coarse, begun=1)))
+
+    for n in range(settings.sweeps):
+        if coarse and n and (n - 1) % coarse.every == 0:
+            x = coarsely(x)
+        x = corrected(x) if n else x
+        x = run(x, plain, last if n + 1 == settings.sweeps else within)
+    if coarse and settings.sweeps <= 1:
+        x = coarsely(x)
+    return x, corrections
