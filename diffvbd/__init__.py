@@ -21,6 +21,7 @@ from .model.material import lame, young_poisson
 from .model.model import Model
 from .model.solver import BDF2, SDIRK2, VBD, ImplicitEuler
 from .rollout.checks import Checks
+from .rollout.equilibrium import equilibrium
 from .rollout.memory import BinomialCheckpoints, memory
 from .rollout.refine import refine
 from .rollout.rollout import rollout
@@ -52,6 +53,7 @@ __all__ = [
     "colliders",
     "contact",
     "diagnose",
+    "equilibrium",
     "error_budget",
     "lame",
     "memory",

@@ -4,6 +4,7 @@ from .adjoint.routes import LinearSolve
 from .inspect.diagnose import Diagnosis
 from .inspect.forces import Stress
 from .inspect.gradcheck import GradientCheck
+from .rollout.equilibrium import Equilibrium
 from .rollout.refine import GradientTest, Refinement
 from .rollout.solve import Solution
 from .rollout.trajectory import Trajectory
@@ -15,6 +16,7 @@ from .step.step import Tape
 __all__ = [
     "Candidate",
     "Diagnosis",
+    "Equilibrium",
     "ErrorBudget",
     "ErrorEstimate",
     "GradientCheck",
