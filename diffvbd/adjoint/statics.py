@@ -19,7 +19,7 @@ from .._contact.pair_forces import NearPairs, corner_points, near_pairs, pair_en
 from .._contact.surface import ContactSurface
 from ..model.system import System
 from .implicit import Assembled, Operator, inverse_blocks
-from .potential import IncreaseInputs, IncrementalPotential, increase_inputs, increase_of_bodies
+from .potential import IncreaseInputs, IncrementalPotential, increase_of_bodies
 
 CLOSED = 0.8  # of a gap, at most, in one iteration
 REACH = 0.5  # of the trust-region radius of steps, which a vertex goes at most in one iteration
@@ -36,9 +36,6 @@ class Statics(NamedTuple):
     data: Tensor  # [1 | B, n], of the energies of vertices, without damping
     colliders: Tensor  # [B, Vc, 3] [m]
     kappa: Tensor  # [1 | B] [N/m], of pairs
-
-    def increase_inputs(self, model: System, x: Tensor) -> IncreaseInputs:
-        return increase_inputs(model, self.fields(x), 1.0)
 
     def fields(self, x: Tensor) -> ops.SweepFields:
         massless = x.new_zeros((1, x.shape[1]))

@@ -126,6 +126,9 @@ def equilibrium(
         if on_failure == "raise":
             raise RuntimeError(text)
         warn(text, RuntimeWarning)
+    elif bool(outcome.turned.any()):
+        warn(f"equilibrium: tets of scene {int(outcome.turned.nonzero()[0])} ended inside out; load in increments, or "
+             "less; " + page("statics.md"))  # fmt: skip
     return Equilibrium(end.to(x.dtype).reshape(x.shape), residual, outcome.iterations, converged)
 
 
@@ -166,8 +169,10 @@ class _Rest(Function):
     @staticmethod
     def forward(ctx: Any, held: Tensor, *args: Any) -> tuple[Tensor, Rest]:
         *tensors, start, model, limits, adjoint = args
-        given = Statics(*tensors)
-        with torch.autocast(start.device.type, enabled=False):
+        with torch.inference_mode(False), torch.no_grad(), torch.autocast(start.device.type, enabled=False):
+            # clones: what was made in inference mode cannot be differentiated, as the barrier of pairs is
+            held, start, *tensors = (t.clone() if t.is_inference() else t for t in (held, start, *tensors))
+            given = Statics(*tensors)
             _check_start(model, start, given)
             rest = find_rest(model, start, held, given, limits)
         ctx.save_for_backward(rest.x, *tensors)
@@ -233,6 +238,8 @@ def _failure(rest: Rest, tolerance: float) -> str:
         return (f"equilibrium: expected bodies that are held against their loads, got one that went far away in scene "
                 f"{int(rest.unbounded.nonzero()[0])}: the potential is unbounded and has no equilibrium")  # fmt: skip
     scene = int((~rest.converged).nonzero()[0])
+    if not math.isfinite(float(rest.residual[scene])):
+        return f"equilibrium: expected pins that move without closing a gap, got ones that close one in scene {scene}"
     return (f"equilibrium: expected a residual of at most {tolerance:g}, got {float(rest.residual[scene]):.3g} in "
             f"scene {scene} after {rest.iterations} iterations; start nearer, load in increments, or take more "
             f"(max_iterations); " + page("statics.md"))  # fmt: skip

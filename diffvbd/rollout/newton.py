@@ -14,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._common.constants import ELASTIC
 from .._common.messages import log_progress
 from ..adjoint.implicit import descent_direction
-from ..adjoint.potential import IncreaseInputs
+from ..adjoint.potential import IncreaseInputs, increase_inputs
 from ..adjoint.statics import StaticPotential, Statics, newton_operators
 from ..model.system import System
 from ..step.residual import of_scenes, rounding, share
@@ -42,9 +43,12 @@ class Rest(NamedTuple):
     iterations: int  # of all increments
     converged: Tensor  # bool [B]
     unbounded: Tensor  # bool [B]: it went far away
+    turned: Tensor  # bool [B]: tets are inside out that were not at the start
 
 
 class Limits(NamedTuple):
+    """Where iterations end, and whether each is logged."""
+
     tolerance: float
     iterations: int
     progress: bool
@@ -59,7 +63,7 @@ def find_rest(model: System, x: Tensor, held: Tensor, given: Statics, limits: Li
     turned, move = _inside_out(model, x, given), torch.where(model._pinned[:, None], held - x, 0)
     count, parts = 0, 1
     while True:
-        rest = Rest(x, x.new_full((len(x),), torch.inf), 0, *x.new_zeros((2, len(x)), dtype=torch.bool))
+        rest = Rest(x, x.new_full((len(x),), torch.inf), 0, *x.new_zeros((3, len(x)), dtype=torch.bool))
         for n in range(1, parts + 1):
             part = given._replace(load=n / parts * given.load)
             start = _follow(model, rest.x, torch.where(model._pinned[:, None], x + n / parts * move - rest.x, 0), part)
@@ -73,15 +77,16 @@ def find_rest(model: System, x: Tensor, held: Tensor, given: Statics, limits: Li
             count += rest.iterations
             if not bool(rest.converged.all()):
                 break
-        good = rest.converged & (turned | ~_inside_out(model, rest.x, given))
-        if bool((good | rest.unbounded).all()) or count >= limits.iterations or parts >= MOST_PARTS:
-            return rest._replace(iterations=count)
+        rest = rest._replace(iterations=count, turned=_inside_out(model, rest.x, given) & ~turned)
+        good = bool((rest.converged & ~rest.turned).all())
+        if good or bool(rest.unbounded.any()) or count >= limits.iterations or parts >= MOST_PARTS:
+            return rest
         parts *= 2
 
 
 def _inside_out(model: System, x: Tensor, given: Statics) -> Tensor:
-    """Whether a tet is inside out, bool [B]."""
-    return (StaticPotential(model, x, given).ratio <= 0).any(-1)
+    """Whether a tet that resists it is inside out, bool [B]."""
+    return (StaticPotential(model, x, given).ratio <= 0).any(-1) & bool(model.energy_mask & ELASTIC)
 
 
 def _follow(model: System, x: Tensor, step: Tensor, given: Statics) -> Tensor | None:
@@ -99,7 +104,7 @@ def _follow(model: System, x: Tensor, step: Tensor, given: Statics) -> Tensor | 
 
 def _minimize(model: System, x: Tensor, given: Statics, limits: Limits) -> Rest:
     """From x, whose pinned vertices stay."""
-    inputs, at = given.increase_inputs(model, x), StaticPotential(model, x, given)
+    inputs, at = increase_inputs(model, given.fields(x), 1.0), StaticPotential(model, x, given)
     scale, extent = at.stiffness(), (x.amax(1) - x.amin(1)).amax(-1)
     shift, count = x.new_zeros(len(x), 1, 1), 0
     while True:
@@ -109,7 +114,7 @@ def _minimize(model: System, x: Tensor, given: Statics, limits: Limits) -> Rest:
             log_progress("equilibrium: residual %.3g after %d iterations", float(residual.max()), count)
         stuck = shift[:, 0, 0] > LAST_SHIFT
         if bool((done | unbounded | stuck).all()) or count >= limits.iterations:
-            return Rest(at.x, residual, count, done, unbounded)
+            return Rest(at.x, residual, count, done, unbounded, torch.zeros_like(done))
         count += 1
         rests = done | unbounded | stuck
         operators = newton_operators(at, shift * scale)
@@ -138,7 +143,7 @@ def _search(at: StaticPotential, step: Tensor, slope: Tensor, inputs: IncreaseIn
 
     slope: Of the potential along the step [J], [B].  rests: Scenes that shall stay, bool [B].
     """
-    fraction, moved, x = at.admissible(step), rests, at.x
+    fraction, moved, x, trial = at.admissible(step), rests, at.x, at
     eps = torch.finfo(x.dtype).eps
     for _ in range(HALVINGS):
         trial = StaticPotential(at.model, torch.where(moved[:, None, None], x, at.x + fraction[:, None, None] * step),
@@ -149,4 +154,4 @@ def _search(at: StaticPotential, step: Tensor, slope: Tensor, inputs: IncreaseIn
         if bool(moved.all()):
             break
         fraction = fraction / 2
-    return StaticPotential(at.model, x, at.given), moved
+    return trial if torch.equal(trial.x, x) else StaticPotential(at.model, x, at.given), moved

@@ -10,7 +10,6 @@ from helpers.dense_statics import Energy, barrier, newton, potential, residual, 
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.reference import distance
 from diffvbd.reference.distance import EDGE_EDGE, POINT_TRIANGLE, distance, log_barrier, mollifier
 
 SOLVER = dv.VBD(1.0, 0, subspace="coarse")
@@ -103,8 +102,8 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "two materials": two_materials,
     "neck": lambda: necked(1.0),
     "neck, contrast": lambda: necked(1e4),
-    "slender": lambda: slender(2e7),
-    "hanging": lambda: slender(1e6),
+    "slender": lambda: slender(2.4e7),
+    "hanging": lambda: slender(4.5e4),  # and stretched by its weight
     "incompressible": lambda: beam(1e6, 0.4999),
 }
 

@@ -107,6 +107,16 @@ def test_not_converging_is_never_silent() -> None:
     assert not done.converged and done.iterations == 2 and done.residual > 1e-8
 
 
+@pytest.mark.slow
+def test_tets_that_end_inside_out_are_said() -> None:
+    mesh = dv.mesh.cube(5, size=0.2)
+    y = torch.as_tensor(mesh.points[:, 1])
+    model = dv.Model(mesh, pinned=(y < 1e-9) | (y > 0.2 - 1e-9))
+    low = torch.where(model.pinned[:, None], model.rest_points * y.new_tensor([1.0, 0.2, 1.0]), torch.nan)
+    with pytest.warns(UserWarning, match="equilibrium: tets of scene 0 ended inside out"):
+        assert rest(model, prescribed=low, poisson=0.4).converged
+
+
 def test_progress_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "diffvbd"):
         done = rest(beam(), progress=True)
