@@ -21,16 +21,16 @@ def random_pairs(count: int, seed: int) -> tuple[NearPairs, torch.Tensor, torch.
 
 def test_no_gap_closes_on_the_way() -> None:
     truncated = 0
-    for seed in range(50):
+    for seed in range(15):
         pairs, points, move = random_pairs(3, seed)
         fraction = safe_fraction(pairs, points, move, CLOSED)
         truncated += int((fraction < 1).sum())
         assert bool((fraction > 0).all())
         gap = distance(pairs.kind, pairs.positions(points))
-        for t in torch.linspace(0, 1, 41, dtype=torch.float64):
+        for t in torch.linspace(0, 1, 21, dtype=torch.float64):
             there = points + (t * fraction)[:, None, None] * move
             assert bool((distance(pairs.kind, pairs.positions(there)) >= (1 - CLOSED - 1e-9) * gap).all())
-    assert truncated > 20
+    assert truncated > 10
 
 
 def test_a_motion_that_keeps_every_gap_is_whole() -> None:

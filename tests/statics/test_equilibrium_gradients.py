@@ -73,7 +73,7 @@ def test_young_poisson_and_prescribed() -> None:
 
 def pressed() -> tuple[dv.Model, Tensor]:
     """Two blocks, the upper one pressed onto the lower, and where its top shall go."""
-    low, high = dv.mesh.cube(3, size=0.2), dv.mesh.cube(3, size=0.16).translate([0.013, 0.21, 0.009])
+    low, high = dv.mesh.cube(2, size=0.2), dv.mesh.cube(2, size=0.16).translate([0.013, 0.21, 0.009])
     mesh = dv.mesh.join([low, high])
     y = torch.as_tensor(mesh.points[:, 1])
     top = y > float(y.max()) - 1e-9
