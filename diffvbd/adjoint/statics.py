@@ -186,10 +186,13 @@ class StaticPotential(IncrementalPotential):
 def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[Operator, Operator]:
     """Product with the Hessian of U between free vertices, ``shift`` [B, V, 1] added to its diagonal, and what
     preconditions it: the inverse of its diagonal blocks and, with a coarse subspace, of its projection on that."""
-    eye, pairs = torch.eye(3, dtype=at.x.dtype, device=at.x.device), at.pair_diagonal
-    own = IncrementalPotential.diagonal(at) if shift is None else (
-        IncrementalPotential.diagonal(at) + shift[..., None] * eye)  # fmt: skip
-    elastic, smooth = Assembled(at, own), inverse_blocks(own + pairs, at.free)
+    eye = torch.eye(3, dtype=at.x.dtype, device=at.x.device)
+    shift = at.x.new_zeros((1, 1, 1)) if shift is None else shift
+    blocks = at.diagonal() + shift[..., None] * eye
+    smooth = inverse_blocks(blocks, at.free)
+    stored = at.x.is_cuda or torch.backends.mkl.is_available()  # sparse products on a CPU need MKL
+    elastic = Assembled(at, blocks - at.pair_diagonal) if stored else (
+        lambda w: at.free * (IncrementalPotential.product(at, w) + shift * w))  # fmt: skip
 
     def product(w: Tensor) -> Tensor:
         return elastic(w) if at.pairs is None else elastic(w) + at.free * at.pair_product(w)
@@ -198,10 +201,9 @@ def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[
     if weights is None:
         return product, smooth
     (count, functions), scenes = weights.shape, len(at.x)
-    columns = (weights[:, None, :, None] * eye[:, None]).reshape(3 * count, 3 * functions)
-    image = (elastic.matrix @ columns.repeat(scenes, 1)).reshape(scenes, count, 3, 3 * functions)
-    image = image + pairs @ columns.reshape(count, 3, 3 * functions)
-    matrix = columns.T @ image.flatten(1, 2)
+    columns = (weights[:, None, :, None] * eye[:, None]).reshape(count, 3, 3 * functions)
+    image = torch.stack([product(c.expand(scenes, -1, -1)).flatten(1) for c in columns.unbind(-1)], -1)
+    matrix = columns.flatten(0, 1).T @ image
     value, vector = torch.linalg.eigh((matrix + matrix.mT) / 2)
     value = value.abs()  # positive definite, whatever the Hessian is
     value = torch.maximum(value, SINGULAR * value.amax(-1, keepdim=True))
