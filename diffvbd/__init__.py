@@ -23,6 +23,7 @@ from .model.material import fibre_contraction, lame, young_poisson
 from .model.model import Model
 from .model.solver import BDF2, SDIRK2, VBD, ImplicitEuler
 from .rollout.checks import Checks
+from .rollout.equilibrium import equilibrium
 from .rollout.memory import BinomialCheckpoints, memory
 from .rollout.refine import refine
 from .rollout.rollout import rollout
@@ -59,6 +60,7 @@ __all__ = [
     "contact",
     "coupling_forces",
     "diagnose",
+    "equilibrium",
     "error_budget",
     "fibre_contraction",
     "lame",

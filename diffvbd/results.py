@@ -4,6 +4,7 @@ from .adjoint.routes import LinearSolve
 from .inspect.diagnose import Diagnosis
 from .inspect.forces import CouplingForces, Stress
 from .inspect.gradcheck import GradientCheck
+from .rollout.equilibrium import Equilibrium
 from .rollout.refine import GradientTest, Refinement
 from .rollout.solve import Solution
 from .rollout.trajectory import Trajectory
@@ -16,6 +17,7 @@ __all__ = [
     "Candidate",
     "CouplingForces",
     "Diagnosis",
+    "Equilibrium",
     "ErrorBudget",
     "ErrorEstimate",
     "GradientCheck",

@@ -14,6 +14,7 @@ NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]\d+)?")
 EXPECTED = {
     "first_gradient": [(0.048, 0.051), (3.5e-7, 4.5e-7)],
     "identify_material": [(79_900, 80_100), (0.399, 0.401), (80_000, 80_000), (0.4, 0.4)],
+    "stiffness_field": [(0.43, 0.44), (0.39, 0.41), (399, 401), (99, 101), (199, 201), (99, 101)],
     "contact_drop": [(0.100, 0.120), (0.1087, 0.1088), (0.25, 0.29), (0.27, 0.28), (-0.40, -0.32), (-0.363, -0.362)],
     "soft_gripper": [(7.0, 10.0), (2.0, 6.0), (1.0, 2.5)],
     "train_policy": [(0.12, 0.25), (0.0, 0.05)],
@@ -29,7 +30,7 @@ def run(name: str, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-QUICK = ["first_gradient", "identify_material", "contact_drop", "custom_energy"]
+QUICK = ["first_gradient", "stiffness_field", "identify_material", "contact_drop", "custom_energy"]
 
 
 @pytest.mark.parametrize("name", quick_and_slow(QUICK, EXPECTED))

@@ -20,6 +20,8 @@ from ..energies import damped_fraction
 from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from ..reference.energies import smoothed
 
+ADVANCES = 8  # of continuous detection after the first; fewer are on the safe side
+
 
 class NearPairs(NamedTuple):
     """Q pairs that are closer than their dhat."""
@@ -71,9 +73,13 @@ def corner_points(x: Tensor, origin: Tensor | None, colliders: Tensor) -> Tensor
 
 
 def near_pairs(
-    x: Tensor, origin: Tensor | None, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier
-) -> NearPairs:
+    x: Tensor, origin: Tensor | None, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
+    radius: Tensor | None = None,
+) -> NearPairs:  # fmt: skip
     """Pairs closer than their dhat at x; arguments as of :func:`detection.detect`, ``origin`` or None.
+
+    radius: How far the vertices of each body go, and the most of all [B, bodies + 1] [m]; pairs that may come closer
+    than dhat on the way are listed, too.
 
     Raises:
         ValueError: Where surfaces touch, or positions are not finite.
@@ -81,10 +87,10 @@ def near_pairs(
     with torch.no_grad():
         x, was, now = (t.detach().contiguous() for t in (x, was, now))
         shift = x.new_empty((0,)) if origin is None else origin.detach().contiguous()
-        still = x.new_zeros((x.shape[0], surface.bodies + 1))  # nothing is about to move
+        reach = x.new_zeros((x.shape[0], surface.bodies + 1)) if radius is None else radius
         capacity = max(surface.capacity * x.shape[0], LEAST_CAPACITY)
         while True:
-            pairs, constants, *_, counts, _ = detect(x, shift, was, now, surface, barrier, capacity, still)
+            pairs, constants, *_, counts, _ = detect(x, shift, was, now, surface, barrier, capacity, reach, reach)
             needed, touching, key, _ = counts.tolist()
             if needed <= capacity:
                 break
@@ -93,6 +99,8 @@ def near_pairs(
             _raise_touching(surface, touching, key)
         rows, numbers = pairs[:needed].long(), constants[:needed].double()
         listed = NearPairs(rows[:, :4], rows[:, 4], rows[:, 5], *numbers[:, :3].unbind(1))
+        if radius is not None:
+            return listed
         gap = distance(listed.kind, listed.positions(corner_points(x, origin, was))) - listed.offset
         near = gap < listed.dhat
         return NearPairs(*(t[near] for t in listed))
@@ -104,6 +112,35 @@ def _raise_touching(surface: ContactSurface, touching: int, key: int) -> None:
     scene, corners = surface.corners_of(key)
     fail("x", "surfaces that do not touch", f"{touching} pairs without a gap, one of the corner points {corners} of "
          f"{surface.owners_of(corners[0], corners[3])} in scene {scene}")  # fmt: skip
+
+
+def pair_energy(pairs: NearPairs, corners: Tensor, kappa: Tensor) -> Tensor:
+    """Energy of the barrier of each pair [J], [Q]; corners: [Q, 4, 3].  kappa: [1 | B] [N/m]."""
+    gap = distance(pairs.kind, corners) - pairs.offset
+    return mollifier(pairs.kind, corners, pairs.threshold) * log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)[0]
+
+
+def safe_fraction(pairs: NearPairs, points: Tensor, move: Tensor, closed: float) -> Tensor:
+    """Largest fraction, at most 1, of a motion of corner points [B, N, 3] on which each pair closes at most a part
+    ``closed`` of its gap, of each scene [B]. No corner may go farther than the pairs were listed for.
+
+    The gap of a pair shrinks no faster than its two sides approach: additive continuous collision detection.
+
+    Source: Li et al. (2021), Codimensional incremental potential contact, section 4.
+    """
+    at, u = pairs.positions(points), pairs.positions(move)
+    u = u - u.mean(1, keepdim=True)  # what all corners share changes no gap
+    size, both = u.norm(dim=-1), pairs.kind == EDGE_EDGE
+    first = torch.where(both, torch.maximum(size[:, 0], size[:, 1]), size[:, 0])
+    second = torch.where(both, torch.maximum(size[:, 2], size[:, 3]), size[:, 1:].amax(1))
+    gap, speed = distance(pairs.kind, at) - pairs.offset, first + second
+    some = speed > closed * gap  # the others may go all the way
+    kind, scene, at, u, gap, speed = (a[some] for a in (pairs.kind, pairs.scene, at, u, gap, speed))
+    fraction = closed * gap / speed
+    for _ in range(ADVANCES):
+        left = distance(kind, at + fraction[:, None, None] * u) - pairs.offset[some] - (1 - closed) * gap
+        fraction = (fraction + left / speed).clamp(max=1)
+    return points.new_ones(len(points)).scatter_reduce(0, scene, fraction, "amin")
 
 
 def barrier_forces(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:

@@ -33,6 +33,8 @@ MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
 CHECK_EVERY = 8  # iterations on CUDA between two looks at whether all scenes have converged: each waits for the device
 
+Operator = Callable[[Tensor], Tensor]
+
 _DIFFERENTIABLE = ops.SweepFields._fields.index("origin")  # x_start ... energy_data
 _FIELDS = _DIFFERENTIABLE + 1  # and the origin
 
@@ -77,7 +79,8 @@ class _GlobalBackward(Function):
                                "whose solve waits for the device")  # fmt: skip
         with torch.autocast(x.device.type, enabled=False):  # which would take the products in half precision
             potential = IncrementalPotential(model, x, fields, h)
-            w = _solve(potential, torch.where(potential.free > 0, x_bar, 0), adjoint)
+            x_bar_free = torch.where(potential.free > 0, x_bar, 0)
+            w = solve_adjoint(potential, x_bar_free, adjoint, system(potential, adjoint.assembled), "GlobalAdjoint")
             bars = potential.dependence(w, needs)
             if needs[0]:
                 bars[0] = torch.where(potential.free > 0, 0, x_bar - potential.product(w))
@@ -92,27 +95,34 @@ class _GlobalBackward(Function):
         no_second_derivative()
 
 
-def _solve(potential: IncrementalPotential, x_bar: Tensor, adjoint: GlobalAdjoint) -> Tensor:
-    """w with (d2G/dx2) w = x_bar at the free vertices, w = 0 at the pinned."""
+def solve_adjoint(potential: IncrementalPotential, x_bar: Tensor, adjoint: GlobalAdjoint,
+                  operators: tuple[Operator, Operator], name: str, roundings: float = 0.0) -> Tensor:  # fmt: skip
+    """w with (d2G/dx2) w = x_bar at the free vertices, w = 0 at the pinned.
+
+    operators: As of system().  name: Of what is differentiated.  roundings: Of a product with the Hessian, which the
+    residual may keep whatever the tolerance is.
+    """
     # of order one, so that no square of it leaves the range of its numbers
     size = x_bar.abs().amax((-2, -1), keepdim=True) if x_bar.numel() else x_bar.new_ones((len(x_bar), 1, 1))
     b = x_bar / torch.where(size == 0, 1, size)
     tolerance = adjoint.tolerance or DEFAULT_TOLERANCE[b.dtype]
     limit = adjoint.max_iterations or min(max(10 * 3 * potential.model.num_active, 1), MAX_ITERATIONS)
-    product, precondition = system(potential, adjoint.assembled)
+    product, precondition = operators
     found = conjugate_gradients(product, b, precondition, tolerance, limit)
     residual = float(found.residual.max()) if len(b) else 0.0
+    if roundings and not residual <= tolerance:
+        part = potential.stiffness() * found.x
+        kept = roundings * torch.finfo(b.dtype).eps * (_dot(part, part) / _dot(b, b)).sqrt().flatten()
+        tolerance = max(tolerance, float(kept[found.residual.argmax()]))
     if adjoint.report is not None:
         adjoint.report(LinearSolve(found.iterations, residual, residual <= tolerance))
     if not residual <= tolerance:
         scene = int(found.residual.argmax())
         if not bool(torch.isfinite(size[scene])):
-            text = (
-                f"GlobalAdjoint: expected finite adjoints of the positions, got {float(size[scene])} in scene {scene}"
-            )
+            text = f"{name}: expected finite adjoints of the positions, got {float(size[scene])} in scene {scene}"
         else:
             text = (
-                f"GlobalAdjoint: expected conjugate gradients to meet a relative residual of {tolerance:g}, got "
+                f"{name}: expected conjugate gradients to meet a relative residual of {tolerance:g}, got "
                 f"{residual:.3g} in scene {scene} after {found.iterations} iterations"
                 f"{'; the Hessian is not positive definite there' if found.indefinite else ''}"
             )
@@ -122,18 +132,20 @@ def _solve(potential: IncrementalPotential, x_bar: Tensor, adjoint: GlobalAdjoin
     return found.x * size
 
 
-Operator = Callable[[Tensor], Tensor]
-
-
 def system(potential: IncrementalPotential, matrix: bool) -> tuple[Operator, Operator]:
     """Product with the Hessian between free vertices, by a matrix or without, and with the inverse of its diagonal
     blocks, which preconditions it; functions of [B, V, 3]."""
     blocks, free = potential.diagonal(), potential.free
+    product = Assembled(potential, blocks) if matrix else lambda w: free * potential.product(w)
+    return product, inverse_blocks(blocks, free)
+
+
+def inverse_blocks(blocks: Tensor, free: Tensor) -> Operator:
+    """Product with the inverse of the blocks [B, V, 3, 3] of vertices that are free [V, 1]."""
     eye = torch.eye(3, dtype=blocks.dtype, device=blocks.device)
     # a pinned vertex may have neither mass nor tets, so that its block is zero
     inverse = torch.linalg.inv(torch.where(free[..., None] > 0, blocks, eye)) * free[..., None]
-    product = Assembled(potential, blocks) if matrix else lambda w: free * potential.product(w)
-    return product, lambda r: (inverse @ r[..., None])[..., 0]
+    return lambda r: (inverse @ r[..., None])[..., 0]
 
 
 class Conjugate(NamedTuple):
@@ -176,10 +188,23 @@ def conjugate_gradients(
     return Conjugate(x, torch.nan_to_num(ratio, nan=math.inf), iterations, bool((lowest < 0).any()))
 
 
+def descent_direction(
+    product: Operator, b: Tensor, precondition: Operator, tolerance: Tensor, max_iterations: int
+) -> tuple[Tensor, Tensor]:
+    """Truncated solution of A x = b [B, V, 3], with b . x > 0, and whether negative curvature has ended it, bool [B].
+
+    tolerance: |b - A x| / |b| of each scene at which it ends, [B, 1, 1].
+    Source: Nocedal and Wright, Numerical Optimization, algorithm 7.1.
+    """
+    x, _, lowest = _cycle(product, b, precondition, tolerance.square() * _dot(b, b), max_iterations, descends=True)
+    return x, (lowest < 0)[:, 0, 0]
+
+
 def _cycle(
-    product: Operator, r: Tensor, precondition: Operator, goal: Tensor, max_iterations: int
+    product: Operator, r: Tensor, precondition: Operator, goal: Tensor, max_iterations: int, descends: bool = False
 ) -> tuple[Tensor, int, Tensor]:
-    """Solution of A x = r by the recurrence from zero: x, the most iterations of a scene, the lowest curvature met."""
+    """Solution of A x = r by the recurrence from zero: x, the most iterations of a scene, the lowest curvature met.
+    ``descends``: a scene ends before a direction without positive curvature; its first one it goes."""
     x, rr = torch.zeros_like(r), _dot(r, r)
     p = z = precondition(r)
     rz = _dot(r, z)
@@ -192,6 +217,10 @@ def _cycle(
         q = product(p)
         curvature = _dot(p, q)
         lowest = torch.minimum(lowest, curvature)
+        if descends:
+            curved = active & ~(curvature > 0)
+            x = torch.where(curved, p, x) if iteration == 0 else x
+            active &= ~curved
         # a scene that has arrived, or broken down, rests
         alpha = torch.where(active, rz / curvature, zero)
         x.addcmul_(alpha, p)

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..model.moving import MovingBodies
+from .._common.constants import ELASTIC
+from ..model.moving import MovingBodies, moving_bodies
 from ..model.system import System
 from ..ops.fields import ROUNDINGS
 
@@ -228,7 +229,7 @@ class IncreaseInputs(NamedTuple):
 
     @property
     def bodies(self) -> MovingBodies:
-        return self.model._moving
+        return bodies_of(self.model)
 
     def admits(self, x: Tensor, to: Tensor) -> Tensor:
         """Whether the potential of each body lets it go from x to ``to`` [B, V, 3]: it does not rise by more than
@@ -245,11 +246,20 @@ class IncreaseInputs(NamedTuple):
         return moves > admitted[:, of]  # moves and not admitted, in one launch
 
 
+def bodies_of(model: System) -> MovingBodies:
+    """The bodies that move: of a Model whose steps have no use for them, made at the first call."""
+    if hasattr(model, "_moving"):
+        return model._moving
+    return model.derived("moving_bodies", lambda: moving_bodies(
+        model._rest_points.cpu().double(), model._topology[0].cpu(), model._pinned.cpu(),
+        bool(model.energy_mask & ELASTIC)).to(model.device, model.dtype))  # fmt: skip
+
+
 def increase_inputs(model: System, fields: ops.SweepFields, time_step: float) -> IncreaseInputs:
     """fields: of the step's sweeps."""
     # contiguous: a state may be expanded over scenes
     fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore
-    moving: MovingBodies = model._moving
+    moving = bodies_of(model)
     blocks, lanes = moving.tet.shape
     counts = fields.mu.shape[0], fields.lam.shape[0]
     scenes = max(counts) if min(counts) else 0  # a modulus of no scenes leaves none
@@ -263,7 +273,7 @@ def increase_inputs(model: System, fields: ops.SweepFields, time_step: float) ->
 def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
     """Increase of the potential of each body from x to ``to`` [B, V, 3] [kg m^2, times h^2], and the sum of the sizes
     of its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may."""
-    model, moving, f = inputs.model, inputs.model._moving, inputs.fields
+    model, moving, f = inputs.model, inputs.bodies, inputs.fields
     origin = x.new_empty((0,)) if f.origin is None else f.origin
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
     return ops.direct.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
