@@ -159,10 +159,7 @@ CASES: dict[str, Case] = {
     "free_corner": Case(pinned=False, floor=_CORNER | {"height": (-0.1, -0.75, -0.4), "damping": 50.0}, fall=10.0),
     "free_batch": Case(pinned=False, batch=(3,), floor=_NEAR | {"damping": 50.0}, fall=2.0),
     "batch": Case(batch=(3,), floor=_NEAR | {"damping": 50.0}, fall=2.0),
-    "grown": Case(stress_free=0.2),
-    "viscous": Case(viscosity=(50, 200), relaxation=1.6),
     "viscous_inverted": Case(jitter=0.3, speed=5, viscosity=(50, 200)),
-    "dragged": Case(pinned=False, drag=(1, 10), floor=_NEAR, fall=1.0),
     "damped_batch": Case(pinned=False, batch=(3,), floor=_NEAR, fall=2.0, stress_free=0.1, viscosity=(5, 500),
                          drag=(1, 10)),
 }  # fmt: skip

@@ -193,7 +193,7 @@ def test_gradient_against_central_differences(device: str, integrator: Any, subs
     def loss(x: Tensor, v: Tensor, viscosity: Tensor, volume_viscosity: Tensor, drag: Tensor) -> Tensor:
         motion = dv.rollout(model, x, v, solver, steps=2, save="last", young=1e5, poisson=0.3, viscosity=viscosity,
                             volume_viscosity=volume_viscosity, drag=drag)  # fmt: skip
-        return (weight * (motion.x[-1] + 0.01 * motion.v[-1])).sum()
+        return (weight * (motion.x[-1] - model.rest_points + 0.01 * motion.v[-1])).sum()
 
     def between(low: float, high: float, count: int) -> Tensor:
         return torch.linspace(low, high, count, dtype=torch.float64, device=device)
