@@ -28,6 +28,7 @@ from ..model.solver import VBD
 from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
 from ..step.arguments import (
+    VISCOSITIES,
     acceleration_of,
     broadcastable,
     check_prescribed,
@@ -136,15 +137,19 @@ def _statics(model: System, x: Tensor, lead: tuple[int, ...], inputs: dict[str, 
     """Where pinned vertices are held [B, V, 3] [m], and what the potential depends on; differentiable."""
     sorted_inputs = given_of(model, inputs)
     material, parameters, loads = sorted_inputs
-    if loads["colliders_before"] is not None:
-        fail("colliders_before", "none: at rest nothing has moved", "a value")
+    if model.couplings:
+        raise NotImplementedError("model: expected one without springs, tendons and pressure, got one with "
+                                  f"{model.couplings[0]}; take a rollout of long steps until it rests")  # fmt: skip
+    for name in ("colliders_before", *VISCOSITIES, "drag"):
+        if {**loads, **material}[name] is not None:
+            fail(name, "none: at rest nothing has moved", "a value")
     for name in ("prescribed", "colliders"):
         if isinstance(loads[name], tuple):
             fail(name, "a tensor", "a tuple, which SDIRK2 takes")
     gravity = acceleration_of(loads["gravity"], x)
+    check_prescribed(model, loads["prescribed"], x)
     refuse_non_finite(model, {"x": x, **loads, "gravity": gravity, **material, **parameters})
     prepared = prepare(model, lead, sorted_inputs, time_step=1.0, sweeps=0)
-    check_prescribed(model, loads["prescribed"], x)
 
     flat, pinned = (math.prod(lead), *x.shape[-2:]), model._pinned[:, None]
     held = x if loads["prescribed"] is None else broadcastable("prescribed", loads["prescribed"], x)
@@ -194,8 +199,12 @@ class _RestBackward(Function):
         *tensors, model, adjoint, needs = args
         with torch.autocast(x.device.type, enabled=False):
             at = StaticPotential(model, x, Statics(*tensors))
-            w = solve_adjoint(at, torch.where(at.free > 0, x_bar, 0), adjoint, newton_operators(at), "equilibrium",
-                              ROUNDINGS)  # fmt: skip
+            try:
+                w = solve_adjoint(at, torch.where(at.free > 0, x_bar, 0), adjoint, newton_operators(at), "equilibrium",
+                                  ROUNDINGS)  # fmt: skip
+            except RuntimeError as error:
+                raise RuntimeError(f"{error}. Where a body may slide or turn freely there is no derivative: hold it, "
+                                   "best by a weak dv.Anchor") from None  # fmt: skip
             held = torch.where(at.free > 0, 0, x_bar - at.product(w))
             bars = [held, *(ops.sum_to(bar, tensor.shape) for bar, tensor in zip(at.depends(w), tensors, strict=True))]
         return tuple(bar for bar, need in zip(bars, needs, strict=True) if need)

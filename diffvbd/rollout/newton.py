@@ -35,6 +35,7 @@ FIRST_SHIFT, LAST_SHIFT, RAISED = 1e-6, 1e3, 10.0  # of the diagonal
 PATIENCE = 100  # iterations of one increment of the load
 MOST_PARTS = 64
 INCREMENT = 1e-3  # residual at which the next increment follows
+SMALL_STRAIN = 1e-5
 WHOLE = 1 - 1e-9  # a fraction of 1, but for rounding
 FAR = 1e4  # extents of the scene
 
@@ -166,12 +167,15 @@ def _state(at: StaticPotential, x: Tensor) -> StaticPotential:
 
 
 def residual_of(at: StaticPotential, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Force left over at free vertices [N], [B, V, 3]; its size over those of internal forces and loads [-], [B];
-    whether that meets the tolerance, or is no more than rounding leaves, bool [B]."""
+    """Force left over at free vertices [N], [B, V, 3]; its size over those of internal forces, loads and SMALL_STRAIN
+    [-], [B]; whether that meets the tolerance, or is no more than rounding leaves, bool [B]."""
     internal = at.internal()  # where pinned, too: without loads the reactions are what balances
     left = at.free * (internal - at.given.load)
     size = of_scenes(left)
-    ratio = share(size, of_scenes(internal) + of_scenes(at.given.load))
+    # a state without stress and loads has no forces to compare with: those of a small strain stand for them
+    extent = (at.x.amax(1) - at.x.amin(1)).amax(-1, keepdim=True) if at.x.numel() else size
+    least = SMALL_STRAIN * extent / max(at.x.shape[1], 1) * of_scenes(at.free * at.stiffness())
+    ratio = share(size, of_scenes(internal) + of_scenes(at.given.load) + least)
     return left, ratio[:, 0], ((ratio <= tolerance) | (size <= rounding(at, of_scenes)))[:, 0]
 
 

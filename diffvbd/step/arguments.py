@@ -200,6 +200,9 @@ def prepare(
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
     if stress_free is not None:
+        stress_free = check_tensor("stress_free", stress_free, like)
+        if stress_free.shape[-2:] != (3, 3):
+            fail("stress_free", f"shape [..., {model.num_tets}, 3, 3]", f"shape {list(stress_free.shape)}")
         stress_free = _scenes_first("stress_free", stress_free, like, lead, (*tets, 3, 3))
     if rest_points is not None or density is not None or stress_free is not None:
         points = model._rest_points if rest_points is None else rest_points

@@ -13,21 +13,39 @@ Drag: m drag (x - x_start) / h only shifts the predictor y of the step and enlar
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from .. import ops
 from .._common.context import replaced
-from ..model.material import face_normals, stiffness_weights
+from ..model.material import determinant, face_normals, stiffness_weights
 from ..model.system import System
 from .arguments import Damping, Drag, Prepared
 from .coarse import coarse_mass, coarse_parts
 
+GRAM = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # products of two edges
+LEAST = 1e-30  # [Pa] a shear modulus that no motion notices, by which 0 Pa has a derivative, too
 
-def damped(model: System, prepared: Prepared, x: Tensor, reference: Tensor | None = None) -> Prepared:
+
+class Reference(NamedTuple):
+    """From where the motion of a solve is measured, as a scheme extrapolates it from two states [..., V, 3].
+
+    Positions are extrapolated for drag. For viscosity the products of edges are, one + weight (two - one), which no
+    rotation changes: extrapolated positions of a body that turns are no shape of it.
+    """
+
+    position: Tensor
+    one: Tensor
+    two: Tensor
+    weight: float
+
+
+def damped(model: System, prepared: Prepared, x: Tensor, reference: Reference | None = None) -> Prepared:
     """Arguments of a solve from x [..., V, 3] with its damping in moduli, rest metric, mass and drag.
 
-    reference: From where the motion of the solve is measured [..., V, 3]; None: x.
+    reference: None: the motion is measured from x.
     """
     damping = prepared.damping
     if damping is None:
@@ -36,10 +54,34 @@ def damped(model: System, prepared: Prepared, x: Tensor, reference: Tensor | Non
         raise NotImplementedError("adjoint: expected ReverseSweep for damping with SDIRK2() or BDF2(), got Unrolled")
     out = replaced(prepared, damping=None)
     if damping.drag is not None:
-        out = _slowed(model, out, damping.drag, x, reference)
+        out = _slowed(model, out, damping.drag, x, None if reference is None else reference.position)
     if damping.viscosity is not None or damping.volume_viscosity is not None:
-        out = _viscous(model, out, damping, (x if reference is None else reference).reshape(-1, *x.shape[-2:]))
+        if reference is None:
+            normals, six_volumes = face_normals(_corners(model, x))
+            products = torch.stack(stiffness_weights(normals, torch.full_like(six_volumes, 6.0)), -1)
+        else:
+            products, six_volumes = _extrapolated(model, reference)
+        out = _viscous(model, out, damping, products, six_volumes)
     return out
+
+
+def _corners(model: System, x: Tensor) -> Tensor:
+    return ops.tet_gather(x.reshape(-1, *x.shape[-2:]), *model._topology)
+
+
+def _extrapolated(model: System, reference: Reference) -> tuple[Tensor, Tensor]:
+    """n_a . n_b [m^4], [B, T, 6], and 6 V [m^3], [B, T], 0 where there is no such tet, of extrapolated products of
+    edges."""
+    edges = [c[..., 1:, :] - c[..., :1, :] for c in (_corners(model, reference.one), _corners(model, reference.two))]
+    one, two = ([(e[..., a, :] * e[..., b, :]).sum(-1) for a, b in GRAM] for e in edges)
+    xx, xy, xz, yy, yz, zz = (p + reference.weight * (q - p) for p, q in zip(one, two, strict=True))
+    # cofactors: products of the normals n_1, n_2, n_3; n_0 = -(n_1 + n_2 + n_3)
+    n11, n22, n33 = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    n12, n13, n23 = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - yz * xx
+    products = [-(n11 + n12 + n13), -(n12 + n22 + n23), -(n13 + n23 + n33), n12, n13, n23]
+    square = xx * n11 + xy * n12 + xz * n13
+    exists = (square.detach() > 0) & (n33.detach() > 0) & (determinant(edges[0].detach()) > 0)
+    return torch.stack(products, -1), torch.where(exists, torch.where(exists, square, 1.0).sqrt(), 0.0)
 
 
 def _slowed(model: System, prepared: Prepared, drag: Tensor, x: Tensor, reference: Tensor | None) -> Prepared:
@@ -57,16 +99,16 @@ def _slowed(model: System, prepared: Prepared, drag: Tensor, x: Tensor, referenc
     return replaced(prepared, mass=mass, coarse=coarse, drag=Drag(factor, shift))
 
 
-def _viscous(model: System, prepared: Prepared, damping: Damping, start: Tensor) -> Prepared:
+def _viscous(model: System, prepared: Prepared, damping: Damping, products: Tensor, six_volumes: Tensor) -> Prepared:
+    """products: n_a . n_b of the tets' faces where the motion starts [B, T, 6]; six_volumes: 6 V there [B, T]."""
     h, rest = prepared.settings.numbers.time_step, prepared.rest
     rest = model.rest_scalars if rest is None else rest
-    normals, six_volumes = face_normals(ops.tet_gather(start, *model._topology))
     given = prepared.mu, prepared.lam, damping.viscosity, damping.volume_viscosity
-    scenes = max(len(t) for t in (start, rest, *given) if t is not None)
+    scenes = max(len(t) for t in (products, rest, *given) if t is not None)
     shape = scenes, model.num_tets
 
     def of_tets(value: Tensor | None) -> Tensor:
-        return start.new_zeros(shape) if value is None else ops.broadcast(value, shape)
+        return products.new_zeros(shape) if value is None else ops.broadcast(value, shape)
 
     own = ops.broadcast(rest, (*shape, rest.shape[-1]))
     c6, weights = own[..., 6], own[..., :6]
@@ -79,9 +121,9 @@ def _viscous(model: System, prepared: Prepared, damping: Damping, start: Tensor)
     elastic, viscous = 2 * mu + lam, 2 * shear + volume
     total = elastic + viscous
     r = torch.where(total > 0, (elastic + ratio * viscous) / torch.where(total > 0, total, 1.0), 1.0)
-    both = mu + shear
-    share = torch.where(both > 0, shear / torch.where(both > 0, both, 1.0), 0.0)[..., None]
-    at_start = torch.stack(stiffness_weights(normals, c6), -1)
+    both = mu + shear + LEAST
+    share = (shear / both)[..., None]
+    at_start = (c6 / 6)[..., None] * products
     metric = torch.cat([(weights + share * (at_start - weights)) / r[..., None], (c6 / r)[..., None]], -1)
     coarse = prepared.coarse
     if coarse is not None:  # whose matrices are those of the shape at rest

@@ -28,7 +28,7 @@ from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import STAGED, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse import coarse_mass
 from .contact import ContactStep, motion_of
-from .damping import damped
+from .damping import Reference, damped
 from .predict import Begun, begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
@@ -115,7 +115,7 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
 
     outer = {"x": x, "v": v, **_named(history, given)}
 
-    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any], reference: Tensor | None = None,
+    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any], reference: Reference | None = None,
               begun: Tensor | None = None) -> tuple[Tensor, Tensor, Solve]:  # fmt: skip
         """``reference``: as of damped(); ``begun``: where a solve before this one has ended."""
         try:
@@ -161,8 +161,10 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
         return Taken(x_end, v_end, remembered(x_end), last)
 
     def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, fraction: float, lookback: float,
-                   end: dict[str, Any] = end, begun: Tensor | None = None) -> Taken:  # fmt: skip
-        """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
+                   states: tuple[Tensor, float], end: dict[str, Any] = end, begun: Tensor | None = None
+                   ) -> Taken:  # fmt: skip
+        """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it: that
+        of x + weight (other - x), of the ``states`` other and weight."""
         start, weights = reference + carried, _over(whole, fraction, lookback)
         if euler is not None:
             one = euler[..., None]
@@ -172,15 +174,18 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
             loads = end
         began = None
         if weights.damping is not None:
-            began = feasible + weights.settings.numbers.time_step * carried
-            began = began if euler is None else torch.where(euler[..., None], x, began)
+            position, two = feasible + weights.settings.numbers.time_step * carried, states[0]
+            if euler is not None:
+                position, two = (torch.where(euler[..., None], x, t) for t in (position, two))
+            began = Reference(position, x, two, states[1])
         x_end, v_end, last = solve(feasible, start, weights, loads, began, begun)
         v_end = v_end - carried if euler is None else torch.where(euler[..., None], fraction * v_end, v_end - carried)
         return Taken(x_end, v_end, remembered(x_end), last)
 
     if isinstance(integrator, BDF2) and history is not None:
         carried = history.moved / (2 * time_step)
-        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3, LOOKBACK_OF_BDF2)
+        before = x - history.moved, -1 / 3
+        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3, LOOKBACK_OF_BDF2, before)
     first, second = LOOKBACKS_OF_SDIRK2
     midway = _at_fraction(given, x, GAMMA)
     x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), midway)
@@ -195,7 +200,8 @@ def take(integrator: Integrator, model: System, x: Tensor, v: Tensor, history: H
             before = torch.where(mixed, given["colliders_before"], before)
     if given["colliders_before"] is not None:
         end = {**end, "colliders_before": before}
-    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, second, end, x1)
+    half = x1, 1 + math.sqrt(2)
+    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, second, half, end, x1)
 
 
 def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:

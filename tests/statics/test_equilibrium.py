@@ -183,3 +183,32 @@ def edge_squares(x: Tensor, pairs: Tensor) -> Tensor:
     """|u|^2 |v|^2 of the two edges of each pair of edges."""
     a, b, c, d = x[pairs].unbind(1)
     return (b - a).square().sum(-1) * (d - c).square().sum(-1)
+
+
+@pytest.mark.parametrize("pins", ([0], [0, 1, 2, 3]))
+@pytest.mark.parametrize("factor", (0.8, 1.1, 2.0))
+def test_what_swells_freely_ends_without_stress(factor: float, pins: list[int]) -> None:
+    """Where no force is left to compare a residual with."""
+    model = dv.Model(dv.mesh.cube(3, size=0.1), pinned=pins)
+    inputs = {"stress_free": factor * torch.eye(3, dtype=torch.float64), "mu": 4e4, "lam": 9e4}
+    end = dv.equilibrium(model, model.rest_points, dv.VBD(1.0, 0, subspace="coarse"), gravity=(0.0, 0.0, 0.0), **inputs)
+    assert end.converged and end.residual < 1e-8 and end.iterations < 30
+    if len(pins) == 1:
+        assert float(dv.stress(model, end.x, **inputs).von_mises.max()) < 1e-2
+        size = end.x.amax(0) - end.x.amin(0)
+        assert float(size.norm()) == pytest.approx(0.1 * factor * 3**0.5, rel=1e-4)
+
+
+def test_what_equilibrium_does_not_know_is_refused() -> None:
+    mesh = dv.mesh.cube(2, size=0.1)
+    springs = dv.Springs(dv.Embedding.of_vertices([7]), torch.zeros((1, 3), dtype=torch.float64), 10.0)
+    joined = dv.Model(mesh, pinned=[0], energies=(dv.StableNeoHookean(), springs))
+    solver = dv.VBD(1.0, 0)
+    with pytest.raises(NotImplementedError, match="model: expected one without springs"):
+        dv.equilibrium(joined, joined.rest_points, solver, mu=1e4, lam=1e4)
+    model = dv.Model(mesh, pinned=[0])
+    for name in ("viscosity", "drag"):
+        with pytest.raises(ValueError, match=f"{name}: expected none: at rest nothing has moved"):
+            dv.equilibrium(model, model.rest_points, solver, mu=1e4, lam=1e4, **{name: 1.0})
+    with pytest.raises(ValueError, match="prescribed: expected a shape"):
+        dv.equilibrium(model, model.rest_points, solver, mu=1e4, lam=1e4, prescribed=model.rest_points[:3])

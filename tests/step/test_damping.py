@@ -174,6 +174,23 @@ def test_spin_is_kept_and_momentum_is_not_made() -> None:
     assert float((ends[0][1] - ends[1][1]).norm() / ends[0][1].norm()) < 2e-3
 
 
+@pytest.mark.parametrize("integrator", (dv.SDIRK2(), dv.BDF2()), ids=str)
+def test_strong_viscosity_neither_swells_nor_drives_a_turning_body(integrator: Any) -> None:
+    """Where strain rates were measured from extrapolated positions, the body grew by 1 % and gained 60 % of energy."""
+    model = dv.Model(dv.mesh.beam(4, 3, 2, size=(0.3, 0.2, 0.1)))
+    x = model.rest_points
+    spin = torch.tensor([0.0, 0.0, 5.5], dtype=torch.float64)
+    v = torch.linalg.cross(spin.expand_as(x), x - x.mean(0))
+    solver = dv.VBD(0.01, 30, subspace="coarse", integrator=integrator)
+    motion = dv.rollout(
+        model, x, v, solver, steps=50, viscosity=1e5, volume_viscosity=1e5, gravity=NO_GRAVITY, **MODULI
+    )
+    energy = (model.mass[:, None] * motion.v.square()).sum((-2, -1))
+    size = (motion.x - motion.x.mean(1, keepdim=True)).norm(dim=(-2, -1))
+    assert float(energy.max() / energy[0]) < 1.002 and float(energy[-1] / energy[0]) > 0.85
+    assert float((size / size[0] - 1).abs().max()) < 5e-4
+
+
 @pytest.mark.parametrize("integrator", (dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2()), ids=str)
 @pytest.mark.parametrize("subspace", ("rigid", "coarse"))
 def test_gradient_against_central_differences(device: str, integrator: Any, subspace: Any) -> None:
@@ -184,8 +201,8 @@ def test_gradient_against_central_differences(device: str, integrator: Any, subs
     energies = [dv.StableNeoHookean(), dv.PairBarrier(), dv.Friction(0.3)]
     model = dv.Model(mesh, pinned=mesh.points[:, 0] > 1.099, energies=energies, device=device)
     x = model.rest_points + 1e-4 * randn(mesh.num_vertices, 3).to(device)
-    v = torch.zeros_like(x)
-    v[:, 1] = torch.where(x[:, 1] > 0.1, -0.5, 0.0)
+    v = 0.05 * randn(mesh.num_vertices, 3, seed=1).to(device)  # a body at rest lies at a kink of friction
+    v[:, 1] -= torch.where(x[:, 1] > 0.1, 0.5, 0.0)
     weight = randn(mesh.num_vertices, 3, seed=2).to(device)
 
     solver = dv.VBD(0.004, 4, subspace=subspace, integrator=integrator)
@@ -200,7 +217,7 @@ def test_gradient_against_central_differences(device: str, integrator: Any, subs
 
     viscosities = {"viscosity": between(10, 200, mesh.num_tets), "volume_viscosity": between(200, 20, mesh.num_tets)}
     arguments = {"x": x, "v": v, **viscosities, "drag": between(1, 30, mesh.num_vertices)}
-    found = dv.check_gradients(loss, arguments, tolerance=1e-5, verbose=False)
+    found = dv.check_gradients(loss, arguments, verbose=False)
     assert found.ok, str(found)
     assert all(row[1] > 0 for row in found.rows)
 
@@ -232,6 +249,19 @@ def test_reactions_hold_what_damping_asks_for() -> None:
     wanted = (mass * ((v1 - v) / 0.01 + 4.0 * v1)).sum(0) - model.mass.sum() * torch.tensor([0, -9.81, 0])
     assert float((held - wanted).norm() / wanted.norm()) < 1e-6
     raises(lambda: dv.reactions(model, x1, **inputs), "previous", "None")
+
+
+def test_gradient_of_a_viscosity_of_zero_without_shear_modulus() -> None:
+    model = dv.Model(dv.mesh.cube(2, size=0.1), pinned=[0])
+    x = model.rest_points + 0.005 * randn(8, 3)
+
+    def loss(viscosity: Tensor) -> Tensor:
+        end = dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 10), mu=0.0, lam=1e4, viscosity=viscosity)[0]
+        return (end * randn(8, 3, seed=1)).sum()
+
+    at = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (0.0, 1e-4)]
+    (slope,) = torch.autograd.grad(loss(at[0]), at[0])
+    assert float(slope) == pytest.approx(float((loss(at[1]) - loss(at[0])).detach()) / 1e-4, rel=1e-3)
 
 
 def test_float32() -> None:

@@ -103,8 +103,8 @@ def test_gradient_against_central_differences(subspace: Any) -> None:
     model = dv.Model(mesh, energies=[dv.StableNeoHookean(), dv.PairBarrier(), dv.Friction(0.3)])
     generator = torch.Generator().manual_seed(1)
     x = model.rest_points + 1e-4 * torch.randn(model.rest_points.shape, dtype=torch.float64, generator=generator)
-    v = torch.zeros_like(x)
-    v[:, 1] = torch.where(x[:, 1] > 0.1, -0.5, 0.0)
+    v = 0.05 * torch.randn(x.shape, dtype=torch.float64, generator=generator)
+    v[:, 1] -= torch.where(x[:, 1] > 0.1, 0.5, 0.0)
     g = torch.eye(3, dtype=torch.float64) + 0.05 * torch.randn(
         (mesh.num_tets, 3, 3), dtype=torch.float64, generator=generator
     )
@@ -128,7 +128,7 @@ def test_bad_input() -> None:
     x, v, solver = model.rest_points, torch.zeros_like(model.rest_points), dv.VBD(0.01, 2)
     flat = matrix((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
     for value, got in ((flat, "got 0"), (-torch.eye(3, dtype=torch.float64), "got -1"), (torch.eye(3), "torch.float32"),
-                       (x, r"shape \[20, 3\]")):  # fmt: skip
+                       (x, r"shape \[20, 3\]"), (1.2, r"shape \[\]")):  # fmt: skip
         raises(lambda value=value: dv.step(model, x, v, solver, stress_free=value, **MATERIAL), "stress_free", got)
     loose = dv.Model(model.mesh, pinned=model.pinned, energies=[dv.Anchor(1.0)])
     raises(lambda: dv.step(loose, x, v, solver, stress_free=flat), "stress_free", "no elastic law")
