@@ -217,7 +217,7 @@ def test_gradient_against_central_differences(device: str, integrator: Any, subs
 
     viscosities = {"viscosity": between(10, 200, mesh.num_tets), "volume_viscosity": between(200, 20, mesh.num_tets)}
     arguments = {"x": x, "v": v, **viscosities, "drag": between(1, 30, mesh.num_vertices)}
-    found = dv.check_gradients(loss, arguments, verbose=False)
+    found = dv.check_gradients(loss, arguments, tolerance=1e-5, verbose=False)  # that of contact
     assert found.ok, str(found)
     assert all(row[1] > 0 for row in found.rows)
 
