@@ -183,7 +183,7 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
-    mu, lam, young, poisson, rest_points, density, stress_free, *_ = given_inputs.material.values()
+    mu, lam, young, poisson, rest_points, density, stress_free, *dampings = given_inputs.material.values()
     parameters = given_inputs.parameters
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
@@ -254,6 +254,9 @@ def prepare(
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
+    damping = None
+    if any(value is not None for value in dampings):
+        damping = _damping(model, like, lead, given_inputs.material, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],
@@ -263,7 +266,7 @@ def prepare(
         settings=settings,
         coarse=coarse,
         unrolled=unrolled,
-        damping=_damping(model, like, lead, given_inputs.material, corners),
+        damping=damping,
     )
 
 
@@ -279,7 +282,7 @@ def _stress_free(given: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str, Any], corners: Tensor | None
-             ) -> Damping | None:  # fmt: skip
+             ) -> Damping:  # fmt: skip
     """corners: of the tets' rest shapes [B, T, 4, 3] where a step is given those."""
     out: dict[str, Tensor | None] = {}
     for name in (*VISCOSITIES, "drag"):
@@ -292,7 +295,7 @@ def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str
             if model.block == "paper" and name != "drag":
                 fail(name, 'a solver with block="exact"', 'one with block="paper"')
         out[name] = value
-    return Damping(**out, corners=corners) if any(value is not None for value in out.values()) else None
+    return Damping(**out, corners=corners)
 
 
 def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,

@@ -14,9 +14,10 @@ from .._common.checks import check_tensor, fail, to_float
 from .._common.context import refuse_refinement, refuse_transforms
 from ..adjoint.routes import Adjoint, TapedSweep, check_adjoint
 from ..model.model import Model
-from ..model.solver import BDF2, VBD
+from ..model.solver import BDF2, VBD, ImplicitEuler
 from .advance import advance
 from .arguments import check_prescribed, check_staged, check_state, given_of, prepare
+from .damping import damped
 from .integrators import take
 from .warnings import notice_loss, system_for, warn_of_sweeps
 
@@ -79,9 +80,13 @@ def step(
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
         check_prescribed(system, value, x)
     warn_of_sweeps(system, prepared, scheme)
-    taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
-    notice_loss(system, prepared, scheme, v, given.loads["force"], taken.x)
-    return taken.x, taken.v
+    if isinstance(scheme, ImplicitEuler):
+        x_end, v_end = advance(system, x, v, damped(system, prepared, x), adjoint=adjoint, **given.loads)
+    else:
+        taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
+        x_end, v_end = taken.x, taken.v
+    notice_loss(system, prepared, scheme, v, given.loads["force"], x_end)
+    return x_end, v_end
 
 
 @dataclass(frozen=True)
