@@ -77,8 +77,8 @@ def memory(
     per_step = (5 if local else 3) * state + tape_bytes
     per_step += scenes * sum(model._data_count) * item if local else 0
     per_step += scenes * coarse_scalars(model, sweeps) * item
-    # each sweep with couplings has its own start and record
-    per_step += scenes * sweeps * 12 * model.num_vertices * item if model.couplings else 0
+    if model.couplings:  # each sweep has its own start and record, and free bodies a correction of their own
+        per_step += scenes * sweeps * (23 if model.corrects else 12) * model.num_vertices * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
