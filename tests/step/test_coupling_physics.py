@@ -153,7 +153,7 @@ def icosphere(levels: int) -> tuple[np.ndarray, np.ndarray]:
     return points / np.linalg.norm(points, axis=1, keepdims=True), faces
 
 
-@pytest.mark.parametrize(("levels", "thickness"), [(2, 0.05), slow(3, 0.02)])
+@pytest.mark.parametrize(("levels", "thickness"), [(2, 0.05), pytest.param(3, 0.02, marks=pytest.mark.hours)])
 def test_a_sphere_under_pressure_grows_as_the_closed_form_says(levels: int, thickness: float) -> None:
     """Lame's thick sphere; where the wall is thin, also dr = p R^2 (1 - nu) / (2 E t)."""
     young, nu = 1e5, 0.3

@@ -29,11 +29,13 @@ CASES: dict[str, tuple[dict[str, Any], tuple[Any, ...], dict[str, Any]]] = {
     "sdirk2": ({}, (), {"integrator": dv.SDIRK2()}),
 }
 RUNS = [("plain", 1, 1), ("plain", 8, 1), ("plain", 2, 3), *((name, 2, 1) for name in CASES if name != "plain")]
-LONG = [(name, sweeps, steps) for name in CASES for sweeps in (1, 2, 8) for steps in (1, 3)
-        if (name, sweeps, steps) not in RUNS]  # fmt: skip
+EVERY = [(name, sweeps, steps) for name in CASES for sweeps in (1, 2, 8) for steps in (1, 3)
+         if (name, sweeps, steps) not in RUNS]  # fmt: skip
+LONG = [run for i, run in enumerate(EVERY) if i % 4 == 0]  # which takes all cases, sweeps and steps in turn
+HOURS = [pytest.param(*run, marks=pytest.mark.hours) for run in EVERY if run not in LONG]
 
 
-@pytest.mark.parametrize(("case", "sweeps", "steps"), [*RUNS, *(slow(*run) for run in LONG)])
+@pytest.mark.parametrize(("case", "sweeps", "steps"), [*RUNS, *(slow(*run) for run in LONG), *HOURS])
 def test_gradients_are_those_of_the_executed_sweeps(device: str, case: str, sweeps: int, steps: int) -> None:
     scene, energies, options = CASES[case]
     model, solver = coupled(*energies, **scene), dv.VBD(STEP, sweeps, **options)
