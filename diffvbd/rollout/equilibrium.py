@@ -94,7 +94,8 @@ def equilibrium(
         adjoint: Tolerance, max_iterations, on_failure and report of the backward's linear solve; its matrix is stored.
         progress: Print the residual at each iteration, by the logger "diffvbd".
         inputs: As in :func:`diffvbd.step`. ``prescribed`` moves the pinned vertices from x, in increments if need be.
-            Inputs of friction and damping are checked and have no gradient.
+            Those of friction and of contact damping are checked and have no gradient; ``viscosity``,
+            ``volume_viscosity``, ``drag`` and ``colliders_before`` raise.
 
     Returns:
         A :class:`diffvbd.results.Equilibrium`.

@@ -35,7 +35,7 @@ FIRST_SHIFT, LAST_SHIFT, RAISED = 1e-6, 1e3, 10.0  # of the diagonal
 PATIENCE = 100  # iterations of one increment of the load
 MOST_PARTS = 64
 INCREMENT = 1e-3  # residual at which the next increment follows
-SMALL_STRAIN = 1e-5
+SMALL_STRAIN = 1e-5  # whose forces stand for those of a state without any, far below the strains of a scene
 WHOLE = 1 - 1e-9  # a fraction of 1, but for rounding
 FAR = 1e4  # extents of the scene
 
