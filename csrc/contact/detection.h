@@ -161,6 +161,7 @@ DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t e
 constexpr double kRestFraction = 0.9, kSamePlace = 1e-9;
 // Squared sine below which edges are mollified (Li et al. 2020), with the lengths at rest.
 constexpr double kMollified = 1e-3;
+constexpr int32_t kSharp = 2;  // of two edges that push each other
 
 // Surfaces of all scenes and what is known of their corner points: `vertices` of the mesh, then those of colliders.
 template <class T>
@@ -168,7 +169,10 @@ struct Surfaces {
   const T *x, *origin;                // [B, V, 3]; origin may be null
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
+  // Triangles; for pairs of different bodies edges (a, b, b) and vertices (a, a, a), too, with what each face counts;
+  // and the sharpness of edges (diffvbd/_contact/surface.py). The last two are null where nothing pushes.
   const int32_t *triangles, *edges, *points, *planes, *body;
+  const int32_t *weight, *sharpness;
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -202,7 +206,7 @@ template <class T>
 struct Detected {
   int64_t capacity;
   int32_t* pairs;         // [capacity, 6]  corner points, kind, scene
-  T* constants;           // [capacity, 8]  dhat, offset, threshold; what limit.h takes as hints, the pair's gap last
+  T* constants;           // [capacity, 8]  as of Constants; what limit.h takes as hints, the pair's gap last
   int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
   int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
   T* near_values;         // [B, N, 8]  weights, normal, gap
@@ -347,6 +351,9 @@ DIFFVBD_FN Candidate candidate_of_key(const Surfaces<T>& in, uint64_t key) {
                    static_cast<int32_t>(key % m));
 }
 
+// Whether corner k of a pair is the same point as the one before it, as in edges and vertices that count as faces.
+DIFFVBD_FN bool is_repeated(const int32_t* pair, int k) { return k > 1 && pair[k] == pair[k - 1]; }
+
 // Whether the rules admit the pair, but for the distance at rest of two sides of one body.
 template <class T>
 DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
@@ -360,6 +367,8 @@ DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
     }
     for (int k = 1; k < 4; ++k) pinned = pinned && in.pinned[c.v[k]];
   }
+  // a face of fewer dimensions counts for other bodies
+  if (c.kind == kPointTriangle && is_repeated(c.v, 3) && in.body[c.v[0]] == in.body[c.v[1]]) return false;
   return !pinned && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
 }
 
@@ -398,7 +407,8 @@ DIFFVBD_APART T height(const Corners<T>& c) {
 
 template <class T>
 struct Constants {
-  T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier [m^4]
+  T dhat, offset;   // reach of the barrier, 0 where it has none, and sum of the radii [m]
+  T threshold;      // of two edges: of the mollifier [m^4]; else: what the pair counts
   bool admitted;              // false for two sides of one body that are one place of the material
 };
 
@@ -410,7 +420,7 @@ DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
 template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
   const int second = c.second();
-  Constants<T> out{in.dhat, offset_of(in, c), T(0), true};
+  Constants<T> out{in.dhat, offset_of(in, c), T(c.kind == kPointTriangle ? in.weight[c.b] : 1), true};
   const bool one_body = c.kind != kPointPlane && in.body[c.v[0]] == in.body[c.v[second]];
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
@@ -420,7 +430,10 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   };
   const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
   if (c.kind == kEdgeEdge) out.threshold = T(kMollified) * e * f;
-  if (!one_body) return out;
+  if (!one_body) {
+    if (in.sharpness[c.a] + in.sharpness[c.b] < kSharp) out.dhat = T(0);
+    return out;
+  }
   T longest = e < f ? f : e;
   if (c.kind == kPointTriangle && longest < squared_length(1, 3)) longest = squared_length(1, 3);
   const T at_rest = separation(c.kind, rest);

@@ -104,7 +104,7 @@ template <class R, class T>
 DIFFVBD_FN LagState<R> lag_state(int kind, const Corners<R>& c, const Distance<R>& at, const PairConstants<T>& a,
                                  const R& kappa) {
   const R gap = at.d - R(a.offset);
-  const LogBarrier<R> b(gap, R(a.dhat), kappa);
+  const LogBarrier<R> b = a.barrier(kind, gap, kappa);
   LagState<R> out{-b.first, select(gap < R(a.dhat), R(1), R(0)), at.n, {at.w[0], at.w[1], at.w[2], at.w[3]}};
   if (is_mollified(kind, c, a.threshold)) out.force = mollifier(c, a.threshold).e * out.force;
   return out;

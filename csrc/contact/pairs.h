@@ -12,10 +12,16 @@ namespace diffvbd::contact {
 // Constants of a listed pair.
 template <class T>
 struct PairConstants {
-  T dhat, offset, threshold;  // [m], radii that the gap is less than the distance [m], of the mollifier [m^4]
+  T dhat, offset;  // [m], radii that the gap is less than the distance [m]
+  T threshold;     // of two edges: of the mollifier [m^4]; else: what the pair counts
   DIFFVBD_FN explicit PairConstants(const T* a) : dhat(a[0]), offset(a[1]), threshold(a[2]) {}
   DIFFVBD_FN PairConstants(const T& dhat, const T& offset, const T& threshold)
       : dhat(dhat), offset(offset), threshold(threshold) {}
+  // b of a gap, times a size and what the pair counts
+  template <class R>
+  DIFFVBD_FN LogBarrier<R> barrier(int kind, const R& gap, const R& size) const {
+    return LogBarrier<R>(gap, R(dhat), kind == kEdgeEdge ? size : R(threshold) * size);
+  }
 };
 
 // The item of corner i; in a pack of lanes each has an i of its own.
@@ -32,7 +38,7 @@ DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at
   const R gap = at.d - a.offset;
   const auto active = gap < a.dhat;
   if (!any(active)) return active;
-  const LogBarrier<R> b(gap, a.dhat, h2 * kappa);
+  const LogBarrier<R> b = a.barrier(kind, gap, h2 * kappa);
   R e = R(1);
   Vec3<R> own = zero3<R>();
   const auto mollified = is_mollified(kind, c, a.threshold);
@@ -81,7 +87,7 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   const R gap = at.d - a.offset;
   const auto active = gap < a.dhat;
   if (!any(active)) return active;
-  const LogBarrier<R> b(gap, a.dhat, h2);  // kappa scales everything: it comes last
+  const LogBarrier<R> b = a.barrier(kind, gap, h2);  // kappa scales everything: it comes last
   const R w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw);
   R e = R(1), phi = R(0), by_gap = R(0);
   const auto mollified = is_mollified(kind, c, a.threshold);

@@ -270,7 +270,7 @@ DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& 
   const Distance<double> near = distance(record[4], c);
   const double gap = near.d - a.offset, h = in.scene.time_step;
   if (!(gap < dhat)) return false;
-  const LogBarrier<double> b(gap, dhat, h * h * in.kappa.data[scene * in.kappa.scene]);
+  const LogBarrier<double> b = a.barrier(record[4], gap, h * h * in.kappa.data[scene * in.kappa.scene]);
   double e = 1;
   Mollifier<double> m{};
   const bool mollified = is_mollified(record[4], c, a.threshold);

@@ -142,7 +142,7 @@ DIFFVBD_FN void add_by_motions(const ForceTerms<double>& a, const PairMotions& m
 template <class R, class T>
 DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
-  const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
+  const LogBarrier<R> b = a.barrier(kind, near.d - R(a.offset), R(size));
   ForceTerms<R> out{};
   R e(1);
   if (is_mollified(kind, c, a.threshold)) {

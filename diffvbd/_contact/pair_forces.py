@@ -29,7 +29,12 @@ class NearPairs(NamedTuple):
     scene: Tensor  # [Q] int64
     dhat: Tensor  # [Q] [m]
     offset: Tensor  # [Q] sum of the radii [m]
-    threshold: Tensor  # [Q] of the mollifier [m^4]
+    threshold: Tensor  # [Q] of two edges: of the mollifier [m^4]; else: what the pair counts
+
+    @property
+    def weight(self) -> Tensor:
+        """What each pair counts [Q]."""
+        return torch.where(self.kind == EDGE_EDGE, 1.0, self.threshold)
 
     def positions(self, points: Tensor) -> Tensor:
         """Corners [Q, 4, 3] in corner points [B, N, 3]."""
@@ -113,14 +118,14 @@ def barrier_forces(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
         points: Corner points [B, N, 3].  kappa: [1 | B] [N/m].
     """
     gap, slope, e, turn = pairs.measures(points)
-    value, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
+    value, first, _ = log_barrier(gap, pairs.weight * pairs.of_scene(kappa), pairs.dhat)
     return -(e * first)[:, None, None] * slope - value[:, None, None] * turn
 
 
 def barrier_stiffness(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
     """Trace of the barrier's part of each corner point's block [N/m], [B, N]; arguments as of barrier_forces."""
     gap, slope, e, _ = pairs.measures(points)
-    _, _, second = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
+    _, _, second = log_barrier(gap, pairs.weight * pairs.of_scene(kappa), pairs.dhat)
     return pairs.summed((e * second)[:, None, None] * slope.square(), points).sum(-1)  # of 3x3 blocks
 
 
@@ -139,11 +144,12 @@ class Lag(NamedTuple):
 def lag_of(pairs: NearPairs, start: Tensor, kappa: Tensor) -> Lag:
     """pairs: near at the start, where corner points are ``start`` [B, N, 3]; kappa: [1 | B] [N/m]."""
     gap, slope, e, _ = pairs.measures(start)
-    _, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
+    _, first, _ = log_barrier(gap, pairs.weight * pairs.of_scene(kappa), pairs.dhat)
     normal = pairs.of_first(slope)  # weights of the first side sum to 1
     weights = (slope * normal[:, None]).sum(-1)
     size = -e * first
-    return Lag(pairs, start, size, normal, damped_fraction(size, pairs.of_scene(kappa), pairs.dhat), weights, slope)
+    fraction = pairs.weight * damped_fraction(pairs.weight * size, pairs.of_scene(kappa), pairs.dhat)
+    return Lag(pairs, start, size, normal, fraction, weights, slope)
 
 
 def lagged_forces(

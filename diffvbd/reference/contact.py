@@ -26,7 +26,7 @@ class Substep(NamedTuple):
     vertices before colliders."""
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
-    constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
+    constants: Tensor  # [Q, 3 or more]: dhat and sum of radii [m]; of edges the mollifier's threshold [m^4], else a weight
     u: Tensor  # [B, bodies, 3]: translation of each body's island
     fractions: Tensor  # [B, V]: step fraction of each vertex at the start
     truncated: Tensor  # bool [B, V]: vertices whose displacement goes on in the next substep
@@ -50,6 +50,7 @@ class Pairs:
         rows, constants = substep.pairs[order], scene.tensor(substep.constants)[order]
         self.corners, self.kind, self.batch = rows[:, :4], rows[:, 4], rows[:, 5]
         self.dhat, self.offset, self.threshold = constants[:, :3].unbind(1)
+        self.weight = torch.where(self.kind == EDGE_EDGE, 1.0, self.threshold)
         self.lead = scene.like.shape[:-2]
         self.points = scene.rest_points.shape[-1] + scene.model.collider_points.shape[-2]
         self.sizes = [len(color.vertices) for color in scene.layout.colors]
@@ -62,7 +63,9 @@ class Pairs:
         position[vertices] = torch.arange(len(vertices), device=vertices.device)
         owner = position[self.corners]
         pair, local = (owner >= 0).nonzero(as_tuple=True)
-        together = (owner >= 0).sum(1)[pair]
+        moves = owner >= 0
+        moves[:, 2:] &= self.corners[:, 2:] != self.corners[:, 1:-1]  # edges and vertices repeat their last corner
+        together = moves.sum(1)[pair]
         return pair, local, self.batch[pair] * len(vertices) + owner[pair, local], together
 
     def per_pair(self, value: Tensor) -> Tensor:
@@ -108,7 +111,7 @@ class PairBarrier:
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:
         self.weight, self.pairs, self.colliders = scene.time_step**2, pairs, colliders
-        self.kappa = pairs.per_pair(scene.parameter(scene.model.contact, "kappa"))
+        self.kappa = pairs.weight * pairs.per_pair(scene.parameter(scene.model.contact, "kappa"))
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         pair, local, _, together = self.pairs.entries[k]
@@ -156,7 +159,8 @@ class LaggedPairForces:
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
         force = -e * first
         whole = force + FADE * kappa * pairs.dhat
-        fraction = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
+        fraction = pairs.weight * torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
+        first = pairs.weight * first
         self.damping = fraction * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large

@@ -73,7 +73,8 @@ def _viscous(model: System, prepared: Prepared, damping: Damping, start: Tensor)
     ratio = c6 * six_volumes
     upright = ratio.detach() > 0  # a tet that starts inside out is not damped in the step
     mu, lam, *rates = (of_tets(value) for value in given)
-    shear, volume = (torch.where(upright, rate / h, 0.0) for rate in rates)
+    all_shear, all_volume = (rate / h for rate in rates)
+    shear, volume = (torch.where(upright, rate, 0.0) for rate in (all_shear, all_volume))
     ratio = torch.where(upright, ratio, 1.0)
     elastic, viscous = 2 * mu + lam, 2 * shear + volume
     total = elastic + viscous
@@ -84,6 +85,6 @@ def _viscous(model: System, prepared: Prepared, damping: Damping, start: Tensor)
     metric = torch.cat([(weights + share * (at_start - weights)) / r[..., None], (c6 / r)[..., None]], -1)
     coarse = prepared.coarse
     if coarse is not None:  # whose matrices are those of the shape at rest
-        parts = coarse_parts(model, both, lam + volume, None, metric, damping.corners)
+        parts = coarse_parts(model, mu + all_shear, lam + all_volume, None, metric, damping.corners)
         coarse = replaced(parts, mass=coarse.mass)
     return replaced(prepared, mu=r * both, lam=r * (lam + volume), rest=metric, coarse=coarse)

@@ -106,7 +106,8 @@ def test_inputs_are_declared_by_energies() -> None:
     assert table["friction"].source == "Friction" and table["young"].source == "StableNeoHookean"
     assert "anchor_stiffness" not in table and len(str(table).splitlines()) == len(table) + 1
     bare = dv.Model(dv.mesh.cube(split="kuhn"), energies=()).inputs
-    assert set(bare) == {"force", "gravity", "prescribed", "colliders", "colliders_before", "rest_points", "density"}
+    assert set(bare) == {"force", "gravity", "prescribed", "colliders", "colliders_before", "rest_points", "density",
+                         "drag"}  # fmt: skip
 
 
 def test_paper_preset() -> None:
