@@ -52,9 +52,9 @@ void require_capacity(int64_t capacity) {
 // Results as in contact/detection.h. mesh_bodies: body labels from there on are colliders; radii [scenes, mesh_bodies +
 // 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
 // many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
-DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,
-                 In faces, In weight, In edges, In sharpness, In points, In planes, In body, In pinned,
-                 In trust_radius, In deformation_radius, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
+DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius, In faces,
+                 In weight, In edges, In sharpness, In points, In planes, In body, In pinned, In trust_radius,
+                 In deformation_radius, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
                  int64_t capacity, bool trim) {
   const Device device(x);
   require_capacity(capacity);

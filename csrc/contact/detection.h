@@ -407,9 +407,9 @@ DIFFVBD_APART T height(const Corners<T>& c) {
 
 template <class T>
 struct Constants {
-  T dhat, offset;   // reach of the barrier, 0 where it has none, and sum of the radii [m]
-  T threshold;      // of two edges: of the mollifier [m^4]; else: what the pair counts
-  bool admitted;              // false for two sides of one body that are one place of the material
+  T dhat, offset;  // reach of the barrier, 0 where it has none, and sum of the radii [m]
+  T threshold;     // of two edges: of the mollifier [m^4]; else: what the pair counts
+  bool admitted;   // false for two sides of one body that are one place of the material
 };
 
 template <class T>
@@ -420,8 +420,9 @@ DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
 template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
   const int second = c.second();
-  Constants<T> out{in.dhat, offset_of(in, c), T(c.kind == kPointTriangle ? in.weight[c.b] : 1), true};
   const bool one_body = c.kind != kPointPlane && in.body[c.v[0]] == in.body[c.v[second]];
+  Constants<T> out{in.dhat, offset_of(in, c), T(1), true};
+  if (c.kind == kPointTriangle && in.weight != nullptr) out.threshold = T(in.weight[c.b]);
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
   const auto squared_length = [&](int i, int j) {
@@ -431,7 +432,7 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
   if (c.kind == kEdgeEdge) out.threshold = T(kMollified) * e * f;
   if (!one_body) {
-    if (in.sharpness[c.a] + in.sharpness[c.b] < kSharp) out.dhat = T(0);
+    if (in.sharpness != nullptr && in.sharpness[c.a] + in.sharpness[c.b] < kSharp) out.dhat = T(0);
     return out;
   }
   T longest = e < f ? f : e;

@@ -127,7 +127,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     pinned = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
     all_triangles, all_edges = index_tensor(triangles, 3), index_tensor(edges, 2)
-    faces, weight = faces_of(all_triangles.numpy())
+    faces, weight = faces_of(all_triangles.numpy(), all_edges.numpy())
+    sharpness = sharpness_of(np.concatenate(rest), all_triangles.numpy(), all_edges.numpy())
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
         radius=torch.from_numpy(np.concatenate(radius)),
@@ -135,7 +136,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         edges=all_edges,
         faces=torch.from_numpy(faces),
         weight=torch.from_numpy(weight),
-        sharpness=torch.from_numpy(sharpness_of(np.concatenate(rest), all_triangles.numpy(), all_edges.numpy())),
+        sharpness=torch.from_numpy(sharpness),
         points=index_tensor(points, 1).reshape(-1),
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
@@ -156,16 +157,17 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     )
 
 
-def faces_of(triangles: Any) -> tuple[Any, Any]:
+def faces_of(triangles: Any, edges: Any) -> tuple[Any, Any]:
     """Faces of all dimensions of surfaces, int32 [F', 3], and by how much each counts, int32 [F'].
 
     Triangles, edges (a, b, b) and vertices (a, a, a). A face counts 1 less the counts of those that contain it: an edge
-    of two triangles -1, a vertex all around which there are triangles 1, an edge or vertex of the border 0. So that of
-    a surface that is flat or convex near a point only the closest face counts, and once.
+    of two triangles -1, a vertex all around which there are triangles 1, an edge or vertex of the border 0, a lone edge
+    1. So that of a surface that is flat or convex near a point only the closest face counts, and once.
     """
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-    edges, each = np.unique(sides, axis=0, return_counts=True) if len(sides) else (sides, np.zeros(0, int))
-    points = np.unique(triangles)
+    edges, each = np.unique(np.concatenate([sides, np.sort(edges, 1)]), axis=0, return_counts=True)
+    each = each - 1  # triangles of each
+    points = np.unique(edges)
     around = np.zeros(points[-1] + 1 if len(points) else 0, np.int64)
     np.add.at(around, triangles.reshape(-1), 1)
     np.add.at(around, edges.reshape(-1), np.repeat(1 - each, 2))
