@@ -161,7 +161,7 @@ DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t e
 constexpr double kRestFraction = 0.9, kSamePlace = 1e-9;
 // Squared sine below which edges are mollified (Li et al. 2020), with the lengths at rest.
 constexpr double kMollified = 1e-3;
-constexpr int32_t kSharp = 2;  // of two edges that push each other
+constexpr double kAcross = 0.25;  // sine of the angle from the faces of a sharp edge to what lies across it
 
 // Surfaces of all scenes and what is known of their corner points: `vertices` of the mesh, then those of colliders.
 template <class T>
@@ -170,9 +170,10 @@ struct Surfaces {
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
   // Triangles; for pairs of different bodies edges (a, b, b) and vertices (a, a, a), too, with what each face counts;
-  // and the sharpness of edges (diffvbd/_contact/surface.py). The last two are null where nothing pushes.
+  // and of edges the sharpness and the other corners of two of their triangles [E, 2], -1 where there is none
+  // (diffvbd/_contact/surface.py). The last three are null where nothing pushes.
   const int32_t *triangles, *edges, *points, *planes, *body;
-  const int32_t *weight, *sharpness;
+  const int32_t *weight, *sharpness, *wings;
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -417,6 +418,31 @@ DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
   return in.radius[c.v[0]] + in.radius[c.v[c.second()]];
 }
 
+// Whether two edges of different bodies push each other: both are sharp, or one is, and the other lies across it rather
+// than along one of its faces.
+template <class T>
+DIFFVBD_APART bool are_sharp(const Surfaces<T>& in, const Candidate& c) {
+  const int32_t sharpness[2] = {in.sharpness[c.a], in.sharpness[c.b]}, both = sharpness[0] + sharpness[1];
+  if (both != 1) return both > 1;
+  const bool first = sharpness[0] == 1;
+  const Corners<T> corners = corners_with(in, c, in.collider);
+  const Vec3<T> one = corners.x[1] - corners.x[0], two = corners.x[3] - corners.x[2], edge = first ? one : two;
+  // the common normal, which is the direction where both are closest inside
+  const Vec3<T> n = cross(one, two), apart = first ? corners.x[2] - corners.x[0] : corners.x[0] - corners.x[2];
+  const T size = square_root(dot(n, n));
+  if (!(T(0) < size)) return false;
+  const Vec3<T> outward = (dot(n, apart) < T(0) ? T(-1) / size : T(1) / size) * n;
+  const Place<T> from = place(in, in.collider, c.scene, c.v[first ? 0 : 2]);
+  for (int k = 0; k < 2; ++k) {
+    const int32_t wing = in.wings[2 * (first ? c.a : c.b) + k];
+    if (wing < 0) continue;
+    const Place<T> to = place(in, in.collider, c.scene, wing);
+    const Vec3<T> arm = (to.x - from.x) + (to.o - from.o), across = arm - (dot(arm, edge) / dot(edge, edge)) * edge;
+    if (!(dot(outward, across) < T(-kAcross) * square_root(dot(across, across)))) return false;
+  }
+  return true;
+}
+
 template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
   const int second = c.second();
@@ -432,7 +458,7 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
   if (c.kind == kEdgeEdge) out.threshold = T(kMollified) * e * f;
   if (!one_body) {
-    if (in.sharpness != nullptr && in.sharpness[c.a] + in.sharpness[c.b] < kSharp) out.dhat = T(0);
+    if (in.sharpness != nullptr && !are_sharp(in, c)) out.dhat = T(0);
     return out;
   }
   T longest = e < f ? f : e;

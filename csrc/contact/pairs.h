@@ -39,6 +39,20 @@ struct PairTerms {
   Distance<R> at_ends;
   Mollifier<R> m;
 
+  // The stiffness along n in the block of corner i, and its derivative by the gap. The blocks of a point add up to a
+  // positive semidefinite one; in those of a face's corners what counts negative is left out, so that they do, too.
+  template <class Index>
+  DIFFVBD_FN R counted(const Index& i, const R& value) const {
+    return select(is_corner(i, 0), value, select(R(0) < inner.second, value, R(0)));
+  }
+  template <class Index>
+  DIFFVBD_FN R along(const Index& i) const {
+    return counted(i, inner.second);
+  }
+  template <class Index>
+  DIFFVBD_FN R along_rate(const Index& i) const {
+    return counted(i, inner.third);
+  }
   DIFFVBD_FN R height() const { return inner.value - ends.value; }
   DIFFVBD_FN R value() const { return e * height(); }
   // what corner k gets beside its share of the force e b' n: of the mollifier and of the ends
@@ -67,8 +81,8 @@ DIFFVBD_FN PairTerms<R> pair_terms(int kind, const Corners<R>& c, const Distance
   return out;
 }
 
-// Adds the barrier's part of the block of corner i of a pair whose distance is `at`; returns whether it is active. What
-// the ends take away is left out of H, which stays positive semidefinite.
+// Adds the barrier's part of the block of corner i of a pair whose distance is `at`; returns whether it is active. H
+// has what counts positive, and stays positive semidefinite.
 template <class R, class Index>
 DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at, const Index& i, const R& together,
                             const PairConstants<R>& a, const R& kappa, const R& h2, Vec3<R>& g, Sym3<R>& H) {
@@ -81,7 +95,7 @@ DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at
     g += of_corner(pull, i);
   }
   g += (t.e * t.inner.first * w) * at.n;
-  add_outer(H, together * t.e * t.inner.second * w * w, at.n);
+  add_outer(H, together * t.e * t.along(i) * w * w, at.n);
   return active;
 }
 
@@ -122,9 +136,9 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   const LogBarrier<R>& b = x.inner;
   const R& e = x.e;
   const R w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw);
-  const R toward = dot(of_corner(x.m.gradient, i), p), by_e = b.first * s + b.second * s * t;
-  const R by_gap = b.first * toward + e * (b.second * s + b.third * s * t);
-  const Vec3<R> z = (e * (b.first + b.second * t)) * p + (e * b.second * s) * d_raw;
+  const R toward = dot(of_corner(x.m.gradient, i), p), along = x.along(i), by_e = b.first * s + along * s * t;
+  const R by_gap = b.first * toward + e * (b.second * s + x.along_rate(i) * s * t);
+  const Vec3<R> z = (e * (b.first + along * t)) * p + (e * along * s) * d_raw;
   const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, z));
   for (int k = 0; k < 4; ++k) {
     const Vec3<Dual<R>> row = turned.w[k] * turned.n;

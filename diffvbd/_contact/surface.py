@@ -36,6 +36,7 @@ class ContactSurface:
     faces: Tensor  # [F', 3] int32, of all dimensions, see faces_of()
     weight: Tensor  # [F'] int32
     sharpness: Tensor  # [E] int32, see sharpness_of()
+    wings: Tensor  # [E, 2] int32
     points: Tensor  # [P] int32
     planes: Tensor  # [L, 3] int32
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
@@ -128,7 +129,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     order = np.argsort(label, kind="stable")
     all_triangles, all_edges = index_tensor(triangles, 3), index_tensor(edges, 2)
     faces, weight = faces_of(all_triangles.numpy(), all_edges.numpy())
-    sharpness = sharpness_of(np.concatenate(rest), all_triangles.numpy(), all_edges.numpy())
+    sharpness, wings = sharpness_of(np.concatenate(rest), all_triangles.numpy(), all_edges.numpy())
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
         radius=torch.from_numpy(np.concatenate(radius)),
@@ -137,6 +138,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         faces=torch.from_numpy(faces),
         weight=torch.from_numpy(weight),
         sharpness=torch.from_numpy(sharpness),
+        wings=torch.from_numpy(wings),
         points=index_tensor(points, 1).reshape(-1),
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
@@ -177,21 +179,26 @@ def faces_of(triangles: Any, edges: Any) -> tuple[Any, Any]:
     return np.concatenate(faces).astype(np.int32)[counts], weight.astype(np.int32)[counts]
 
 
-def sharpness_of(points: Any, triangles: Any, edges: Any) -> Any:
-    """Of each edge [E]: 0 where its two triangles are flat at rest, up to FLAT; 2 where it has none, as the axis of a
-    capsule; else 1. Two edges push each other apart where these add up to 2: what is flat pushes along its normal, by
-    its points and faces."""
+def sharpness_of(points: Any, triangles: Any, edges: Any) -> tuple[Any, Any]:
+    """Sharpness of each edge, int32 [E]: 0 where its two triangles are flat at rest, up to FLAT; 2 where it has none,
+    as the axis of a capsule; else 1. And the other corners of two of its triangles, int32 [E, 2], or -1."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
     order = np.lexsort(sides.T[::-1])
     keys, first, each = np.unique(sides[order], axis=0, return_index=True, return_counts=True)
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     normal = np.cross(b - a, c - a)
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    of = order // 3
-    both = np.minimum(first + 1, len(of) - 1)
-    flat = (each == 2) & ((normal[of[first]] * normal[of[both]]).sum(1) > np.cos(np.radians(FLAT)))
-    found = {(int(i), int(j)): int(not f) for (i, j), f in zip(keys, flat, strict=True)}
-    return np.array([found.get((int(min(e)), int(max(e))), 2) for e in edges], np.int32)
+    of, opposite = order // 3, triangles[:, [2, 0, 1]].reshape(-1)[order]
+    second = np.minimum(first + 1, max(len(of) - 1, 0))
+    flat = (each == 2) & ((normal[of[first]] * normal[of[second]]).sum(1) > np.cos(np.radians(FLAT)))
+    row = {(int(i), int(j)): k for k, (i, j) in enumerate(keys)}
+    at = np.array([row.get((int(min(e)), int(max(e))), -1) for e in edges], np.int64)
+    sharpness, wings = np.full(len(edges), 2), np.full((len(edges), 2), -1)
+    some = at >= 0
+    sharpness[some] = ~flat[at[some]]
+    wings[some, 0] = opposite[first[at[some]]]
+    wings[some, 1] = np.where(each[at[some]] > 1, opposite[second[at[some]]], -1)
+    return sharpness.astype(np.int32), wings.astype(np.int32)
 
 
 def units(body: Tensor, pinned_bodies: Tensor) -> Tensor:

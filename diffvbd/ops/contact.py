@@ -37,8 +37,9 @@ class Detection(NamedTuple):
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
-                   faces: Tensor, weight: Tensor, edges: Tensor, sharpness: Tensor, points: Tensor, planes: Tensor,
-                   body: Tensor, pinned: Tensor, trust_radius: Tensor, deformation_radius: Tensor, mesh_bodies: int,
+                   faces: Tensor, weight: Tensor, edges: Tensor, sharpness: Tensor, wings: Tensor, points: Tensor,
+                   planes: Tensor, body: Tensor, pinned: Tensor, trust_radius: Tensor, deformation_radius: Tensor,
+                   mesh_bodies: int,
                    self_contact: bool, between_bodies: bool, dhat: float, capacity: int, trim: bool = False
                    ) -> Detection:  # fmt: skip
     """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
@@ -61,7 +62,9 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         faces, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique. Faces are triangles and, for pairs
             of different bodies, edges (a, b, b) and vertices (a, a, a).
         weight: [F] what each face counts.
-        sharpness: [E]; edges of different bodies have a reach only where theirs add up to 2 or more.
+        sharpness, wings: [E], [E, 2] of each edge: 0 flat, 1 sharp, 2 without triangles; and the other corners of two
+            of its triangles, or -1. Edges of different bodies have a reach where their sharpness adds up to 2, or to 1
+            and the other edge lies across the sharp one.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, pinned: [N]; labels from ``mesh_bodies`` on are colliders; pinned: bool, no sweep moves the point.
         trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
@@ -73,8 +76,9 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, rest, radius, faces, weight, edges, sharpness, points, planes, body,
-            pinned, trust_radius, deformation_radius, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
+            x, origin, collider, collider_next, rest, radius, faces, weight, edges, sharpness, wings, points, planes,
+            body, pinned, trust_radius, deformation_radius, mesh_bodies, self_contact, between_bodies, dhat, capacity,
+            trim,
         )
     )  # fmt: skip
 

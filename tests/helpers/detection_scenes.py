@@ -140,6 +140,7 @@ class Scene:
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), torch.ones(len(self.triangles), dtype=torch.int32, device=device),
             index(self.edges), torch.full((len(self.edges),), 2, dtype=torch.int32, device=device),
+            torch.full((len(self.edges), 2), -1, dtype=torch.int32, device=device),
             index(self.points), index(self.planes),
             index(self.body), index(self.pinned), real(trust_radius), real(self.own_fraction * trust_radius),
             self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
