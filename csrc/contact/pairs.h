@@ -39,20 +39,10 @@ struct PairTerms {
   Distance<R> at_ends;
   Mollifier<R> m;
 
-  // The stiffness along n in the block of corner i, and its derivative by the gap. The blocks of a point add up to a
-  // positive semidefinite one; in those of a face's corners what counts negative is left out, so that they do, too.
-  template <class Index>
-  DIFFVBD_FN R counted(const Index& i, const R& value) const {
-    return select(is_corner(i, 0), value, select(R(0) < inner.second, value, R(0)));
-  }
-  template <class Index>
-  DIFFVBD_FN R along(const Index& i) const {
-    return counted(i, inner.second);
-  }
-  template <class Index>
-  DIFFVBD_FN R along_rate(const Index& i) const {
-    return counted(i, inner.third);
-  }
+  // The stiffness along n in the block of a vertex, which must be positive semidefinite, and its derivative by the gap:
+  // what counts negative has none there.
+  DIFFVBD_FN R along() const { return select(R(0) < inner.second, inner.second, R(0)); }
+  DIFFVBD_FN R along_rate() const { return select(R(0) < inner.second, inner.third, R(0)); }
   DIFFVBD_FN R height() const { return inner.value - ends.value; }
   DIFFVBD_FN R value() const { return e * height(); }
   // what corner k gets beside its share of the force e b' n: of the mollifier and of the ends
@@ -95,7 +85,7 @@ DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at
     g += of_corner(pull, i);
   }
   g += (t.e * t.inner.first * w) * at.n;
-  add_outer(H, together * t.e * t.along(i) * w * w, at.n);
+  add_outer(H, together * t.e * t.along() * w * w, at.n);
   return active;
 }
 
@@ -136,8 +126,8 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   const LogBarrier<R>& b = x.inner;
   const R& e = x.e;
   const R w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw);
-  const R toward = dot(of_corner(x.m.gradient, i), p), along = x.along(i), by_e = b.first * s + along * s * t;
-  const R by_gap = b.first * toward + e * (b.second * s + x.along_rate(i) * s * t);
+  const R toward = dot(of_corner(x.m.gradient, i), p), along = x.along(), by_e = b.first * s + along * s * t;
+  const R by_gap = b.first * toward + e * (b.second * s + x.along_rate() * s * t);
   const Vec3<R> z = (e * (b.first + along * t)) * p + (e * along * s) * d_raw;
   const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, z));
   for (int k = 0; k < 4; ++k) {

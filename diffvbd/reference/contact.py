@@ -116,8 +116,8 @@ class PairBarrier:
         pair, local, _, together = self.pairs.entries[k]
         of = self.pairs.terms(corner_points(x, self.colliders), self.kappa, pair)
         slope, pull = (g[torch.arange(len(pair), device=pair.device), local].T for g in (of.slope, of.pull))
-        stiffness = torch.where(local == 0, of.second, of.second.clamp(min=0))  # of a face's corners what counts positive
-        columns = torch.cat((of.first * slope + pull, together * stiffness * outer6(slope)))
+        stiffness = together * of.second.clamp(min=0)  # of what counts positive
+        columns = torch.cat((of.first * slope + pull, stiffness * outer6(slope)))
         return self.pairs.assemble(k, self.weight * columns)
 
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
