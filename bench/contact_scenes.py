@@ -228,14 +228,12 @@ def slope_error(number: int, steps: int, device: str) -> float | None:
 def pair_energy(model: dv.Model, x: Tensor) -> Tensor:
     """Energy of the barriers of pairs [B] [J]. x: [B, V, 3] [m]."""
     from diffvbd._contact.pair_forces import corner_points, near_pairs
-    from diffvbd.reference.distance import log_barrier
 
     barrier, surface = model.contact, model.surface_of_contact
     assert barrier is not None and surface is not None
     colliders = model.collider_points.expand(len(x), -1, 3)
     found = near_pairs(x, None, colliders, colliders, surface, barrier)
-    gap, _, mollifier, _ = found.measures(corner_points(x, None, colliders))
-    value = mollifier * log_barrier(gap, torch.full_like(gap, barrier.kappa), found.dhat)[0]
+    value = found.terms(corner_points(x, None, colliders), x.new_full((1,), barrier.kappa)).value
     return torch.zeros_like(x[:, 0, 0]).index_add(0, found.scene, value)
 
 

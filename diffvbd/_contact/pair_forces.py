@@ -6,7 +6,6 @@ detection and have no derivative. Everything is computed in float64, whatever th
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -17,7 +16,7 @@ from .._contact.barrier import PairBarrier
 from .._contact.detection import detect
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
 from ..energies import damped_fraction
-from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
+from ..reference.distance import EDGE_EDGE, PairTerms, distance, pair_terms
 from ..reference.energies import smoothed
 
 ADVANCES = 8  # of continuous detection after the first; fewer are on the safe side
@@ -31,18 +30,20 @@ class NearPairs(NamedTuple):
     scene: Tensor  # [Q] int64
     dhat: Tensor  # [Q] [m]
     offset: Tensor  # [Q] sum of the radii [m]
-    threshold: Tensor  # [Q] of the mollifier [m^4]
+    threshold: Tensor  # [Q] of two edges: of the mollifier [m^4]; else: what the pair counts
+
+    @property
+    def weight(self) -> Tensor:
+        """What each pair counts [Q]."""
+        return torch.where(self.kind == EDGE_EDGE, 1.0, self.threshold)
 
     def positions(self, points: Tensor) -> Tensor:
         """Corners [Q, 4, 3] in corner points [B, N, 3]."""
         return points[self.scene[:, None], self.corners]
 
-    def measures(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gap [Q] and mollifier [Q], each followed by its gradient [Q, 4, 3] toward the corners."""
-        at = self.positions(points)
-        d, slope = with_gradient(partial(distance, self.kind), at)
-        e, turn = with_gradient(partial(mollifier, self.kind, threshold=self.threshold), at)
-        return d - self.offset, slope, e, turn
+    def terms(self, points: Tensor, kappa: Tensor) -> PairTerms:
+        """Their barrier; kappa [1 | B]."""
+        return pair_terms(self.kind, self.positions(points), *self[3:], self.of_scene(kappa))
 
     def of_scene(self, value: Tensor) -> Tensor:
         """A parameter [1 | B], for each pair [Q]."""
@@ -149,16 +150,14 @@ def barrier_forces(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
     Args:
         points: Corner points [B, N, 3].  kappa: [1 | B] [N/m].
     """
-    gap, slope, e, turn = pairs.measures(points)
-    value, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
-    return -(e * first)[:, None, None] * slope - value[:, None, None] * turn
+    of = pairs.terms(points, kappa)
+    return -(of.first[:, None, None] * of.slope + of.pull)
 
 
 def barrier_stiffness(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
     """Trace of the barrier's part of each corner point's block [N/m], [B, N]; arguments as of barrier_forces."""
-    gap, slope, e, _ = pairs.measures(points)
-    _, _, second = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
-    return pairs.summed((e * second)[:, None, None] * slope.square(), points).sum(-1)  # of 3x3 blocks
+    of = pairs.terms(points, kappa)
+    return pairs.summed(of.second[:, None, None] * of.slope.square(), points).sum(-1)  # of 3x3 blocks
 
 
 class Lag(NamedTuple):
@@ -175,12 +174,12 @@ class Lag(NamedTuple):
 
 def lag_of(pairs: NearPairs, start: Tensor, kappa: Tensor) -> Lag:
     """pairs: near at the start, where corner points are ``start`` [B, N, 3]; kappa: [1 | B] [N/m]."""
-    gap, slope, e, _ = pairs.measures(start)
-    _, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
-    normal = pairs.of_first(slope)  # weights of the first side sum to 1
-    weights = (slope * normal[:, None]).sum(-1)
-    size = -e * first
-    return Lag(pairs, start, size, normal, damped_fraction(size, pairs.of_scene(kappa), pairs.dhat), weights, slope)
+    of = pairs.terms(start, kappa)
+    normal = pairs.of_first(of.slope)  # weights of the first side sum to 1
+    weights = (of.slope * normal[:, None]).sum(-1)
+    size = -of.normal
+    fraction = pairs.weight * damped_fraction(pairs.weight * size, pairs.of_scene(kappa), pairs.dhat)
+    return Lag(pairs, start, size, normal, fraction, weights, of.slope)
 
 
 def lagged_forces(

@@ -20,6 +20,20 @@ from diffvbd.reference.energies import build_energies, floor_friction
 from diffvbd.reference.scene import build_layout
 from diffvbd.testing import generator, relative_error, tolerance
 
+
+def rest_of(kind: Tensor, corners: Tensor, offset: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Gap of the ends of pairs, beyond dhat but of two edges that are closest inside both; and pairs of which something
+    is left: no edges whose ends are closest."""
+    edges, ends = kind == distance.EDGE_EDGE, distance.ends_distance(kind, corners)
+    return torch.where(edges, ends - offset, DHAT), ~edges | (d < ends)
+
+
+def slope_of(gap: Tensor) -> Tensor:
+    """-b' of 200 N/m."""
+    inner = torch.where(gap < DHAT, gap, DHAT)
+    return 200 * (2 * (inner - DHAT) * (inner / DHAT).log() + (inner - DHAT) ** 2 / inner)
+
+
 # --- two tets, a sphere, a capsule, a plane ---------------------------------------------------------------------------
 
 
@@ -46,7 +60,8 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
     model, x, pairs = setup()
     if mollified:  # thresholds above where the edges are
         a, b, c, d = torch.cat((x, COLLIDERS))[pairs.corners].unbind(1)
-        pairs.threshold = 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1)
+        edges = pairs.kind == distance.EDGE_EDGE
+        pairs.threshold = torch.where(edges, 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1), 1.0)
     barrier = PairBarrier(scene_of(model, x), pairs, COLLIDERS[None])
     state = x.clone().requires_grad_()
     (expected,) = torch.autograd.grad(barrier.energy(state.T, x.T), state)
@@ -65,15 +80,22 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
     color, counts = colors(model, len(x) + len(COLLIDERS)), []
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
         one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
-        one.constants[:, 2] = 0
+        edges = bool(one.pairs[0, 4] == distance.EDGE_EDGE)
+        one.constants[:, 2] = 0 if edges else 1
         barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
-
-        def potential(p: Tensor, barrier: PairBarrier = barrier) -> Tensor:
-            return barrier.energy(torch.cat((x[:vertex], p[None], x[vertex + 1 :])).T, x.T)
+        corners = torch.cat((x, COLLIDERS))[one.pairs[:, :4]]
+        d = distance.distance(one.pairs[:, 4], corners)
+        if not bool(rest_of(one.pairs[:, 4], corners, one.constants[:, 1], d)[1]):
+            assert not blocks(model, barrier, x, x)[1].any()
+            continue
 
         def gap(p: Tensor, one: reference.Substep = one) -> Tensor:
             points = torch.cat((x[:vertex], p[None], x[vertex + 1 :], COLLIDERS))
             return (distance.distance(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
+
+        def potential(p: Tensor, gap: Any = gap) -> Tensor:
+            """Without what the ends take away."""
+            return 1e-4 * distance.log_barrier(gap(p), *torch.tensor([200.0, DHAT], dtype=torch.float64))[0]
 
         _, first, _ = distance.log_barrier(gap(x[vertex]), *torch.tensor([200.0, DHAT], dtype=torch.float64))
         full = torch.autograd.functional.hessian(potential, x[vertex])
@@ -82,7 +104,7 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
         counts.append(int((color[one.pairs[0, :4]] == color[vertex]).sum()))
         difference = hessian[vertex] - counts[-1] * (full - 1e-4 * first * bent)
         assert difference.abs().max() <= tolerance("cancelling") * hessian[vertex].abs().max()
-        if one.pairs[0, 4] == distance.EDGE_EDGE:
+        if edges:
             a, b, c, d = torch.cat((x, COLLIDERS))[one.pairs[0, :4]]
             one.constants[:, 2] = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
             barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
@@ -106,10 +128,9 @@ def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
     (slope,) = torch.autograd.grad(d.sum(), corners)
     normal = slope[:, 0] + (pairs.kind == distance.EDGE_EDGE)[:, None] * slope[:, 1]
     weights = (slope * normal[:, None]).sum(-1)
-    gap = (d - pairs.offset).detach().requires_grad_()
     e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
-    inside = gap < DHAT
-    (force,) = torch.autograd.grad((200 * inside * e * (gap - DHAT) ** 2 * (gap / DHAT).log()).sum(), gap)
+    ends, left = rest_of(pairs.kind, corners.detach(), pairs.offset, d.detach())
+    force = e * left * (slope_of((d - pairs.offset).detach()) - slope_of(ends))
     reach = 0.01 * 0.05
 
     def potential(state: Tensor) -> Tensor:
@@ -145,7 +166,8 @@ def test_damping_opposes_approach_alone() -> None:
 
     gap = distance.distance(pairs.kind, corners.detach()) - pairs.offset
     e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
-    size = 200 * e * (2 * (gap - DHAT) * (gap / DHAT).log() + (gap - DHAT) ** 2 / gap) * (gap < DHAT)
+    ends, left = rest_of(pairs.kind, corners.detach(), pairs.offset, gap + pairs.offset)
+    size = e * left * (slope_of(gap) - slope_of(ends))
     share = size / (size + 20 * DHAT)
     assert (gap > DHAT).any()
     along = change(x)
