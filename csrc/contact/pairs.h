@@ -43,6 +43,8 @@ struct PairTerms {
   // what counts negative has none there.
   DIFFVBD_FN R along() const { return select(R(0) < inner.second, inner.second, R(0)); }
   DIFFVBD_FN R along_rate() const { return select(R(0) < inner.second, inner.third, R(0)); }
+  // Curvature of -b(ends) across the normal of the ends, over w w: Hess d <= w w (1 - n n') / d.
+  DIFFVBD_FN R across() const { return select(R(0) < e, -(e * ends.first) / at_ends.d, R(0)); }
   DIFFVBD_FN R height() const { return inner.value - ends.value; }
   DIFFVBD_FN R value() const { return e * height(); }
   // what corner k gets beside its share of the force e b' n: of the mollifier and of the ends
@@ -83,9 +85,14 @@ DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at
   if (kind == kEdgeEdge) {
     const Vec3<R> pull[4] = {t.pull(0), t.pull(1), t.pull(2), t.pull(3)};
     g += of_corner(pull, i);
+    const R w_end = of_corner(t.at_ends.w, i), across = together * t.across() * w_end * w_end;
+    add_diagonal(H, across);
+    add_outer(H, -across, t.at_ends.n);
   }
   g += (t.e * t.inner.first * w) * at.n;
-  add_outer(H, together * t.e * t.along() * w * w, at.n);
+  const R bend = select(R(0) < t.inner.first, t.inner.first / at.d, R(0)), over = together * bend * w * w;
+  add_diagonal(H, over);
+  add_outer(H, together * t.e * t.along() * w * w - over, at.n);
   return active;
 }
 
@@ -127,19 +134,27 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   const R& e = x.e;
   const R w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw);
   const R toward = dot(of_corner(x.m.gradient, i), p), along = x.along(), by_e = b.first * s + along * s * t;
-  const R by_gap = b.first * toward + e * (b.second * s + x.along_rate() * s * t);
-  const Vec3<R> z = (e * (b.first + along * t)) * p + (e * along * s) * d_raw;
+  const auto negative = both(active, R(0) < b.first);
+  const R over = select(negative, b.first / at.d, R(0)), over_rate = select(negative, (b.second - over) / at.d, R(0));
+  const R spread_in = w * w * dot(p, d_raw) - s * t;
+  const R by_gap = b.first * toward + e * (b.second * s + x.along_rate() * s * t) + over_rate * spread_in;
+  const Vec3<R> z = (e * (b.first + along * t)) * p + (e * along * s) * d_raw +
+                    over * ((R(2) * dot(p, d_raw) * w) * at.n - t * p - s * d_raw);
   const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, z));
   for (int k = 0; k < 4; ++k) {
     const Vec3<Dual<R>> row = turned.w[k] * turned.n;
     out.x[k] = by_gap * at.w[k] * at.n + derivative(row);
   }
-  R phi = e * by_e + x.height() * toward;
+  R phi = e * by_e + x.height() * toward + over * spread_in;
   const auto ended = both(active, R(0) < e);
   if (kind == kEdgeEdge && any(ended)) {
-    const R s_end = of_corner(x.at_ends.w, i) * dot(x.at_ends.n, p), of_ends = x.ends.first * s_end;
-    const R by_end = x.ends.first * toward + e * x.ends.second * s_end;
-    const Distance<Dual<R>> beside = ends_by(end, moved_along(c, i, (e * x.ends.first) * p));
+    const R w_end = of_corner(x.at_ends.w, i), s_end = w_end * dot(x.at_ends.n, p);
+    const R t_end = w_end * dot(x.at_ends.n, d_raw), spread = w_end * w_end * dot(p, d_raw) - s_end * t_end;
+    const R slack = select(ended, x.at_ends.d, R(1)), bend = x.ends.first / slack;
+    const R of_ends = x.ends.first * s_end + bend * spread;
+    const R by_end = x.ends.first * toward + e * (x.ends.second * s_end + (x.ends.second - bend) / slack * spread);
+    const Vec3<R> across = (R(2) * dot(p, d_raw) * w_end) * x.at_ends.n - t_end * p - s_end * d_raw;
+    const Distance<Dual<R>> beside = ends_by(end, moved_along(c, i, (e * x.ends.first) * p + (e * bend) * across));
     const auto mollified = is_mollified(kind, c, a.threshold);
     Mollifier<Dual<R>> curved{};
     if (any(mollified)) curved = mollifier(moved_along(c, i, x.height() * p), a.threshold);
