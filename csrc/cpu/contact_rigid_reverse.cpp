@@ -13,7 +13,7 @@ void rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, co
   const auto listed = [&](int64_t i) {
     const BarrierWork<T> work(in, given, i);
     out.pushes[i] = work.acts;
-    for (int part = 0; work.acts != 0 && part < kWorkParts; ++part) {
+    for (int part = 0; work.acts && part < kWorkParts; ++part) {
       work.store(part, out.barrier + 4 * kWorkScalars * i, out.by_kappa + i);
     }
   };

@@ -19,15 +19,15 @@ static_assert(kWorkParts <= kPartsApart);
 template <class T>
 __device__ void find_pushing(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                              int64_t row, int32_t* count, int32_t* pushing) {
-  const uint8_t pushes = BarrierWork<T>::pushes(in, given, row);
+  const bool pushes = BarrierWork<T>::pushes(in, given, row);
   out.pushes[row] = pushes;
-  if (pushes != 0) pushing[atomicAdd(count, 1)] = static_cast<int32_t>(row);
+  if (pushes) pushing[atomicAdd(count, 1)] = static_cast<int32_t>(row);
 }
 // Work of one part of a pair that pushes.
 template <class T>
 __device__ void store_barrier(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                               int64_t row, int part) {
-  const BarrierWork<T> work(in, given, row, out.pushes[row]);
+  const BarrierWork<T> work(in, given, row, true);
   work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
 }
 template <class T>

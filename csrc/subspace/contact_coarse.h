@@ -121,7 +121,7 @@ DIFFVBD_FN bool force_of_listed(const RigidInputs<T>& in, int64_t pair, CornerFo
   for (int k = 0; k < 4; ++k) c.x[k] = at(scene, record[k]) - origin;
   const double h2 = in.scene.time_step * in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
   const ForceTerms<double> a =
-      barrier_terms(record[4], c, PairConstants<T>(in.gate.constants + kConstants * pair), h2 * kappa, known.stiff);
+      barrier_terms(record[4], c, PairConstants<T>(in.gate.constants + kConstants * pair), h2 * kappa);
   out.force = known.force, out.stiffness = known.stiffness;
   for (int k = 0; k < 4; ++k) out.w[k] = a.w[k], out.pull[k] = a.at_corner[k];
   return true;

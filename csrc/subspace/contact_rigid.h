@@ -153,7 +153,6 @@ struct PairForce {
   double weight[2];
   Vector at[2], pull[2], torque[2];
   double value;
-  bool stiff;            // whether its stiffness counts
   Vector tangential;     // tangential displacement that friction is linear about
   double friction_load;  // h^2 times its load [N], over `doubled`
   double doubled;        // 2 where sides are not of one group: each takes twice its body's motion; else 1
@@ -236,49 +235,6 @@ DIFFVBD_FN void each_corner(int first, const F& f) {
   }
 }
 
-// Which corner points bear a pair's closest point on a face: the same of two faces where they meet.
-struct Bearers {
-  int32_t point[3];
-  int count = 0;
-  DIFFVBD_FN bool has(int32_t v) const {
-    bool out = false;
-    for (int k = 0; k < 3; ++k) out = out || (k < count && point[k] == v);
-    return out;
-  }
-  DIFFVBD_FN Bearers(const int32_t* record, const double (&w)[4]) : point{} {
-    for (int k = 1; k < 4; ++k) {
-      if (w[k] != 0 && !has(record[k])) point[count++] = record[k];
-    }
-  }
-};
-
-// Whether a pair's stiffness counts: not what counts negative beyond the other faces of its point that have the same
-// closest point, as an edge in a groove has none. So the sum over a point's pairs is positive semidefinite.
-template <class T, class At>
-DIFFVBD_FN bool is_stiff(const RigidInputs<T>& in, int64_t pair, const At& at, const double (&w)[4]) {
-  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
-  const auto count = [&](int64_t i) { return PairConstants<T>(in.gate.constants + kConstants * i).threshold; };
-  if (record[4] != kPointTriangle || !(count(pair) < 0)) return true;
-  const int64_t scene = record[5];
-  const Bearers own(record, w);
-  const Vector origin = at(scene, record[0]);
-  const PairList::Entries all = in.gate.listed.of(scene * in.gate.corners + record[0]);
-  double sum = 0;
-  for (int e = 0; e < all.count; ++e) {
-    const int64_t other = all.first[e] >> 2;
-    const int32_t* face = in.gate.listed.pairs + kPairRow * other;
-    if ((all.first[e] & 3) != 0 || face[4] != kPointTriangle) continue;
-    const auto shares = [&](int32_t v) { return v == face[1] || v == face[2] || v == face[3]; };
-    bool shared = true;
-    for (int k = 0; k < own.count; ++k) shared = shared && shares(own.point[k]);
-    if (!shared) continue;
-    Corners<double> c;
-    for (int k = 0; k < 4; ++k) c.x[k] = at(scene, face[k]) - origin;
-    if (Bearers(face, distance(kPointTriangle, c).w).count == own.count) sum += count(other);
-  }
-  return sum >= 0;
-}
-
 // The barrier of a listed pair between bodies; false where it does not act, or moves with one body.
 template <class T, class At>
 DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& at, PairForce& out) {
@@ -319,8 +275,7 @@ DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& 
   out.value = t.value();
   out.force = (t.e * t.inner.first) * near.n;
   out.stiffness = Sym3<double>{};
-  out.stiff = at.moved || is_stiff(in, pair, at, near.w);
-  if (out.stiff) add_outer(out.stiffness, t.e * t.inner.second, near.n);
+  add_outer(out.stiffness, t.e * t.inner.second, near.n);
   each_corner(first, [&](int side, int k) {
     if (out.body[side] < 0) return;
     out.weight[side] += near.w[k];

@@ -141,13 +141,12 @@ DIFFVBD_FN void add_by_motions(const ForceTerms<double>& a, const PairMotions& m
 
 // size: h^2 kappa.
 template <class R, class T>
-DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size,
-                                       bool stiff) {
+DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
   const PairTerms<R> t = pair_terms(kind, c, near, a, R(size));
   ForceTerms<R> out{};
   for (int k = 0; kind == kEdgeEdge && k < 4; ++k) out.at_corner[k] = t.pull(k);
-  out.force = (t.e * t.inner.first) * near.n, out.n = near.n, out.along = stiff ? t.e * t.inner.second : R(0);
+  out.force = (t.e * t.inner.first) * near.n, out.n = near.n, out.along = t.e * t.inner.second;
   for (int k = 0; k < 4; ++k) out.w[k] = near.w[k];
   return out;
 }
@@ -159,25 +158,23 @@ constexpr int kDirections = 12, kWorkParts = kDirections + 1;
 // The work of a listed pair.
 template <class T>
 struct BarrierWork {
-  uint8_t acts;  // 0: not; 1: with its stiffness; 2: without
+  bool acts;
   PairMotions m;
   Corners<double> c;
   PairConstants<T> a;
   int kind;
   double h2, kappa;
 
-  DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : BarrierWork(in, given, pair, pushes(in, given, pair)) {}
-  // acts: as it is known
-  DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, uint8_t acts)
-      : acts(acts),
+  // known: that it acts
+  DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, bool known = false)
+      : acts(known || pushes(in, given, pair)),
         m{},
         c{},
         a(in.gate.constants + kConstants * pair),
         kind(0),
         h2(0),
         kappa(0) {
-    if (acts == 0) return;
+    if (!acts) return;
     const CornerPoints<T> at{in, false};
     const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
     const int64_t scene = record[5];
@@ -187,12 +184,10 @@ struct BarrierWork {
     h2 = in.scene.time_step * in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
   }
 
-  DIFFVBD_FN static uint8_t pushes(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair) {
+  DIFFVBD_FN static bool pushes(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair) {
     PairForce term;
-    const bool acts = pair < in.first_listed(in.scene.scenes) &&
-                      works(in, given, in.gate.listed.pairs + kPairRow * pair) &&
-                      barrier_force(in, pair, CornerPoints<T>{in, false}, term);
-    return acts ? term.stiff ? 1 : 2 : 0;
+    return pair < in.first_listed(in.scene.scenes) && works(in, given, in.gate.listed.pairs + kPairRow * pair) &&
+           barrier_force(in, pair, CornerPoints<T>{in, false}, term);
   }
 
   // Stores a part of the rows of the corners [4, 9], and adds the derivative by kappa, where the pair acts.
@@ -200,12 +195,12 @@ struct BarrierWork {
     if (part < kDirections) {
       const int k = part / 3, i = part % 3;
       const Vector z = {double(i == 0), double(i == 1), double(i == 2)};
-      const auto terms = barrier_terms(kind, moved_along(c, k, z), a, h2 * kappa, acts == 1);
+      const auto terms = barrier_terms(kind, moved_along(c, k, z), a, h2 * kappa);
       rows[kWorkScalars * k + i] = T(virtual_work(terms, m).derivative);
       return;
     }
-    *by_kappa += T(virtual_work(barrier_terms(kind, c, a, h2, acts == 1), m));
-    add_by_motions(barrier_terms(kind, c, a, h2 * kappa, acts == 1), m, rows);
+    *by_kappa += T(virtual_work(barrier_terms(kind, c, a, h2), m));
+    add_by_motions(barrier_terms(kind, c, a, h2 * kappa), m, rows);
   }
 };
 
