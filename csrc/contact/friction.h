@@ -104,7 +104,7 @@ template <class R, class T>
 DIFFVBD_FN LagState<R> lag_state(int kind, const Corners<R>& c, const Distance<R>& at, const PairConstants<T>& a,
                                  const R& kappa) {
   const PairTerms<R> t = pair_terms(kind, c, at, a, kappa);
-  const R force = t.e * (t.ends.first - t.inner.first), active = select(at.d - R(a.offset) < R(a.dhat), R(1), R(0));
+  const R force = t.inside * t.e * (t.ends.first - t.inner.first), active = select(at.d - R(a.offset) < R(a.dhat), R(1), R(0));
   return {force, active, at.n, {at.w[0], at.w[1], at.w[2], at.w[3]}};
 }
 

@@ -273,9 +273,9 @@ DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& 
   const PairTerms<double> t = pair_terms(record[4], c, near, a, h * h * in.kappa.data[scene * in.kappa.scene]);
   const bool pulls = record[4] == kEdgeEdge;
   out.value = t.value();
-  out.force = (t.e * t.inner.first) * near.n;
+  out.force = t.first() * near.n;
   out.stiffness = Sym3<double>{};
-  add_outer(out.stiffness, t.e * t.inner.second, near.n);
+  add_outer(out.stiffness, t.inside * t.e * t.inner.second, near.n);
   each_corner(first, [&](int side, int k) {
     if (out.body[side] < 0) return;
     out.weight[side] += near.w[k];

@@ -146,7 +146,7 @@ DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const Pair
   const PairTerms<R> t = pair_terms(kind, c, near, a, R(size));
   ForceTerms<R> out{};
   for (int k = 0; kind == kEdgeEdge && k < 4; ++k) out.at_corner[k] = t.pull(k);
-  out.force = (t.e * t.inner.first) * near.n, out.n = near.n, out.along = t.e * t.inner.second;
+  out.force = t.first() * near.n, out.n = near.n, out.along = t.inside * t.e * t.inner.second;
   for (int k = 0; k < 4; ++k) out.w[k] = near.w[k];
   return out;
 }

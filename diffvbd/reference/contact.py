@@ -116,9 +116,13 @@ class PairBarrier:
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         pair, local, _, together = self.pairs.entries[k]
         of = self.pairs.terms(corner_points(x, self.colliders), self.kappa, pair)
-        slope, pull = (g[torch.arange(len(pair), device=pair.device), local].T for g in (of.slope, of.pull))
-        stiffness = together * of.second.clamp(min=0)  # of what counts positive
-        columns = torch.cat((of.first * slope + pull, stiffness * outer6(slope)))
+        entry = torch.arange(len(pair), device=pair.device)
+        slope, pull, side = (g[entry, local].T for g in (of.slope, of.pull, of.side))
+        # what counts positive along its normal, what counts negative across it
+        normal, diagonal = outer6(side), torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]).to(x)[:, None]
+        across = of.across * ((side * side).sum(0) * diagonal - normal)
+        stiffness = together * (of.stiff.clamp(min=0) * outer6(slope) + across)
+        columns = torch.cat((of.first * slope + pull, stiffness))
         return self.pairs.assemble(k, self.weight * columns)
 
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does

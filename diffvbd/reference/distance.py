@@ -162,8 +162,11 @@ class PairTerms(NamedTuple):
     value: Tensor  # [Q]
     first: Tensor  # [Q] e b'
     second: Tensor  # [Q] e b''
+    stiff: Tensor  # [Q] the same for the block of a vertex, which does not know what is inside, lest it jump
     slope: Tensor  # [Q, 4, 3] of the gap toward the corners
     pull: Tensor  # [Q, 4, 3] the rest of the gradient: of the mollifier and of the ends
+    across: Tensor  # [Q] curvature across the normal of what counts negative, -b' / d
+    side: Tensor  # [Q, 4, 3] the gradient of its d
     normal: Tensor  # [Q] e (b' - b' of the ends), less the normal force
 
 
@@ -175,15 +178,17 @@ def pair_terms(kind: Tensor, corners: Tensor, dhat: Tensor, offset: Tensor, thre
     size = torch.where(edges, kappa, threshold * kappa)
     b, first, second = log_barrier(d - offset, size, dhat)
     if not bool(edges.any()):
-        return PairTerms(b, first, second, slope, torch.zeros_like(slope), first)
+        return PairTerms(b, first, second, second, slope, torch.zeros_like(slope), first.clamp(min=0) / d, slope, first)
     ends, back = with_gradient(partial(ends_distance, kind), corners)
     e, turn = with_gradient(partial(mollifier, kind, threshold=threshold), corners)
     of_ends, end, _ = log_barrier(ends - offset, torch.where(edges, kappa, 0.0), dhat)
     inside = ~edges | (d < ends)
-    e = torch.where(inside, e, 0.0)
     height = torch.where(inside, b - of_ends, 0.0)
-    pull = height[:, None, None] * turn - (e * end)[:, None, None] * back
-    return PairTerms(e * height, e * first, e * second, slope, pull, e * (first - end))
+    pull = height[:, None, None] * turn - (inside * e * end)[:, None, None] * back
+    across = torch.where(edges, -e * end / torch.where(edges, ends, 1.0), first.clamp(min=0) / d)
+    side = torch.where(edges[:, None, None], back, slope)
+    return PairTerms(e * height, inside * e * first, inside * e * second, e * second, slope, pull, across, side,
+                     inside * e * (first - end))  # fmt: skip
 
 
 CHUNK = 1 << 21  # boxes compared at a time
