@@ -261,6 +261,16 @@ def flown(number: int, device: str) -> tuple[int, int, float, bool]:
 PARTS = ("start", "first rigid correction", "sweeps", "coarse correction", "corrections after the sweeps")
 
 
+def listed_energy(of: Any, found: Any, x: Tensor) -> float:
+    """Energy of the pairs that a detection of diffvbd.step.contact has listed. x: [B, V, 3] [m]."""
+    from diffvbd._contact.pair_forces import NearPairs
+
+    count = int(found.counts[0])
+    rows, numbers = found.listed.pairs[:count].long(), found.listed.constants[:count]
+    listed = NearPairs(rows[:, :4], rows[:, 4], rows[:, 5], *numbers[:, :3].unbind(1))
+    return float(listed.terms(torch.cat([x, of.before], 1), x.new_full((1,), of.barrier.kappa)).value.sum())
+
+
 def friction_energy(of: Any, x: Tensor) -> float:
     """Potential of lagged friction and damping in a step of diffvbd.step.contact, times h^2. x: [B, V, 3] [m]."""
     numbers, total = of.prepared.settings.numbers, 0.0
@@ -293,7 +303,7 @@ def risen(number: int, device: str) -> dict[str, float]:
 
     def potential(x: Tensor) -> float:
         total = reference.incremental_potential(body, x, now["y"], **material, time_step=h).sum()
-        return float(total + h * h * pair_energy(model, x).sum()) + friction_energy(now["step"], x)
+        return float(total + h * h * listed_energy(now["step"], now["found"], x)) + friction_energy(now["step"], x)
 
     def note(part: str, x: Tensor, to: Tensor) -> None:
         before, after = potential(x.detach()), potential(to.detach())
@@ -313,8 +323,8 @@ def risen(number: int, device: str) -> dict[str, float]:
     detect, start = step._detect, contact.start_between
 
     def detected(of: Any, *given: Any) -> Any:
-        now["step"] = of
-        return detect(of, *given)
+        now.update(step=of, found=detect(of, *given))
+        return now["found"]
 
     def started(x: Tensor, move: Tensor, was: Tensor, at: Tensor, floor: Any, origin: Tensor, detection: Any,
                 *rest: Any) -> Any:  # fmt: skip

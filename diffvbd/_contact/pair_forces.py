@@ -117,8 +117,7 @@ def _raise_touching(surface: ContactSurface, touching: int, key: int) -> None:
 
 def pair_energy(pairs: NearPairs, corners: Tensor, kappa: Tensor) -> Tensor:
     """Energy of the barrier of each pair [J], [Q]; corners: [Q, 4, 3].  kappa: [1 | B] [N/m]."""
-    gap = distance(pairs.kind, corners) - pairs.offset
-    return mollifier(pairs.kind, corners, pairs.threshold) * log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)[0]
+    return pair_terms(pairs.kind, corners, *pairs[3:], pairs.of_scene(kappa)).value
 
 
 def safe_fraction(pairs: NearPairs, points: Tensor, move: Tensor, closed: float) -> Tensor:

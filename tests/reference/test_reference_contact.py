@@ -73,43 +73,47 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
 
 
 def test_barrier_block_is_the_curvature_along_the_normals() -> None:
-    """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d): N of its corners share the vertex's color."""
+    """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d) of what counts positive, and N h^2 e (-b' / d)
+    (|a|^2 - a a') with a = grad d of what counts negative: N of its corners share the vertex's color."""
     model, x, _ = setup()
     part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None])
     vertex = 4
     color, counts = colors(model, len(x) + len(COLLIDERS)), []
+    numbers = torch.tensor([200.0, DHAT], dtype=torch.float64)
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
         one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
         edges = bool(one.pairs[0, 4] == distance.EDGE_EDGE)
-        one.constants[:, 2] = 0 if edges else 1
-        barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
-        corners = torch.cat((x, COLLIDERS))[one.pairs[:, :4]]
-        d = distance.distance(one.pairs[:, 4], corners)
-        if not bool(rest_of(one.pairs[:, 4], corners, one.constants[:, 1], d)[1]):
-            assert not blocks(model, barrier, x, x)[1].any()
-            continue
 
-        def gap(p: Tensor, one: reference.Substep = one) -> Tensor:
+        def block(threshold: float, one: reference.Substep = one) -> Tensor:
+            one.constants[:, 2] = threshold
+            barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
+            return blocks(model, barrier, x, x)[1][vertex]
+
+        def gap(p: Tensor, of: Any = distance.distance, one: reference.Substep = one) -> Tensor:
             points = torch.cat((x[:vertex], p[None], x[vertex + 1 :], COLLIDERS))
-            return (distance.distance(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
+            return (of(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
 
-        def potential(p: Tensor, gap: Any = gap) -> Tensor:
-            """Without what the ends take away."""
-            return 1e-4 * distance.log_barrier(gap(p), *torch.tensor([200.0, DHAT], dtype=torch.float64))[0]
+        def across(of: Any, gap: Any = gap, one: reference.Substep = one) -> Tensor:
+            a = torch.autograd.functional.jacobian(lambda p: gap(p, of), x[vertex])
+            _, slope, _ = distance.log_barrier(gap(x[vertex], of), *numbers)
+            bend = -slope / (gap(x[vertex], of) + one.constants[0, 1])
+            return bend * (a.square().sum() * torch.eye(3, dtype=torch.float64) - torch.outer(a, a))
 
-        _, first, _ = distance.log_barrier(gap(x[vertex]), *torch.tensor([200.0, DHAT], dtype=torch.float64))
-        full = torch.autograd.functional.hessian(potential, x[vertex])
-        bent = torch.autograd.functional.hessian(gap, x[vertex])
-        _, hessian = blocks(model, barrier, x, x)
+        _, first, _ = distance.log_barrier(gap(x[vertex]), *numbers)
+        full = torch.autograd.functional.hessian(
+            lambda p, gap=gap: distance.log_barrier(gap(p), *numbers)[0], x[vertex]
+        )
+        along = full - first * torch.autograd.functional.hessian(gap, x[vertex])
         counts.append(int((color[one.pairs[0, :4]] == color[vertex]).sum()))
-        difference = hessian[vertex] - counts[-1] * (full - 1e-4 * first * bent)
-        assert difference.abs().max() <= tolerance("cancelling") * hessian[vertex].abs().max()
+        expected = {0.0: along + across(distance.ends_distance)} if edges else {
+            1.0: along, -1.0: across(distance.distance)}  # fmt: skip
         if edges:
             a, b, c, d = torch.cat((x, COLLIDERS))[one.pairs[0, :4]]
-            one.constants[:, 2] = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
-            barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
-            _, mollified = blocks(model, barrier, x, x)
-            assert torch.allclose(mollified, 0.75 * hessian, rtol=tolerance("cancelling"), atol=0)
+            half = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
+            expected[float(half)] = 0.75 * expected[0.0]
+        for threshold, value in expected.items():
+            found, value = block(threshold), 1e-4 * counts[-1] * value
+            assert (found - value).abs().max() <= tolerance("cancelling") * found.abs().max(), threshold
     assert set(counts) == {1, 2}
 
 
