@@ -52,8 +52,8 @@ def potential_of_step(
     """The potential of a step that has begun, at x [B, V, 3], relative to the step's origin where there is one."""
     fields = begun.at(x).fields(model, prepared)
     if contact is None:
-        return IncrementalPotential(model, x, fields, prepared.settings.numbers.time_step)
-    return ContactPotential(model, x, fields, contact)
+        return IncrementalPotential(model, x, fields, prepared.settings.numbers.time_step, prepared.averaged)
+    return ContactPotential(model, x, fields, contact, prepared.averaged)
 
 
 def of_scenes(values: Tensor) -> Tensor:
@@ -326,8 +326,8 @@ class ErrorEstimate(NamedTuple):
 
 def check_estimable(model: Model, name: str) -> None:
     """Raises where steps of the Model have no estimate; ``name``: of the argument that asks for one."""
-    if model.touches or model.couplings:
-        what = "contact or friction" if model.touches else "springs, tendons or pressure"
+    if model.touches or model.renews:
+        what = "contact or friction" if model.touches else "patches, springs, tendons or pressure"
         raise NotImplementedError(f"{name}: the error of a step with {what} is not estimated")
 
 
