@@ -459,10 +459,9 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     left = (f[..., :, None, :] * f[..., None, :, :]).sum(-1)
     pressure = (shear + second) * (det - 1) - shear
     if (patches := given.model.patches) is not None:
-        volume = (1 / (6 * given.prepared.averaged.c6)).expand(second.shape)  # type: ignore[union-attr]
-        flat = (det * volume).reshape(-1, len(patches.label)), volume.reshape(-1, len(patches.label))
-        mean = patches.spread(patches.sum(flat[0]) / patches.sum(flat[1]))
-        pressure = pressure + second * (mean.reshape(det.shape) - det)
+        assert given.prepared.averaged is not None
+        mean = patches.mean(det.reshape(-1, det.shape[-1]), given.prepared.averaged.c6)
+        pressure = pressure + second * (patches.spread(mean).reshape(det.shape) - det)
     cauchy = (shear / det)[..., None, None] * left + pressure[..., None, None] * eye
     trace = cauchy.diagonal(dim1=-2, dim2=-1).sum(-1)
     square = 1.5 * (cauchy - (trace / 3)[..., None, None] * eye).square().sum((-2, -1))

@@ -27,7 +27,7 @@ from .bodies import connected
 
 SIZE = 6  # tets of a patch: a mesh has five to six for each vertex, and a vertex three freedoms
 LEAST = 4  # tets below which a patch joins a neighbour
-TINY = 1e-6  # of a tet's own law, below which the sum of its moduli under averaging counts as so large
+LEAST_SHARE = 1e-3  # of mu + lam, which has to remain of it
 
 
 class Patches(NamedTuple):
@@ -79,26 +79,32 @@ def uniform(patches: Patches, lam: Tensor, rest: Tensor) -> Averaged:
     return Averaged(lam if lam.shape[-1] == 1 else patches.spread(patches.mean(lam, c6)), c6)
 
 
-def law_at(model: Any, averaged: Averaged, mu: Tensor, lam: Tensor, rest: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """lam [B, T] and rest scalars [B, T, 7] of the law whose tets bound the energy of their patches about x [B, V, 3].
+def law_at(model: Any, averaged: Averaged, mu: Tensor, lam: Tensor, rest: Tensor, x: Tensor
+           ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """mu, lam [B, T] and rest scalars [B, T, 7] of the law whose tets bound the energy of their patches about
+    x [B, V, 3].
 
-    mu, lam, rest: Of the law without averaging, viscosity included [1 | B, 1 | T], [1 | B, T, 7]. Its energy has the
-    terms (mu + lam) c6 / 12 det^2 - (2 mu + lam) / 6 det, with det six times the volume of a tet at x. Averaging adds
-    lam_0 (a - 1) to the second sum of moduli, and lam' and c6' are such that the first term stays.
+    mu, lam, rest: Of the law without averaging, viscosity included [1 | B, 1 | T], [1 | B, T, 7]. With det six times
+    the volume of a tet its energy has the terms (mu + lam) c6 / 12 det^2 - (2 mu + lam) / 6 det and, of shear, mu k_ab.
+    Averaging adds lam_0 (a - 1) to 2 mu + lam. The new moduli and scalars leave the other terms as they are: mu, unless
+    mu + lam were not to remain positive, as in a tet that is far inside out among others; there c6.
     """
     corners = ops.tet_gather(x, *model._topology)
     e1, e2, e3 = (corners[..., a, :] - corners[..., 0, :] for a in (1, 2, 3))
     det = (e1 * torch.linalg.cross(e2, e3)).sum(-1)
     shape = det.shape
-    own, c6 = (ops.broadcast(t, shape) for t in averaged)
+    own, c6, mu, lam = (ops.broadcast(t, shape) for t in (*averaged, mu, lam))
+    rest = ops.broadcast(rest, (*shape, rest.shape[-1]))
     patches: Patches = model.patches
-    shift = c6 * det - patches.spread(patches.sum(det) / patches.sum(1 / c6))  # a - 1
-    mu, lam, rest = ops.broadcast(mu, shape), ops.broadcast(lam, shape), ops.broadcast(rest, (*shape, rest.shape[-1]))
+    added = own * (c6 * det - patches.spread(patches.sum(det) / patches.sum(1 / c6)))
     total = mu + lam
     some = total > 0
-    r = 1 + torch.where(some, own * shift / torch.where(some, total, 1.0), 0.0)
-    r = torch.where(r.abs() > TINY, r, TINY)  # a tet that is far inside out among others has a negative one
-    return r * total - mu, torch.cat([rest[..., :6], (rest[..., 6] / r)[..., None]], -1)
+    usual = ~some | (added > (LEAST_SHARE - 1) * total)
+    r = torch.where(usual & some, 1 + added / torch.where(some, total, 1.0), 1.0)
+    shear = torch.where(usual, mu, mu + added)
+    share = torch.where(usual, 1.0, mu / torch.where(usual, 1.0, shear))
+    rest = torch.cat([rest[..., :6] * share[..., None], (rest[..., 6] / r)[..., None]], -1)
+    return shear, r * total - shear, rest
 
 
 # --- patches of a mesh ------------------------------------------------------------------------------------------------

@@ -59,8 +59,9 @@ class ContactStep:
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
-        if prepared.settings.sweeps == 0 and self._reads(self.x_prev):  # for what sweeps raise
-            plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=())
+        unchecked = prepared.settings.sweeps == 0 or begun.law is not None
+        if unchecked and self._reads(self.x_prev):  # for what sweeps raise
+            plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=(), sweeps=0)
             with torch.no_grad():
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
         self.substeps = (None if self.barrier is None else self.barrier.detections) or 1
@@ -282,7 +283,8 @@ class ContactStep:
                           center=center, trust_radius=trust_radius, collider=collider, collider_prev=self.before,
                           kappa=self.kappa, **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs,
                           lag_ptr=lagged.ptr, lag_entry=lagged.entry, floor_lag=self.floor_lag)  # fmt: skip
-        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
+        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
+                     checked=self.begun.law is None)[:2]  # fmt: skip
 
     def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> Detection:
         """Pairs that can matter for a motion from x."""

@@ -18,7 +18,7 @@ from .coarse import in_lanes
 
 COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 Record = Callable[[Tensor], Tensor]  # of a state [B, V, 3]: data of the energies [B, n]
-Law = Callable[[Tensor], tuple[Tensor, Tensor]]  # of a state: lam [B, T] and rest scalars [B, T, 7]
+Law = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]  # of a state: mu, lam [B, T], rest scalars [B, T, 7]
 
 
 def parameters_at(model: System, given: dict[str, Tensor], scenes: int) -> list[dict[str, Tensor]]:
@@ -78,6 +78,12 @@ def sweep_renewed(model: System, renewed: Callable[[Tensor], dict[str, Tensor]],
         if fields.coarse_rest is not None and "rest" in changes:
             changes["coarse_rest"] = in_lanes(model, changes["rest"])
         now = replaced(fields, x_start=x, **changes)
+        if first and "mu" in changes and not x.is_cuda:  # of a bound moduli may be negative, the given ones may not
+            data = changes.get("energy_data", fields.energy_data)
+            with torch.no_grad():
+                sweep(replaced(plain, x_start=x, energy_data=data), model._packed_rest, model._plan,
+                      replaced(last, sweeps=0), tape_policy=ops.NO_TAPE, debug_step=debug_step)  # fmt: skip
+            first = False
         end, _, done = sweep(now, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
                              checked=first)  # fmt: skip
         corrections.extend([done] if done.numel() else [])

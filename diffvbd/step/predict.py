@@ -49,7 +49,7 @@ class Begun(NamedTuple):
     origin: Tensor | None
     h2a: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
     record: Record | None = None  # of a Model with couplings: data with their bound about a state
-    law: Law | None = None  # of a Model with patches: lam and rest scalars of the bound of their energy about a state
+    law: Law | None = None  # of a Model with patches: the bound of their energy about a state
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
@@ -67,7 +67,7 @@ class Begun(NamedTuple):
     def renewed(self, x: Tensor) -> dict[str, Tensor]:
         """Fields of the sweeps that are bounds about a state x [B, V, 3]."""
         out = {} if self.record is None else {"energy_data": self.record(x)}
-        return out if self.law is None else out | dict(zip(("lam", "rest"), self.law(x), strict=True))
+        return out if self.law is None else out | dict(zip(("mu", "lam", "rest"), self.law(x), strict=True))
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
@@ -123,7 +123,7 @@ def begin(
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
     record = record_of(model, prepared.parameters, data, origin, flat[0])
-    law, moduli, at = None, (prepared.lam, prepared.rest), start
+    law, moduli, at = None, (prepared.mu, prepared.lam, prepared.rest), start
     if prepared.averaged is not None:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest
         law = partial(law_at, model, prepared.averaged, prepared.mu, prepared.lam, rest)
@@ -140,9 +140,9 @@ def begin(
     rest = None
     if (model.starts_from == "auto" or parts) and model.energy_mask & ELASTIC:
         moduli = moduli if law is None else law(at.detach())
-        rest = model.rest_scalars if moduli[1] is None else moduli[1]
+        rest = model.rest_scalars if moduli[2] is None else moduli[2]
     begins = partial(
-        start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, moduli[0],
+        start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, *moduli[:2],
         rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
         start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
