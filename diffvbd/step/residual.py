@@ -18,7 +18,7 @@ from ..model.material import shape_gradients
 from ..model.model import Model
 from ..model.moving import moving_vertices
 from ..model.system import System
-from ..ops.sums import segment_sum
+from ..ops.sums import Rows, segment_sum
 from ..ops.sweep import sweep
 from .arguments import Prepared, acceleration_of, collider_state
 from .coarse import lengths_of, with_corrections
@@ -182,9 +182,14 @@ def _stiffness(model: System, of: _Functions, mu: Tensor, lam: Tensor) -> np.nda
         tets = model._topology[0][of.tets[first : first + CHUNK]]
         gradients, volume = shape_gradients(model._rest_points[tets].double())
         slopes = (gradients.mT @ values[tets]).flatten(1)  # of each function along each axis, [t, 3 f]
-        for total, modulus in ((shear, mu), (bulk, lam)):
+        means = slopes
+        if (patches := model.patches) is not None:  # whose volumes lam acts on
+            own = torch.unique(patches.label[of.tets[first : first + CHUNK]], return_inverse=True)[1]
+            rows = Rows.of(own, int(own.max()) + 1)
+            means = rows.gather(rows.sum((slopes * volume[:, None])[None]) / rows.sum(volume[None, :, None]))[0]
+        for total, modulus, slope in ((shear, mu, slopes), (bulk, lam, means)):
             part = modulus if len(modulus) == 1 else modulus[first : first + CHUNK]
-            total += (slopes * (volume * part)[:, None]).T @ slopes
+            total += (slope * (volume * part)[:, None]).T @ slope
     sheared, pressed = (m.reshape(3, count, 3, count).cpu().numpy() for m in (shear, bulk))
     out = pressed + sheared.transpose(2, 1, 0, 3)
     for c in range(3):

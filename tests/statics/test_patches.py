@@ -118,7 +118,7 @@ def test_gradients_are_those_of_differences() -> None:
     weights = numbers(model.num_vertices, 3, seed=3)
 
     def loss(**inputs: Any) -> Tensor:
-        done = dv.equilibrium(model, inputs.pop("x"), SOLVER, tolerance=1e-13,
+        done = dv.equilibrium(model, inputs.pop("x"), SOLVER, tolerance=1e-12,
                               adjoint=dv.GlobalAdjoint(tolerance=1e-12), **inputs)  # fmt: skip
         return (weights * done.x).sum() + done.x.square().sum()
 

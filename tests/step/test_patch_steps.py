@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 import torch
 from helpers.marks import slow
+from helpers.results import saved_bytes
 from helpers.spreads import assert_near_contact
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.model.system import system_of
+from diffvbd.rollout.checks import mechanical_energy
+from diffvbd.rollout.refine import halved
+from diffvbd.step.arguments import material_of, prepare
 from diffvbd.testing import contact_scenes, evaluate, generator, relative_error, tolerance
 
 STEP = 0.01
@@ -188,6 +193,9 @@ def test_a_converged_step_is_that_of_the_averaged_energy() -> None:
     end = dv.solve(model, x, v, dv.VBD(STEP, 0), tolerance=1e-9, max_sweeps=4000, **values)
     found = dv.diagnose(model, end.x, dv.VBD(STEP, end.sweeps), previous=(x, v), warn=False, **values)
     assert end.converged and float(found.unbalanced) < 1e-8
+    prepared = prepare(system_of(model, dv.VBD(STEP, 0)), (), material_of(mu=mu, lam=lam), time_step=STEP, sweeps=0)
+    one, two = (mechanical_energy(system_of(model, dv.VBD(STEP, 0)), prepared, p, v) for p in (end.x, x))
+    assert relative_error(one - two, energy_of(model, end.x, mu, lam)[None]) <= 1e-9
     at = end.x.detach().clone().requires_grad_()
     (slope,) = torch.autograd.grad(energy_of(model, at, mu, lam), at)
     y = x + STEP**2 * x.new_tensor([0, -9.81, 0])
@@ -223,3 +231,22 @@ def test_float32_transforms_and_bits(device: str) -> None:
     mapped = torch.func.vmap(torch.func.grad(end))(several)
     alone = torch.func.grad(end)(values["lam"])
     assert alone.any() and relative_error(mapped[0], alone) <= tolerance("coupled_adjoint")
+
+
+def test_memory_counts_the_laws_of_sweeps() -> None:
+    model, kept = built(), []
+    for sweeps in (4, 8):
+        x, solver = model.rest_points, dv.VBD(STEP, sweeps)
+        mu = torch.full((model.num_tets,), 1e4, dtype=x.dtype, requires_grad=True)
+        own = [t for rows in model.patches[1:] for t in rows if isinstance(t, Tensor)]  # type: ignore[index]
+        kept.append(saved_bytes(lambda s=solver, x=x, mu=mu: dv.step(model, x, torch.zeros_like(x), s, mu=mu, lam=1e5),
+                                [x, mu, *own]))  # fmt: skip
+    one, two = (dv.memory(model, dv.VBD(STEP, sweeps))["step"] for sweeps in (4, 8))
+    assert abs((two - one) / (kept[1] - kept[0]) - 1) <= tolerance("memory")
+
+
+def test_a_finer_mesh_has_no_labels() -> None:
+    labels = dv.Model(dv.mesh.cube(), energies=[dv.StableNeoHookean(patches=[0] * 5)])
+    with pytest.raises(ValueError, match="mesh: expected False: a finer mesh has other patches than the labels"):
+        halved(labels)
+    assert halved(dv.Model(dv.mesh.cube(), energies=[LAW])).model.patches is not None
