@@ -72,7 +72,7 @@ class StableNeoHookean:
     name: ClassVar[str] = "stable_neo_hookean"
     bit: ClassVar[int] = EXACT_BLOCK
 
-    patches: str | Tensor | None = None
+    patches: str | Tensor | Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if self.patches is None or isinstance(self.patches, str) and self.patches == "auto":

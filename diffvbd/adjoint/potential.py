@@ -251,7 +251,7 @@ class _PatchTerms:
 
     @property
     def stiffness(self) -> Tensor:
-        """h^2 times the second derivative by the volume [kg/m^4 s^2 ...], [B, P]."""
+        """h^2 times the second derivative with respect to the volume of each patch [kg/m^4], [B, P]."""
         return self.at.h**2 * self.weight / self.volume**2
 
     def product(self, w: Tensor) -> Tensor:

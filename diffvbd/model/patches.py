@@ -49,7 +49,8 @@ class Patches(NamedTuple):
         return cls(of, Rows.of(of, count), *(Rows.of(a, n) for a, n in zip(others, groups, strict=True)))
 
     def to(self, device: torch.device) -> Patches:
-        return Patches(*(part.to(device) for part in self))
+        label, *rows = self
+        return Patches(label.to(device), *(part.to(device) for part in rows))
 
     def sum(self, values: Tensor) -> Tensor:
         """Values of tets [B, T] -> sums of the patches [B, P]."""
@@ -99,10 +100,10 @@ def law_at(model: Any, averaged: Averaged, mu: Tensor, lam: Tensor, rest: Tensor
     added = own * (c6 * det - patches.spread(patches.sum(det) / patches.sum(1 / c6)))
     total = mu + lam
     some = total > 0
-    usual = ~some | (added > (LEAST_SHARE - 1) * total)
-    r = torch.where(usual & some, 1 + added / torch.where(some, total, 1.0), 1.0)
-    shear = torch.where(usual, mu, mu + added)
-    share = torch.where(usual, 1.0, mu / torch.where(usual, 1.0, shear))
+    keeps_mu = ~some | (added > (LEAST_SHARE - 1) * total)
+    r = torch.where(keeps_mu & some, 1 + added / torch.where(some, total, 1.0), 1.0)
+    shear = torch.where(keeps_mu, mu, mu + added)
+    share = torch.where(keeps_mu, 1.0, mu / torch.where(keeps_mu, 1.0, shear))
     rest = torch.cat([rest[..., :6] * share[..., None], (rest[..., 6] / r)[..., None]], -1)
     return shear, r * total - shear, rest
 
@@ -110,8 +111,8 @@ def law_at(model: Any, averaged: Averaged, mu: Tensor, lam: Tensor, rest: Tensor
 # --- patches of a mesh ------------------------------------------------------------------------------------------------
 
 
-def patches_of(mesh: TetMesh, given: str | Tensor | None) -> Patches | None:
-    """Patches of a mesh; raises ValueError where the labels do not fit it."""
+def patches_of(mesh: TetMesh, given: Any) -> Patches | None:
+    """Patches of a mesh, given as StableNeoHookean keeps them; raises ValueError where labels do not fit it."""
     if given is None:
         return None
     if isinstance(given, str):
