@@ -24,6 +24,7 @@ from .._common.checks import fail
 from ..mesh import TetMesh
 from ..ops.sums import Rows
 from .bodies import connected
+from .material import determinant
 
 SIZE = 6  # tets of a patch: a mesh has five to six for each vertex, and a vertex three freedoms
 LEAST = 4  # tets below which a patch joins a neighbour
@@ -91,8 +92,7 @@ def law_at(model: Any, averaged: Averaged, mu: Tensor, lam: Tensor, rest: Tensor
     mu + lam were not to remain positive, as in a tet that is far inside out among others; there c6.
     """
     corners = ops.tet_gather(x, *model._topology)
-    e1, e2, e3 = (corners[..., a, :] - corners[..., 0, :] for a in (1, 2, 3))
-    det = (e1 * torch.linalg.cross(e2, e3)).sum(-1)
+    det = determinant(corners[..., 1:, :] - corners[..., :1, :])
     shape = det.shape
     own, c6, mu, lam = (ops.broadcast(t, shape) for t in (*averaged, mu, lam))
     rest = ops.broadcast(rest, (*shape, rest.shape[-1]))

@@ -451,7 +451,7 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
         if matrix is not None and n:
             if corrections is None or of.begun.renews:
                 fields = touching(of, x, collider, start, listed)
-                own = replaced(of.fields, **of.begun.renewed(x))
+                own = of.fields if of.begun.law is None else replaced(of.fields, **of.begun.renewed(x))
                 corrections = Corrections(of.model, own, fields, matrix, settings.numbers)
             x, length = corrections.correct(x)
             lengths.append(length)

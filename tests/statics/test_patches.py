@@ -101,14 +101,14 @@ def energy_of(model: dv.Model, x: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
 
 
 def test_gradients_are_those_of_differences() -> None:
-    """Every input, in two scenes, of a beam at nu about 0.48; no gradient may be zero."""
+    """Every input, in two scenes, of a beam at nu about 0.45; no gradient may be zero."""
     mesh = dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1), split="kuhn")
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=[AUTO])
     x, tets = model.rest_points, model.num_tets
     arguments = {
         "x": torch.stack([x, x + 0.001]),
         "mu": 3e4 * (1 + 0.2 * numbers(2, tets).clamp(-1, 1)),
-        "lam": 6e5 * (1 + 0.2 * numbers(tets).clamp(-1, 1)),
+        "lam": 3e5 * (1 + 0.2 * numbers(tets).clamp(-1, 1)),
         "force": numbers(2, model.num_vertices, 3, size=0.05),
         "gravity": torch.tensor([0.3, -9.0, 0.5], dtype=torch.float64),
         "rest_points": x + numbers(model.num_vertices, 3, size=1e-3),
@@ -122,7 +122,7 @@ def test_gradients_are_those_of_differences() -> None:
                               adjoint=dv.GlobalAdjoint(tolerance=1e-12), **inputs)  # fmt: skip
         return (weights * done.x).sum() + done.x.square().sum()
 
-    check = dv.check_gradients(loss, arguments, relative_steps=(1e-5,), verbose=False)
+    check = dv.check_gradients(loss, arguments, relative_steps=(1e-4,), verbose=False)
     assert check.ok and all(size > 0 for _, size, *_ in check.rows), str(check)
 
 
