@@ -24,7 +24,7 @@ from .._common.checks import fail
 from ..mesh import TetMesh
 from ..ops.sums import Rows
 from .bodies import connected
-from .material import determinant
+from .material import cross, dot
 
 SIZE = 6  # tets of a patch: a mesh has five to six for each vertex, and a vertex three freedoms
 LEAST = 4  # tets below which a patch joins a neighbour
@@ -87,25 +87,92 @@ def law_at(model: Any, averaged: Averaged, mu: Tensor, lam: Tensor, rest: Tensor
     x [B, V, 3].
 
     mu, lam, rest: Of the law without averaging, viscosity included [1 | B, 1 | T], [1 | B, T, 7]. With det six times
-    the volume of a tet its energy has the terms (mu + lam) c6 / 12 det^2 - (2 mu + lam) / 6 det and, of shear, mu k_ab.
-    Averaging adds lam_0 (a - 1) to 2 mu + lam. The new moduli and scalars leave the other terms as they are: mu, unless
-    mu + lam were not to remain positive, as in a tet that is far inside out among others; there c6.
+    the volume of a tet its energy has the terms S c6 / 12 det^2 - (S + mu) / 6 det, S = mu + lam, and, of shear,
+    mu k_ab. Averaging adds lam_0 (a - 1) to S + mu. The new moduli and scalars leave the other terms as they are: with
+    the same mu, unless S were not to remain positive, as in a tet that is far inside out among others; there c6 stays.
     """
-    corners = ops.tet_gather(x, *model._topology)
-    det = determinant(corners[..., 1:, :] - corners[..., :1, :])
-    shape = det.shape
-    own, c6, mu, lam = (ops.broadcast(t, shape) for t in (*averaged, mu, lam))
-    rest = ops.broadcast(rest, (*shape, rest.shape[-1]))
-    patches: Patches = model.patches
-    added = own * (c6 * det - patches.spread(patches.sum(det) / patches.sum(1 / c6)))
-    total = mu + lam
-    some = total > 0
-    keeps_mu = ~some | (added > (LEAST_SHARE - 1) * total)
-    r = torch.where(keeps_mu & some, 1 + added / torch.where(some, total, 1.0), 1.0)
-    shear = torch.where(keeps_mu, mu, mu + added)
-    share = torch.where(keeps_mu, 1.0, mu / torch.where(keeps_mu, 1.0, shear))
-    rest = torch.cat([rest[..., :6] * share[..., None], (rest[..., 6] / r)[..., None]], -1)
-    return shear, r * total - shear, rest
+    return _law(*ops.distinct(x, *averaged, mu, lam, rest), model._topology, model.patches)
+
+
+class _LawTerms(NamedTuple):
+    """What makes a law; of tets [B, T], of patches [B, P]."""
+
+    normals: list[tuple[Tensor, ...]]  # derivatives of det by the second, third and fourth corner, by components
+    det: Tensor
+    size: Tensor  # sum of 1 / c6 of each patch
+    ratio: Tensor  # of each patch, J_P
+    strain: Tensor  # a - 1
+    added: Tensor  # lam_0 (a - 1)
+    keeps_mu: Tensor  # bool
+    total: Tensor  # S, 1 where it is 0
+
+
+def _terms(x: Tensor, own: Tensor, c6: Tensor, mu: Tensor, lam: Tensor, topology: Any, patches: Patches,
+           all_normals: bool = False) -> _LawTerms:  # fmt: skip
+    corners = ops.tet_gather(x, *topology)
+    e1, e2, e3 = (tuple(corners[..., a, i] - corners[..., 0, i] for i in range(3)) for a in (1, 2, 3))
+    normals = [cross(e2, e3), *((cross(e3, e1), cross(e1, e2)) if all_normals else ())]
+    det = dot(e1, normals[0])
+    size = patches.sum((1 / c6).expand(len(c6), det.shape[1]))
+    ratio = patches.sum(det) / size
+    strain = c6 * det - patches.spread(ratio)
+    added, total = own * strain, mu + lam
+    keeps_mu = (added > (LEAST_SHARE - 1) * total) | (total == 0)
+    return _LawTerms(normals, det, size, ratio, strain, added, keeps_mu, torch.where(total == 0, 1.0, total))
+
+
+def _run_law(x: Tensor, own: Tensor, c6: Tensor, mu: Tensor, lam: Tensor, rest: Tensor, topology: Any,
+             patches: Patches) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    t = _terms(x, own, c6, mu, lam, topology, patches)
+    shear = torch.where(t.keeps_mu, mu, mu + t.added)
+    share = torch.where(t.keeps_mu, 1.0, mu / torch.where(t.keeps_mu, 1.0, shear))
+    sixth = torch.where(t.keeps_mu, t.total / (t.total + t.added), 1.0) * rest[..., 6]
+    moduli = lam + torch.where(t.keeps_mu, t.added, -t.added)
+    return shear, moduli, torch.cat([rest[..., :6] * share[..., None], sixth[..., None]], -1)
+
+
+def _reverse_law(bars: Any, saved: Any, more: tuple, needs: Any) -> list[Tensor | None]:
+    x, own, c6, mu, lam, rest = saved
+    t = _terms(x, own, c6, mu, lam, *more, all_normals=bool(needs[0]))
+    shape = t.det.shape
+    of_mu, of_lam, of_rest = (t.det.new_zeros(s) if b is None else b for b, s in
+                              zip(bars, (shape, shape, (*shape, rest.shape[-1])), strict=True))  # fmt: skip
+    keeps, none = t.keeps_mu, t.det.new_zeros(())
+    # where mu stays: c6' = c6 S / s
+    s = torch.where(keeps, t.total + t.added, 1.0)
+    along = torch.where(keeps, of_rest[..., 6] * rest[..., 6] / (s * s), none)
+    # where it does not: k' = k mu / shear
+    shear = torch.where(keeps, 1.0, mu + t.added)
+    share = torch.where(keeps, 1.0, mu / shear)
+    bent = torch.where(keeps, none, (of_rest[..., :6] * rest[..., :6]).sum(-1) / (shear * shear))
+    added = torch.where(keeps, of_lam, of_mu - of_lam) - along * t.total - bent * mu
+    mu_bar = of_mu + along * t.added + bent * t.added
+    lam_bar = of_lam + along * t.added
+    rest_bar = None
+    if needs[5]:
+        sixth = of_rest[..., 6] * torch.where(keeps, t.total / s, 1.0)
+        rest_bar = torch.cat([of_rest[..., :6] * share[..., None], sixth[..., None]], -1)
+    own_bar, strain = added * t.strain, added * own
+    patches: Patches = more[1]
+    of_ratio = -patches.sum(strain.expand(shape)) / t.size
+    c6_bar = strain * t.det + patches.spread(of_ratio * t.ratio) / (c6 * c6) if needs[2] else None
+    x_bar = None
+    if needs[0]:
+        of_det = strain * c6 + patches.spread(of_ratio)
+        corners = [[of_det * n for n in normal] for normal in t.normals]
+        first = [-(a + b + c) for a, b, c in zip(*corners, strict=True)]
+        corners = torch.stack([row for corner in (first, *corners) for row in corner], -1)
+        x_bar = ops.star_sum(corners.unflatten(-1, (4, 3)), *more[0])
+    return [x_bar, own_bar, c6_bar, mu_bar, lam_bar, rest_bar]
+
+
+def _vmap_law(apply: Any, info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    tensors, scenes = ops.folded(info.batch_size, args[:6], in_dims, 1)
+    return tuple(t.unflatten(0, (-1, scenes)) for t in apply(*tensors, *args[6:])), (0, 0, 0)
+
+
+# x, lam_0, c6, mu, lam, rest; topology, patches.
+_law = ops.Differentiable(_run_law, _reverse_law, arguments=8, inputs=6, outputs=3, vmap=_vmap_law, batched=True)
 
 
 # --- patches of a mesh ------------------------------------------------------------------------------------------------

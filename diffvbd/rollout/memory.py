@@ -80,7 +80,7 @@ def memory(
     if model.couplings:  # each sweep has its own start and record, and free bodies a correction of their own
         per_step += scenes * sweeps * (23 if model.corrects else 12) * model.num_vertices * item
     if model.patches is not None:  # each sweep has its own start and law
-        per_step += scenes * sweeps * (27 * model.num_tets + 3 * model.num_vertices) * item
+        per_step += scenes * sweeps * (9 * model.num_tets + 3 * model.num_vertices) * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
