@@ -127,10 +127,11 @@ def test_gradients_are_those_of_differences() -> None:
 
 
 def test_large_deflections_reactions_and_stress() -> None:
-    """Newton's method converges; supports carry the weight; in a state that is affine patches change nothing."""
-    model, values = cantilever(AUTO, 2), {"young": 1e6, "poisson": 0.499}
+    """Newton's method converges, by stages of lam; supports carry the weight; a state that is affine is as ever."""
+    model, values = cantilever(AUTO, 2), {"young": 1e6, "poisson": 0.4999}
     rest = dv.equilibrium(model, model.rest_points, SOLVER, **values)
-    assert rest.converged and float((model.rest_points - rest.x)[:, 1].max()) > 0.5
+    assert rest.converged and float((model.rest_points - rest.x)[:, 1].max()) > 0.5 and rest.iterations < 60
+    assert dv.equilibrium(model, rest.x, SOLVER, **values).iterations == 0
     weight = 9.81 * model.mass.sum()
     held = dv.reactions(model, rest.x.detach(), **values)
     assert abs(held[:, 1].sum() / weight - 1) < 1e-6
@@ -149,6 +150,15 @@ def test_large_deflections_reactions_and_stress() -> None:
     stress = dv.stress(model, x.detach(), **values).cauchy * (torch.linalg.det(edges) / 6)[:, None, None]
     total = torch.zeros_like(force).index_add(0, model.tets.flatten(), (slopes @ stress).flatten(0, 1))
     assert (total - force).norm() <= 1e-10 * force.norm()
+
+
+def test_scenes_that_need_stages_leave_others_alone() -> None:
+    model = cantilever(AUTO, 1)
+    alone = [dv.equilibrium(model, model.rest_points, SOLVER, young=young, poisson=0.499) for young in (5e5, 1e8)]
+    young = torch.tensor([[5e5], [1e8]], dtype=torch.float64)
+    both = dv.equilibrium(model, model.rest_points.expand(2, -1, -1), SOLVER, young=young, poisson=0 * young + 0.499)
+    assert both.converged and alone[0].iterations > 12 > alone[1].iterations
+    assert all(torch.allclose(x, own.x, atol=1e-6) for x, own in zip(both.x, alone, strict=True))
 
 
 def test_pairs_press_averaged_bodies() -> None:
