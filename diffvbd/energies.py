@@ -28,6 +28,7 @@ from ._common.checks import (
 from ._common.constants import EXACT_BLOCK, FIRST_VERTEX_BIT
 
 MAX_PLANES = 8
+INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)  # dtypes of labels
 FADE = 0.1  # of kappa dhat: the normal force from which a contact has half of its damping; twins in csrc and reference
 
 
@@ -55,13 +56,43 @@ def numbers_of(name: str, value: Any) -> Tensor:
 class StableNeoHookean:
     """Stable Neo-Hookean tets, P = mu F + (lb (J - 1) - mu) cof F with lb = mu + lam.
 
+    Args:
+        patches: What the part of lam averages volumes over, against locking near nu = 0.5: None, each tet has its own;
+            "auto", patches of about six neighbours; or a label of each tet, integers of shape [T]. The tets of a label
+            lie in one connected body. lam that differs within a patch counts with its mean by volume.
+
     Inputs: ``mu`` and ``lam``, or ``young`` and ``poisson``.
 
-    Source: Smith, de Goes, Kim (2018); paper, appendix on closed forms; docs/method.md, section 2.
+    Raises:
+        TypeError, ValueError: patches of another kind; in the Model, labels that do not fit its mesh.
+
+    Source: Smith, de Goes, Kim (2018); paper, appendix on closed forms; docs/method.md, sections 2 and 23.
     """
 
     name: ClassVar[str] = "stable_neo_hookean"
     bit: ClassVar[int] = EXACT_BLOCK
+
+    patches: str | Tensor | Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.patches is None or isinstance(self.patches, str) and self.patches == "auto":
+            return
+        if isinstance(self.patches, Tensor):
+            check_readable("patches", self.patches)
+        try:
+            labels = None if isinstance(self.patches, str) else torch.as_tensor(self.patches).detach().cpu()
+        except (TypeError, ValueError, RuntimeError):
+            labels = None
+        if labels is None or labels.dim() != 1 or labels.dtype not in INTEGERS:
+            got = repr(self.patches) if labels is None else f"{labels.dtype}, shape {list(labels.shape)}"
+            fail("patches", 'None, "auto" or integers of shape [T], a label of each tet', got)
+        object.__setattr__(self, "patches", labels.to(torch.int64))
+
+    def __repr__(self) -> str:
+        labels = self.patches
+        if labels is None:
+            return "StableNeoHookean()"
+        return f"StableNeoHookean(patches={repr(labels) if isinstance(labels, str) else f'<{len(labels)} labels>'})"
 
 
 class VertexEnergy:

@@ -22,6 +22,7 @@ from .._contact.pair_forces import (
 )
 from ..energies import damped_fraction
 from ..model.inputs import parameter_of
+from ..model.patches import Averaged
 from ..model.system import System
 from ..ops import contact as ops_contact
 from ..ops.fields import CONSTANTS
@@ -266,8 +267,9 @@ def _no_pairs(points: Tensor) -> NearPairs:
 class ContactPotential(IncrementalPotential):
     """The incremental potential at x with pairs and friction. Its Hessian is that without them."""
 
-    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, contact: StepContact) -> None:
-        super().__init__(model, x, fields, contact.h)
+    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, contact: StepContact,
+                 averaged: Averaged | None = None) -> None:  # fmt: skip
+        super().__init__(model, x, fields, contact.h, averaged)
         self.step_contact = contact
 
     @cached_property

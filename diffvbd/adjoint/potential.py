@@ -12,6 +12,7 @@ k_ab and c6 of docs/method.md, section 2, and the edges e_1, e_2, e_3 from the f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -19,9 +20,12 @@ from torch import Tensor
 
 from .. import ops
 from .._common.constants import ELASTIC
+from .._common.context import replaced
 from ..model.moving import MovingBodies, moving_bodies
+from ..model.patches import Averaged
 from ..model.system import System
 from ..ops.fields import ROUNDINGS
+from ..ops.sums import Rows
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
@@ -44,8 +48,10 @@ class IncrementalPotential:
     Per tet, arrays are [3 edges, 3 components, B, T]: rows of whole meshes, which elementwise operations want.
     """
 
-    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, time_step: float) -> None:
-        """fields: of the step; where its sweeps start does not enter."""
+    def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, time_step: float,
+                 averaged: Averaged | None = None) -> None:  # fmt: skip
+        """fields: of the step, without bounds of patches; where its sweeps start does not enter.  averaged: the law
+        whose volumes patches average; None: that of the fields."""
         self.model, self.x, self.h = model, x, time_step
         self.x_prev, self.y, self.data = fields.x_prev, fields.y, fields.energy_data
         self.mu, self.lam, self.mass = fields.mu, fields.lam, fields.mass[..., None]
@@ -68,6 +74,14 @@ class IncrementalPotential:
         total = self.mu + self.lam
         self._pressure = (h2 / 6) * (total * (self.ratio - 1) - self.mu)
         self._bulk = (h2 / 6) * total * self.c6
+        self.patches = None
+        if model.patches is not None:
+            own = Averaged(self.lam, self.c6) if averaged is None else averaged
+            self.patches = _PatchTerms(self, own)
+            det = self.ratio / self.c6
+            shift = model.patches.spread(self.patches.ratio) - own.c6 * det
+            self._pressure = self._pressure + (h2 / 6) * own.lam * shift
+            self._bulk = self._bulk - (h2 / 6) * own.lam * own.c6
 
     def _edges_of(self, x: Tensor) -> Tensor:
         corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1).contiguous()
@@ -109,7 +123,8 @@ class IncrementalPotential:
         f = self._edges_of(w)
         turned = _cross(_rolled(f, 1), self._last) + _cross(self._next, _rolled(f, 2))
         stretched = self._bulk * (self.normals * f).sum(0).sum(0)
-        return self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
+        out = self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
+        return out if self.patches is None else out + self.patches.product(w)
 
     def vertex_blocks(self) -> Tensor | None:
         """3x3 blocks of the energies of single vertices, [B, V, 3, 3], or None where there are none."""
@@ -137,15 +152,16 @@ class IncrementalPotential:
         total = ops.star_sum(blocks.permute(3, 4, 0, 1, 2).flatten(-2), *self.model._topology).unflatten(-1, (3, 3))
         total = total + self.mass[..., None] * eye
         own = self.vertex_blocks()
-        return total if own is None else total + own
+        total = total if own is None else total + own
+        return total if self.patches is None else total + self.patches.diagonal
 
     def stiffness(self) -> Tensor:
         """Traces of the blocks on the diagonal [kg], [B, V, 1]."""
         return self.diagonal().diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
 
     def edge_blocks(self) -> Tensor:
-        """Blocks off the diagonal of the tets' Hessians: of the corners (a, b) of PAIRS, then of (b, a),
-        [B, T, 12, 9]."""
+        """Blocks off the diagonal of the tets' Hessians, without what couples the tets of patches: of the corners
+        (a, b) of PAIRS, then of (b, a), [B, T, 12, 9]."""
         corners = torch.cat([torch.zeros_like(self.edges[:1]), self.edges])
         normals = self._corner_normals()
         a, b, c, d = _OF_PAIRS.to(self.x.device)
@@ -171,7 +187,7 @@ class IncrementalPotential:
         """
         h2 = self.h * self.h
         out: list[Tensor | None] = [None] * 8
-        f = self._edges_of(w)
+        f, lam = self._edges_of(w), self.lam if self.patches is None else torch.zeros_like(self.lam)
         bent = (self.normals * f).sum(0).sum(0) / 6  # d(V J) along w, over c6 V = 1/6
         if wants[2]:
             out[2] = self.mass * w
@@ -186,11 +202,15 @@ class IncrementalPotential:
                 out[3] = h2 * (sheared - (self.ratio - 2) * bent)
             if wants[6]:
                 shape = torch.broadcast_shapes(bent.shape, self.c6.shape)
-                of_c6 = -h2 * (self.mu + self.lam) * (self.ratio / self.c6) * bent
+                of_c6 = -h2 * (self.mu + lam) * (self.ratio / self.c6) * bent
                 columns = [h2 * self.mu * s for s in stretch] + [of_c6]
                 out[6] = torch.stack([c.expand(shape) for c in columns], -1)
         if wants[4]:
             out[4] = -h2 * (self.ratio - 1) * bent
+        if self.patches is not None and (wants[4] or wants[6]):
+            out[4], of_c6 = self.patches.dependence(bent)
+            if out[6] is not None:
+                out[6] = torch.cat([out[6][..., :6], out[6][..., 6:] + of_c6[..., None]], -1)
         if self.model.vertex_energies and (wants[1] or wants[7]):
             with torch.enable_grad():
                 x_prev, data = (t.detach().requires_grad_() for t in (self.x_prev, self.data))
@@ -210,6 +230,54 @@ class IncrementalPotential:
         ]
 
 
+class _PatchTerms:
+    """h^2 sum over patches of L / 2 (J_P - 1)^2, L = sum V lam, at one state (model/patches.py)."""
+
+    def __init__(self, at: IncrementalPotential, averaged: Averaged) -> None:
+        assert at.model.patches is not None
+        self.at, self.of = at, at.model.patches
+        self.det = at.ratio / at.c6
+        shape = self.det.shape
+        self.lam, self.c6 = (ops.broadcast(t, shape) for t in averaged)
+        volume = 1 / (6 * self.c6)
+        self.volume, self.weight = self.of.sum(volume), self.of.sum(volume * self.lam)  # of patches [m^3], [J]
+        self.ratio = self.of.sum(self.det / 6) / self.volume  # J_P
+
+    @cached_property
+    def slopes(self) -> Tensor:
+        """Derivative of the volume of each patch with respect to each of its vertices [m^2], [B, N, 3]."""
+        normals = self.at._corner_normals().permute(2, 3, 0, 1) / 6
+        return self.of.of_corners.sum(normals.flatten(1, 2))
+
+    @property
+    def stiffness(self) -> Tensor:
+        """h^2 times the second derivative with respect to the volume of each patch [kg/m^4], [B, P]."""
+        return self.at.h**2 * self.weight / self.volume**2
+
+    def product(self, w: Tensor) -> Tensor:
+        """Part of the Hessian that is of rank one in each patch, times w."""
+        along = self.of.members.sum((self.slopes * self.of.of_vertices.gather(w)).sum(-1, keepdim=True))
+        return self.of.of_vertices.sum(self.of.members.gather(self.stiffness[..., None] * along) * self.slopes)
+
+    @cached_property
+    def diagonal(self) -> Tensor:
+        """Its blocks on the diagonal, [B, V, 3, 3]."""
+        scaled = self.of.members.gather(self.stiffness[..., None]) * self.slopes
+        outer = scaled[..., :, None] * self.slopes[..., None, :]
+        return self.of.of_vertices.sum(outer.flatten(-2)).unflatten(-1, (3, 3))
+
+    def dependence(self, bent: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of -w . dE/dx with respect to lam and c6 of each tet, [B, T]; bent: d(V J) along w."""
+        with torch.enable_grad():
+            lam, c6 = (t.detach().clone().requires_grad_() for t in (self.lam, self.c6))
+            volume = 1 / (6 * c6)
+            total = self.of.sum(volume)
+            strain = self.of.sum(self.det.detach() / 6) / total - 1
+            along = self.of.sum(volume * lam) * strain * self.of.sum(bent.detach()) / total
+            of_lam, of_c6 = torch.autograd.grad(-(self.at.h**2) * along.sum(), (lam, c6))
+        return of_lam, of_c6
+
+
 def of_vertices(data: Tensor, x: Tensor) -> Tensor:
     """Data of a scene [1 | B, n] for each vertex of x [B, V, 3], [B, V, n]; its gradient is summed in a fixed order."""
     return ops.broadcast(data[:, None], (*x.shape[:2], data.shape[-1]))
@@ -226,6 +294,7 @@ class IncreaseInputs(NamedTuple):
     material: Tensor  # [1 | B, blocks, 2, 8], mu and lam of the tets by body [Pa]
     rest: Tensor  # [1 | B, blocks, 7, 8]
     time_step: float
+    averaged: Averaged | None = None  # of a Model with patches, whose part material has not
 
     @property
     def bodies(self) -> MovingBodies:
@@ -255,10 +324,15 @@ def bodies_of(model: System) -> MovingBodies:
         bool(model.energy_mask & ELASTIC)).to(model.device, model.dtype))  # fmt: skip
 
 
-def increase_inputs(model: System, fields: ops.SweepFields, time_step: float) -> IncreaseInputs:
-    """fields: of the step's sweeps."""
+def increase_inputs(model: System, fields: ops.SweepFields, time_step: float, averaged: Averaged | None = None
+                    ) -> IncreaseInputs:  # fmt: skip
+    """fields, averaged: as of IncrementalPotential."""
     # contiguous: a state may be expanded over scenes
     fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore
+    if model.patches is not None:
+        rest = model.rest_scalars if fields.rest is None else fields.rest
+        averaged = Averaged(fields.lam, rest[..., 6]) if averaged is None else Averaged(*(t.detach() for t in averaged))
+        fields = replaced(fields, lam=fields.lam - averaged.lam)
     moving = bodies_of(model)
     blocks, lanes = moving.tet.shape
     counts = fields.mu.shape[0], fields.lam.shape[0]
@@ -267,7 +341,7 @@ def increase_inputs(model: System, fields: ops.SweepFields, time_step: float) ->
     for i, modulus in enumerate((fields.mu, fields.lam)):
         material[:, :, i] = modulus[..., None] if modulus.shape[1] == 1 else modulus[:, moving.tet]
     rest = moving.rest if fields.rest is None else fields.rest[:, moving.tet].transpose(-1, -2).contiguous()
-    return IncreaseInputs(model, fields, material, rest, time_step)
+    return IncreaseInputs(model, fields, material, rest, time_step, averaged)
 
 
 def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
@@ -276,6 +350,40 @@ def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
     model, moving, f = inputs.model, inputs.bodies, inputs.fields
     origin = x.new_empty((0,)) if f.origin is None else f.origin
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
-    return ops.direct.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
-                                         inputs.material, inputs.rest, *index, list(model._data_count),
-                                         inputs.time_step)  # fmt: skip
+    out = ops.direct.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
+                                        inputs.material, inputs.rest, *index, list(model._data_count),
+                                        inputs.time_step)  # fmt: skip
+    return out if inputs.averaged is None else out + _increase_of_patches(inputs, inputs.averaged, x, to)
+
+
+def _increase_of_patches(inputs: IncreaseInputs, averaged: Averaged, x: Tensor, to: Tensor) -> Tensor:
+    """The part of increase_of_bodies() that is that of patches."""
+    model, bodies = inputs.model, inputs.bodies
+    patches = model.patches
+    assert patches is not None
+
+    def by_body() -> Rows:
+        vertex = torch.where(model._pinned, -1, bodies.of)[model.tets].amax(1)  # -1: nothing of a tet moves
+        body = torch.full((len(patches.of_tets.ptr) - 1,), -1, device=vertex.device)
+        body = body.scatter_reduce(0, patches.label, vertex, "amax")
+        return Rows.of(torch.where(body < 0, bodies.number, body), bodies.number)
+
+    rows: Rows = model.derived("bodies of patches", by_body)
+    corners, ends = (ops.tet_gather(t.double(), *model._topology) for t in (x, to))
+    e, n = (c[..., 1:, :] - c[..., :1, :] for c in (corners, ends))
+    f = n - e
+
+    def det(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+        return (a * torch.linalg.cross(b, c)).sum(-1)
+
+    # the change itself, which no rounding of the volumes drowns
+    change = (det(f[..., 0, :], n[..., 1, :], n[..., 2, :]) + det(e[..., 0, :], f[..., 1, :], n[..., 2, :])
+              + det(e[..., 0, :], e[..., 1, :], f[..., 2, :]))  # fmt: skip
+    lam, c6 = (ops.broadcast(t.double(), change.shape) for t in averaged)
+    volume = 1 / (6 * c6)
+    total, weight = patches.sum(volume), inputs.time_step**2 * patches.sum(volume * lam)
+    strain = patches.sum(det(*e.unbind(-2)) / 6) / total - 1
+    change = patches.sum(change / 6) / total
+    more = weight * change * (strain + change / 2)
+    size = weight * change.abs() * (1 + strain.abs() + change.abs())
+    return rows.sum(torch.stack([more, size], -1))

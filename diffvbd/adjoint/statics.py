@@ -191,11 +191,15 @@ def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[
     blocks = at.diagonal() + shift[..., None] * eye
     smooth = inverse_blocks(blocks, at.free)
     stored = at.x.is_cuda or torch.backends.mkl.is_available()  # sparse products on a CPU need MKL
-    elastic = Assembled(at, blocks - at.pair_diagonal) if stored else (
+    of_tets = blocks - at.pair_diagonal if at.patches is None else blocks - at.pair_diagonal - at.patches.diagonal
+    elastic = Assembled(at, of_tets) if stored else (
         lambda w: at.free * (IncrementalPotential.product(at, w) + shift * w))  # fmt: skip
 
     def product(w: Tensor) -> Tensor:
-        return elastic(w) if at.pairs is None else elastic(w) + at.free * at.pair_product(w)
+        out = elastic(w)
+        if stored and at.patches is not None:  # a matrix of tets has no room for what couples several
+            out = out + at.free * at.patches.product(w)
+        return out if at.pairs is None else out + at.free * at.pair_product(w)
 
     weights = _coarse_functions(at.model)
     if weights is None:

@@ -336,7 +336,7 @@ def reactions(
 
     at = full(x)
     fields = ops.SweepFields(at, at, at, prepared.mu, prepared.lam, prepared.mass, prepared.rest, given.data(), None)
-    total = IncrementalPotential(given.model, at, fields, h).elastic() / h**2
+    total = IncrementalPotential(given.model, at, fields, h, prepared.averaged).elastic() / h**2
     if given.model.contact is not None:  # planes do not act on pinned vertices
         normal, friction = _contact_at(given, x, previous).on_vertices()
         total = total - normal - friction
@@ -419,6 +419,8 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
 
         cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
 
+    With patches lam times the strain J_P - 1 of the patch stands for lam (J - 1).
+
     Args:
         model: A scene with StableNeoHookean tets.
         x: Positions [m], shape [..., V, 3].
@@ -456,6 +458,10 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     eye = torch.eye(3, dtype=f.dtype, device=f.device)
     left = (f[..., :, None, :] * f[..., None, :, :]).sum(-1)
     pressure = (shear + second) * (det - 1) - shear
+    if (patches := given.model.patches) is not None:
+        assert given.prepared.averaged is not None
+        mean = patches.mean(det.reshape(-1, det.shape[-1]), given.prepared.averaged.c6)
+        pressure = pressure + second * (patches.spread(mean).reshape(det.shape) - det)
     cauchy = (shear / det)[..., None, None] * left + pressure[..., None, None] * eye
     trace = cauchy.diagonal(dim1=-2, dim2=-1).sum(-1)
     square = 1.5 * (cauchy - (trace / 3)[..., None, None] * eye).square().sum((-2, -1))

@@ -19,11 +19,12 @@ from .._common.context import looks_at
 _Vector = tuple[Tensor, ...]  # three components
 
 
-def _cross(a: _Vector, b: _Vector) -> _Vector:
+def cross(a: _Vector, b: _Vector) -> _Vector:
+    """By components, as dot()."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _dot(a: _Vector, b: _Vector) -> Tensor:
+def dot(a: _Vector, b: _Vector) -> Tensor:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -52,15 +53,15 @@ def face_normals(corners: Tensor) -> tuple[list[_Vector], Tensor]:
     """
     p = [tuple(corners[..., a, c].contiguous() for c in range(3)) for a in range(4)]
     e1, e2, e3 = (tuple(p[a][c] - p[0][c] for c in range(3)) for a in (1, 2, 3))
-    n1, n2, n3 = _cross(e2, e3), _cross(e3, e1), _cross(e1, e2)
+    n1, n2, n3 = cross(e2, e3), cross(e3, e1), cross(e1, e2)
     n0 = tuple(-(n1[c] + n2[c] + n3[c]) for c in range(3))
-    return [n0, n1, n2, n3], _dot(e1, n1)
+    return [n0, n1, n2, n3], dot(e1, n1)
 
 
 def stiffness_weights(normals: list[_Vector], c6: Tensor) -> list[Tensor]:
     """k01 k02 k03 k12 k13 k23 = c6 / 6 n_a . n_b [m]."""
     scale = c6 / 6.0
-    return [_dot(normals[a], normals[b]) * scale for a, b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))]
+    return [dot(normals[a], normals[b]) * scale for a, b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))]
 
 
 def lumped_mass(density: Tensor, volume: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
@@ -96,7 +97,7 @@ def deformed(corners: Tensor, by: Tensor) -> Tensor:
 def determinant(matrix: Tensor) -> Tensor:
     """Of matrices [..., 3, 3], without LAPACK."""
     rows = [tuple(matrix[..., r, c] for c in range(3)) for r in range(3)]
-    return _dot(rows[0], _cross(rows[1], rows[2]))
+    return dot(rows[0], cross(rows[1], rows[2]))
 
 
 def fibre_contraction(directions: Tensor, activation: float | Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from .bodies import find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
 from .material import lumped_mass, rest_metric
 from .moving import moving_bodies
+from .patches import Patches, patches_of
 from .solver import VBD
 
 PLACED = (VertexEnergy, Coupling)  # energies that hold tensors
@@ -103,6 +104,8 @@ class Model:
             fitted = self.contact.of_scene(mesh, self._density.numpy(), mask.numpy())
             self._set_energies(tuple(fitted if e is self.contact else e for e in self.energies))
         self._pinned = mask
+        given = next((e.patches for e in self.energies if isinstance(e, StableNeoHookean)), None)
+        self.patches: Patches | None = patches_of(mesh, given)
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = first_of_body(body)
         # those of the default solver: other solvers derive theirs (system.py)
@@ -173,6 +176,11 @@ class Model:
     def touches(self) -> bool:
         """Whether steps go through contact, with pairs or friction."""
         return bool(self.energy_mask & CONTACT)
+
+    @property
+    def renews(self) -> bool:
+        """Whether each sweep begins with bounds of energies about its own start: of couplings, of patches."""
+        return bool(self.couplings) or self.patches is not None
 
     @property
     def collider_points(self) -> Tensor:
@@ -254,6 +262,8 @@ class Model:
         self._bodies, self._other_bodies = self._bodies.to(device), self._other_bodies.to(device)
         placed = [e.placed(self.num_vertices, device) if isinstance(e, PLACED) else e for e in self.energies]
         self._set_energies(tuple(placed))
+        if self.patches is not None:
+            self.patches = self.patches.to(device)
         if hasattr(self, "_rest"):
             self._packed_rest = ops.pack_rest(self._rest, self._plan, self._sizes)
             del self._rest

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .coarse import Coarse
-from .couplings import Bound, energies_of_sweeps
+from .couplings import Bounds, energies_of_sweeps
 from .distance import EDGE_EDGE, PairTerms, distance, pair_terms
 from .energies import FADE, floor_friction, smoothed, tangential6
 from .rigid_contact import Correction
@@ -332,7 +332,7 @@ def in_cycles(
     x_prev: Tensor,
     number: int,
     substep: Any,
-    bound: Bound | None = None,
+    bound: Bounds | None = None,
 ) -> Tensor:
     """The state [..., 3, V] after so many sweeps.
 

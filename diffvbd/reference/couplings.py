@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .energies import ENERGIES, Anchor, build_energies
+from .energies import ENERGIES, Anchor, StableNeoHookean, build_energies
 from .scene import Scene, cross, dot
 
 
@@ -160,11 +160,23 @@ class Bound(Anchor):
         self.points = x - torch.where(some, step, 0.0)
 
 
-def energies_of_sweeps(scene: Scene, elsewhere: tuple[str, ...]) -> tuple[list[Any], Bound | None]:
-    """The energies of a scene as sweeps see them, and the bound that stands for couplings among them."""
+class Bounds:
+    """What a scene's sweeps begin with anew: the bound of its couplings, if any, and those of its patches."""
+
+    def __init__(self, couplings: Bound | None, laws: list[Any]) -> None:
+        self.couplings, self.laws = couplings, laws
+
+    def renew(self, x: Tensor) -> None:
+        for bound in (*self.laws, *([] if self.couplings is None else [self.couplings])):
+            bound.renew(x)
+
+
+def energies_of_sweeps(scene: Scene, elsewhere: tuple[str, ...]) -> tuple[list[Any], Bounds | None]:
+    """The energies of a scene as sweeps see them, and the bounds that stand for some among them."""
     built = build_energies(scene, elsewhere)
     couplings = [energy for energy in built if hasattr(energy, "bound")]
-    if not couplings:
-        return built, None
-    bound = Bound(scene, couplings)
-    return [*(energy for energy in built if not hasattr(energy, "bound")), bound], bound
+    bound = Bound(scene, couplings) if couplings else None
+    if bound is not None:
+        built = [*(energy for energy in built if not hasattr(energy, "bound")), bound]
+    laws = [e for e in built if type(e) is StableNeoHookean and scene.patches is not None]
+    return built, Bounds(bound, laws) if couplings or laws else None

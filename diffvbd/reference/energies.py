@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from .distance import log_barrier
-from .scene import Color, Scene, add_at, cross, dot, outer6, shape_functions, take
+from .scene import Color, Scene, add_at, cross, dot, outer6, patch_means, shape_functions, take
 
 ETA = 0.9  # a filtered step closes at most this fraction of a gap
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
@@ -32,7 +32,12 @@ class StableNeoHookean:
     """psi = mu/2 (|F|^2 - 3) - mu (J - 1) + lb/2 (J - 1)^2, lb = mu + lam: P = mu F + (lb (J - 1) - mu) cof F.
 
     The usual form lb/2 (J - 1 - mu/lb)^2 differs by the constant mu^2 / (2 lb), which does not exist at lb = 0.
+
+    With patches lam/2 (J - a)^2 takes the place of lam/2 (J - 1)^2, a = 1 + J - J_P at the state of the last `renew`
+    with J_P the mean of J over a patch: but for constants, the energy of patches there and a bound of it elsewhere.
     """
+
+    shift: Any = 0.0  # a - 1 of each tet [..., T]
 
     def __init__(self, energy: Any, scene: Scene) -> None:
         self.scene = scene
@@ -64,7 +69,11 @@ class StableNeoHookean:
         cof = cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])
         det = dot(f[0], cof[0]).unsqueeze(-2)
         q = _combine(cof, own)
-        gradient = w_mu * _combine(f, own) + (w_lb * (det - 1) - w_mu) * q
+        stress = w_lb * (det - 1) - w_mu
+        if isinstance(self.shift, Tensor):
+            weight = self.scene.time_step**2 * self.scene.volume * self.scene.lam * self.shift
+            stress = stress - weight[..., color.tet].unsqueeze(-2)
+        gradient = w_mu * _combine(f, own) + stress * q
         return add_at(constant, color.owner, torch.cat((gradient, w_lh * outer6(q)), -2))
 
     def _measures(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -75,11 +84,17 @@ class StableNeoHookean:
         norm = dot(f[0], f[0]) + dot(f[1], f[1]) + dot(f[2], f[2])
         return norm, dot(f[0], cross(f[1], f[2])) - 1
 
+    def renew(self, x: Tensor) -> None:
+        """Take the bound about x [..., 3, V]; differentiable in x."""
+        if self.scene.patches is not None:
+            strain = self._measures(x)[1]
+            self.shift = strain - patch_means(self.scene.patches, strain, self.scene.volume)
+
     def of_tets(self, x: Tensor) -> Tensor:
         """The energy of each tet, h^2-scaled, [..., T]."""
         s = self.scene
         norm, strain = self._measures(x)
-        psi = s.mu * ((norm - 3) / 2 - strain) + (s.mu + s.lam) / 2 * strain**2
+        psi = s.mu * ((norm - 3) / 2 - strain) + (s.mu + s.lam) / 2 * strain**2 - s.lam * self.shift * strain
         return s.time_step**2 * (s.volume * psi)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
@@ -89,7 +104,7 @@ class StableNeoHookean:
         s = self.scene
         norm, strain = self._measures(x)
         weight = s.time_step**2 * s.volume
-        split = (s.mu / 2 * norm, -s.mu * strain, (s.mu + s.lam) / 2 * strain**2)
+        split = (s.mu / 2 * norm, -(s.mu + s.lam * self.shift) * strain, (s.mu + s.lam) / 2 * strain**2)
         return torch.cat([weight * term for term in split], -1), s.layout.tets[0].repeat(3)
 
 
@@ -106,7 +121,7 @@ class Viscosity(StableNeoHookean):
         upright = volume > 0
         share = torch.where(upright, volume / s.volume, 0.0)
         shear, bulk = rates(s)
-        at_start = replace(s, mu=shear, lam=bulk, volume=s.volume * share**2,
+        at_start = replace(s, mu=shear, lam=bulk, patches=None, volume=s.volume * share**2,
                            shape_gradients=torch.where(upright[..., None, None, :], gradients, 0.0))  # fmt: skip
         super().__init__(None, at_start)
 

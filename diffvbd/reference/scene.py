@@ -120,6 +120,7 @@ class Scene:
     parameters: dict[str, Any]
     viscosity: Tensor | None = None  # [..., T] [Pa s]
     volume_viscosity: Tensor | None = None
+    patches: Tensor | None = None  # [T] patch of each tet, whose volumes lam averages
     slowing: Tensor | None = None  # [..., V, 1] of velocities and accelerations by drag [-]; the mass is larger by it
 
     def parameter(self, energy: Any, key: str) -> Tensor:
@@ -174,13 +175,17 @@ def build_scene(
         slowing = 1 / (1 + time_step * torch.as_tensor(drag, dtype=like.dtype, device=like.device))
         slowing = slowing.expand(*slowing.shape[:-1], points.shape[-1])
         mass, slowing = mass / slowing, slowing.unsqueeze(-1)
+    lam, patches = per_tet(lam), getattr(model, "patches", None)
+    if patches is not None:
+        patches = patches.label if layout.order is None else patches.label[layout.order]
+        lam = patch_means(patches, lam, volume)
     return Scene(
         model=model,
         layout=layout,
         like=like,
         time_step=time_step,
         mu=per_tet(mu),
-        lam=per_tet(lam),
+        lam=lam,
         rest_points=points,
         shape_gradients=gradients,
         volume=volume,
@@ -189,7 +194,16 @@ def build_scene(
         viscosity=rates[0],
         volume_viscosity=rates[1],
         slowing=slowing,
+        patches=patches,
     )
+
+
+def patch_means(patches: Tensor, values: Tensor, volume: Tensor) -> Tensor:
+    """Means by volume of values [..., T] over each patch [T], for each tet [..., T]."""
+    parts = torch.stack(torch.broadcast_tensors(values * volume, volume))
+    sums = parts.new_zeros(*parts.shape[:-1], int(patches.max()) + 1 if len(patches) else 0)
+    total, whole = sums.index_add(-1, patches, parts)[..., patches]
+    return total / whole
 
 
 def shape_functions(points: Tensor, tets: Tensor) -> tuple[Tensor, Tensor]:

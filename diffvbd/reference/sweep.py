@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
-from .couplings import Bound, energies_of_sweeps
+from .couplings import Bounds, energies_of_sweeps
 from .energies import StableNeoHookean, Viscosity, build_energies, floor_friction, rates
 from .rigid import Correction
 from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
@@ -184,7 +184,7 @@ def stepper(
                 return state
             if bound is not None and count:
                 renew(state)
-                state = correct(state, y, x_prev) if begun_sweeps else state
+                state = correct(state, y, x_prev) if begun_sweeps and bound.couplings is not None else state
                 begun_sweeps.append(True)
             renew(state)
             usual = max(count - 1, 0) if ends else count
@@ -210,7 +210,7 @@ def _in_cycles(
     y: Tensor,
     x_prev: Tensor,
     steps: Tensor | None,
-    bound: Bound | None = None,
+    bound: Bounds | None = None,
 ) -> tuple[Tensor, Tensor]:
     """All sweeps of a step. With corrections a sweep, then a correction and up to `every` sweeps, until all are done;
     or a correction alone.

@@ -374,10 +374,12 @@ def mechanical_energy(model: System, prepared: Prepared, x: Tensor, v: Tensor, e
 
     With the rest scalars k_ab and c6 of docs/method.md, section 2, E = -mu/2 sum_ab k_ab |x_a - x_b|^2
     + V [(mu + lam)/2 (J - 1)^2 - mu (J - 1) - 3/2 mu], J = c6 det(x_1 - x_0, x_2 - x_0, x_3 - x_0), V = 1/(6 c6).
+    Patches have lam / 2 V_P (J_P - 1)^2 in place of the sum of V lam / 2 (J - 1)^2.
     """
     x, v = (t.reshape(-1, *t.shape[-2:]).double() for t in (x, v))
     moving = 0.5 * (_free_mass(model, prepared) * v.square().sum(-1)).sum(-1)
     total, rows = torch.zeros_like(moving), x.permute(2, 0, 1).contiguous()  # [3, B, V]
+    changes: list[Tensor] = []
     for mu, lam, rest, tets in _elastic_of(model, prepared) if elastic is None else elastic:
         corners = rows[:, :, tets].transpose(1, 2)  # [3, 4, B, t]: long rows are quick
         edges = corners[:, 1:] - corners[:, :1]
@@ -386,8 +388,15 @@ def mechanical_energy(model: System, prepared: Prepared, x: Tensor, v: Tensor, e
         c6 = rest[6]
         change = c6 * (edges[:, 0] * torch.linalg.cross(edges[:, 1], edges[:, 2], dim=0)).sum(0) - 1
         volume = 1 / (6 * c6)
-        density = 0.5 * mu * (shear - 3 * volume) + volume * (0.5 * (mu + lam) * change.square() - mu * change)
+        stiffness = mu + lam if model.patches is None else mu
+        density = 0.5 * mu * (shear - 3 * volume) + volume * (0.5 * stiffness * change.square() - mu * change)
         total = total + density.sum(-1)
+        changes.append(change)
+    if model.patches is not None and prepared.averaged is not None:
+        lam, c6 = (t.double() for t in prepared.averaged)
+        change = torch.cat(changes, -1)
+        weight = model.patches.sum((lam / (6 * c6)).expand(change.shape))
+        total = total + 0.5 * (weight * model.patches.mean(change, c6).square()).sum(-1)
     return moving + total
 
 

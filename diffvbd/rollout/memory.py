@@ -79,6 +79,8 @@ def memory(
     per_step += scenes * coarse_scalars(model, sweeps) * item
     if model.couplings:  # each sweep has its own start and record, and free bodies a correction of their own
         per_step += scenes * sweeps * (23 if model.corrects else 12) * model.num_vertices * item
+    if model.patches is not None:  # each sweep has its own start and law
+        per_step += scenes * sweeps * (9 * model.num_tets + 3 * model.num_vertices) * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
@@ -119,6 +121,7 @@ def memory(
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
     parts += () if model.coarse is None else (model._coarse_plan,)
+    parts += () if model.patches is None else ((model.patches.label,), *model.patches[1:])
     tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
     return {"model": sum(t.numel() * t.element_size() for t in tensors), "tape": tape_bytes, "step": per_step,
             "kept": kept, "scratch": scratch, "total": kept + scratch}  # fmt: skip

@@ -35,6 +35,9 @@ FIRST_SHIFT, LAST_SHIFT, RAISED = 1e-6, 1e3, 10.0  # of the diagonal
 PATIENCE = 100  # iterations of one increment of the load
 MOST_PARTS = 64
 INCREMENT = 1e-3  # residual at which the next increment follows
+STAGES = (20.0, 100.0, 500.0, 2500.0)  # lam over mu, of bodies with patches that are less compressible in the end
+TRIAL = 12  # iterations before stages
+LEAST_SHEAR = 1e-300  # [Pa] of a quotient
 SMALL_STRAIN = 1e-5  # whose forces stand for those of a state without any, far below the strains of a scene
 WHOLE = 1 - 1e-9  # a fraction of 1, but for rounding
 FAR = 1e4  # extents of the scene
@@ -66,16 +69,48 @@ def find_rest(model: System, x: Tensor, held: Tensor, given: Statics, limits: Li
     Loads and pinned positions go there in so many parts, and in twice as many in scenes where that does not converge or
     turns tets inside out that were not before.
     """
-    rest = _in_increments(model, x, held, given, limits, parts)
+    staged = parts == 1 and model.patches is not None and model.num_tets > 0
+    rest = (_in_stages if staged else _in_increments)(model, x, held, given, limits, parts)
     rest = rest._replace(turned=_inside_out(model, rest.x, given) & ~_inside_out(model, x, given))
     bad = (~rest.converged | rest.turned) & ~rest.unbounded
     limits = limits._replace(iterations=limits.iterations - rest.iterations, before=limits.before + rest.iterations)
     if parts >= MOST_PARTS or limits.iterations <= 0 or not bool(bad.any()):
         return rest
-    some = Statics(*(t if len(t) == 1 else t[bad] for t in given))
-    again = find_rest(model, x[bad], held[bad], some, limits, 2 * parts)
-    tensors = (old.index_put((bad,), new) for old, new in zip(rest[:-1], again[:-1], strict=True))
+    return _with(rest, bad, find_rest(model, x[bad], held[bad], _of(given, bad), limits, 2 * parts))
+
+
+def _of(given: Statics, scenes: Tensor) -> Statics:
+    """Of some scenes, bool [B]."""
+    return Statics(*(t if len(t) == 1 else t[scenes] for t in given))
+
+
+def _with(rest: Rest, scenes: Tensor, again: Rest) -> Rest:
+    """The rest states with those of some scenes exchanged, bool [B]; all iterations count."""
+    tensors = (old.index_put((scenes,), new) for old, new in zip(rest[:-1], again[:-1], strict=True))
     return Rest._make([*tensors, rest.iterations + again.iterations])
+
+
+def _in_stages(model: System, x: Tensor, held: Tensor, given: Statics, limits: Limits, parts: int) -> Rest:
+    """Of a Model with patches. Where the first iterations do not do, by way of less lam: volumes that are kept only
+    nearly let shapes change in few iterations, and shapes hardly change as lam rises. With lam at once each iteration
+    may only go as far as a straight step keeps volumes."""
+    most = (given.lam / given.mu.clamp(min=LEAST_SHEAR)).amax()
+    stages = [stage for stage in STAGES if bool(most > 2 * stage)]
+    first = limits._replace(iterations=min(TRIAL, limits.iterations)) if stages else limits
+    tried = _in_increments(model, x, held, given, first, parts)
+    bad, count = ~tried.converged & ~tried.unbounded, 0
+    if not stages or not bool(bad.any()) or tried.iterations >= limits.iterations:
+        return tried
+    at, held, given, goal = x[bad], held[bad], _of(given, bad), max(limits.tolerance, INCREMENT)
+    limits = limits._replace(iterations=limits.iterations - tried.iterations, before=limits.before + tried.iterations)
+    for stage in stages:  # one bound for all tets, so that lam stays alike within a patch
+        soft = given._replace(lam=torch.minimum(given.lam, stage * given.mu.amax(-1, keepdim=True)))
+        left = limits._replace(iterations=max(limits.iterations - count, 1), before=limits.before + count)
+        rest = _in_increments(model, at, held, soft, left._replace(tolerance=goal), parts)
+        at, count = torch.where(rest.converged[:, None, None], rest.x, at), count + rest.iterations
+    left = limits._replace(iterations=max(limits.iterations - count, 1), before=limits.before + count)
+    rest = _in_increments(model, at, held, given, left, parts)
+    return _with(tried, bad, rest._replace(iterations=count + rest.iterations))
 
 
 def _in_increments(model: System, x: Tensor, held: Tensor, given: Statics, limits: Limits, parts: int) -> Rest:

@@ -15,6 +15,7 @@ from .._common.checks import check_bool, check_positive, fail, to_float
 from .._common.constants import ELASTIC
 from .._common.context import Finer, record_to, refined
 from .._common.messages import percent
+from ..energies import StableNeoHookean
 from ..mesh import subdivide
 from ..model.model import Model
 from ..model.solver import VBD
@@ -444,11 +445,15 @@ class Halved(NamedTuple):
 
 
 def halved(model: Model) -> Halved:
-    """Raises ValueError for a Model with an energy that has data of each vertex, such as an Anchor."""
+    """Raises ValueError for a Model with an energy that has data of each vertex, such as an Anchor, or labels of
+    tets."""
     for energy in model.vertex_energies:
         if energy.per_vertex:
             kind = type(model.couplings[0] if model.couplings else energy).__name__
             fail("mesh", f"False: the {kind} acts on vertices, which a finer mesh has not", "True")
+    for energy in model.energies:
+        if isinstance(energy, StableNeoHookean) and isinstance(energy.patches, Tensor):
+            fail("mesh", 'False: a finer mesh has other patches than the labels; take patches="auto"', "True")
     return model.derived("halved", lambda: _halved(model))
 
 

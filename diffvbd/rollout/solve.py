@@ -90,8 +90,8 @@ def solve(
             on CUDA waits for the device; later looks are further apart, at most a quarter of the sweeps so far.
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
         adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
-            the same sweeps again and differentiate them. With contact ReverseSweep(), and no other; with springs,
-            tendons or pressure not GlobalAdjoint(), and ReverseSweep() by default.
+            the same sweeps again and differentiate them. With contact ReverseSweep(), and no other; with patches,
+            springs, tendons or pressure not GlobalAdjoint(), and ReverseSweep() by default.
         progress: Print each look at the residual, by the logger "diffvbd".
 
     Returns:
@@ -101,7 +101,7 @@ def solve(
         ValueError, TypeError: As :func:`diffvbd.step`.
         RuntimeError: Where the sweeps do not converge.
         NotImplementedError: For another adjoint than ReverseSweep with contact or friction; for GlobalAdjoint with
-            springs, tendons or pressure.
+            patches, springs, tendons or pressure.
 
     Source: paper, eq. 1; docs/adjoints.md.
     """
@@ -110,7 +110,7 @@ def solve(
     lead, system, scheme = check_state(model, x, v), system_for(model, solver), solver.integrator
     if isinstance(scheme, BDF2):
         fail("solver", "ImplicitEuler() or SDIRK2() in a step: BDF2() needs the step before", "BDF2()")
-    if adjoint is None and not (model.touches or model.couplings):
+    if adjoint is None and not (model.touches or model.renews):
         adjoint = GlobalAdjoint()
     adjoint = check_adjoint(adjoint, solver.tape)
     if check_positive("tolerance", tolerance) >= 1:

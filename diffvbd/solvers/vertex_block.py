@@ -272,6 +272,8 @@ def check_elastic(model: Model) -> None:
     names = [type(energy).__name__ for energy in model.energies]
     if len(names) != 1 or not isinstance(model.energies[0], StableNeoHookean):
         fail("model", "a StableNeoHookean as its only energy", f"{names or 'none'}")
+    if model.patches is not None:
+        fail("model", "a StableNeoHookean without patches", repr(model.energies[0]))
 
 
 def _shaped(parameters: Tensors) -> Tensors:

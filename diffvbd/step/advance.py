@@ -94,14 +94,14 @@ def swept(
         if colliders is not None:
             with out_of_memory_named(model, begun.x_start, settings, policy):
                 return run_contact(model, begun, prepared, *colliders, policy, debug_step)
-        if checking() and begun.y.is_cuda and begun.record is None:
+        if checking() and begun.y.is_cuda and not begun.renews:
             check_on_cpu(model, fields, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            if begun.record is not None:
-                end, found = sweep_renewed(model, begun.record, fields, settings, policy, debug_step,
+            if begun.renews:
+                end, found = sweep_renewed(model, begun.renewed, fields, settings, policy, debug_step,
                                            lambda x: begun.corrected(x, model, prepared))  # fmt: skip
                 corrections = torch.cat([end.new_empty((len(end), 0, 0)), *found][bool(found) :], 1)
             else:
@@ -120,6 +120,7 @@ def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
+    simple = simple and not model.renews
     simple = simple and not model.corrects and model.coarse is None and model.starts_from == "predictor"
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False

@@ -36,6 +36,7 @@ from ..energies import VERTEX_ENERGIES
 from ..model.inputs import inputs_of, parameters_of
 from ..model.material import deformed, determinant, lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
+from ..model.patches import Averaged, uniform
 from ..model.solver import SDIRK2, Integrator
 from ..model.system import System
 from .coarse import CoarseParts, coarse_parts
@@ -94,6 +95,7 @@ class Prepared(NamedTuple):
     euler: Tensor | None = None  # bool [B, V]: vertices that take implicit Euler in a step of another scheme
     damping: Damping | None = None  # of the material, and drag; damped() has put them into the rest
     drag: Drag | None = None
+    averaged: Averaged | None = None  # of a Model with patches: its law at rest, without viscosity
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -242,9 +244,15 @@ def prepare(
     materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
-    if model.couplings and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
-        raise NotImplementedError(f"adjoint: expected ReverseSweep or Unrolled with {model.couplings[0]}, got "
+    if model.renews and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
+        raise NotImplementedError(f"adjoint: expected ReverseSweep or Unrolled with {what_renews(model)}, got "
                                   "GlobalAdjoint")  # fmt: skip
+    averaged = None
+    if model.patches is not None:
+        if model.block == "paper":
+            fail("solver", 'block="exact" with patches', 'block="paper"')
+        averaged = uniform(model.patches, materials[1], model.rest_scalars if rest is None else rest)
+        materials[1] = averaged.lam
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
@@ -267,7 +275,13 @@ def prepare(
         coarse=coarse,
         unrolled=unrolled,
         damping=damping,
+        averaged=averaged,
     )
+
+
+def what_renews(model: Model) -> str:
+    """The energy of a Model whose bound sweeps begin with anew."""
+    return repr(model.couplings[0]) if model.couplings else "patches of tets"
 
 
 def _stress_free(given: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:

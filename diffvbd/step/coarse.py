@@ -92,8 +92,13 @@ def coarse_parts(model: System, mu: Tensor, lam: Tensor, mass: Tensor | None, re
             own = corners is None
             shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)
             stiffness = coarse_stiffness(plan, mu, least, *shapes)
-        lanes = plan.rest if rest is None else rest.detach()[:, plan.tet].transpose(-1, -2).contiguous()
+        lanes = plan.rest if rest is None else in_lanes(model, rest)
         return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes)
+
+
+def in_lanes(model: System, rest: Tensor) -> Tensor:
+    """Rest scalars [1 | B, T, 7] as the corrections read them [1 | B, blocks, 7, lanes]."""
+    return rest.detach()[:, model._coarse_plan.tet].transpose(-1, -2).contiguous()
 
 
 def _unit_stiffness(model: System) -> Tensor:

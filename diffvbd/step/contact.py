@@ -59,8 +59,9 @@ class ContactStep:
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
-        if prepared.settings.sweeps == 0 and self._reads(self.x_prev):  # for what sweeps raise
-            plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=())
+        unchecked = prepared.settings.sweeps == 0 or begun.law is not None
+        if unchecked and self._reads(self.x_prev):  # for what sweeps raise
+            plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=(), sweeps=0)
             with torch.no_grad():
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
         self.substeps = (None if self.barrier is None else self.barrier.detections) or 1
@@ -225,7 +226,8 @@ class ContactStep:
     @functools.cached_property
     def increase_inputs(self) -> IncreaseInputs:
         """Common data of the step's comparisons of potentials."""
-        return increase_inputs(self.model, self.fields, self.prepared.settings.numbers.time_step)
+        return increase_inputs(self.model, self.fields, self.prepared.settings.numbers.time_step,
+                               self.prepared.averaged)  # fmt: skip
 
     def _inverted(self, x: Tensor) -> Tensor:
         """Scenes with an inverted tet, bool [B]."""
@@ -269,7 +271,7 @@ class ContactStep:
     def _sweep(self, x: Tensor, center: Tensor, trust_radius: Tensor, collider: Tensor, listed: Pairs,
                settings: SweepSettings, policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
-        if self.begun.record is not None and settings.sweeps > 1:  # each with the couplings about its own start
+        if self.begun.renews and settings.sweeps > 1:  # each with the bounds about its own start
             numbers, limits = settings.numbers, []
             within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
             for n in range(settings.sweeps):
@@ -277,11 +279,12 @@ class ContactStep:
                 x, limit = self._sweep(x, center, trust_radius, collider, listed, one, policy, debug_step)
                 limits.append(limit)
             return x, torch.cat(limits, 1)
-        fields = replaced(self.fields, x_start=x, energy_data=self.begun.at(x).data, center=center,
-                          trust_radius=trust_radius, collider=collider, collider_prev=self.before, kappa=self.kappa,
-                          **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr,
-                          lag_entry=lagged.entry, floor_lag=self.floor_lag)  # fmt: skip
-        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
+        fields = replaced(self.fields, **{"energy_data": self.begun.data, **self.begun.renewed(x)}, x_start=x,
+                          center=center, trust_radius=trust_radius, collider=collider, collider_prev=self.before,
+                          kappa=self.kappa, **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs,
+                          lag_ptr=lagged.ptr, lag_entry=lagged.entry, floor_lag=self.floor_lag)  # fmt: skip
+        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
+                     checked=self.begun.law is None)[:2]  # fmt: skip
 
     def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> Detection:
         """Pairs that can matter for a motion from x."""
@@ -446,9 +449,10 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
     for n, count in enumerate(cycles):
         ends = n + 1 == len(cycles)
         if matrix is not None and n:
-            if corrections is None or of.begun.record is not None:
+            if corrections is None or of.begun.renews:
                 fields = touching(of, x, collider, start, listed)
-                corrections = Corrections(of.model, of.fields, fields, matrix, settings.numbers)
+                own = of.fields if of.begun.law is None else replaced(of.fields, **of.begun.renewed(x))
+                corrections = Corrections(of.model, own, fields, matrix, settings.numbers)
             x, length = corrections.correct(x)
             lengths.append(length)
         x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))

@@ -1,4 +1,5 @@
-"""Couplings in a step: their bound about a state as data of the sweeps, and sweeps that renew it (couplings.py)."""
+"""Couplings in a step: their bound about a state as data of the sweeps (couplings.py); and sweeps that renew bounds,
+those of patches, too (model/patches.py)."""
 
 from __future__ import annotations
 
@@ -13,9 +14,11 @@ from .._common.checks import input_name
 from .._common.context import replaced
 from ..model.system import System
 from ..ops.sweep import sweep
+from .coarse import in_lanes
 
 COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 Record = Callable[[Tensor], Tensor]  # of a state [B, V, 3]: data of the energies [B, n]
+Law = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]  # of a state: mu, lam [B, T], rest scalars [B, T, 7]
 
 
 def parameters_at(model: System, given: dict[str, Tensor], scenes: int) -> list[dict[str, Tensor]]:
@@ -57,10 +60,12 @@ def _refreshed(model: System, values: list[dict[str, Tensor]], data: Tensor, ori
     return torch.cat([data[:, :others], anchors.flatten(1)], 1)
 
 
-def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settings: ops.SweepSettings, policy: int,
-                  debug_step: int, corrected: Callable[[Tensor], Tensor]) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
-    """Positions after the sweeps and their corrections, each with the record of the state that it begins at; and what
-    the coarse ones did. Free bodies, which may pull each other, are ``corrected`` before each sweep but the first."""
+def sweep_renewed(model: System, renewed: Callable[[Tensor], dict[str, Tensor]], fields: ops.SweepFields,
+                  settings: ops.SweepSettings, policy: int, debug_step: int, corrected: Callable[[Tensor], Tensor]
+                  ) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
+    """Positions after the sweeps and their corrections, each with the fields that are ``renewed`` at the state that it
+    begins at; and what the coarse ones did. Free bodies that couplings may pull together are ``corrected`` before each
+    sweep but the first."""
     numbers, coarse = settings.numbers, () if fields.coarse_plan is None else settings.coarse
     last = replaced(settings, coarse=(), sweeps=1)
     within = replaced(last, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
@@ -68,8 +73,17 @@ def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settin
     x, corrections = fields.x_start, []
 
     def run(x: Tensor, fields: ops.SweepFields, settings: ops.SweepSettings) -> Tensor:
-        now = replaced(fields, x_start=x, energy_data=record(x))
         first = x is fields.x_start  # looks at the values that all others have, too
+        changes = renewed(x)
+        if fields.coarse_rest is not None and "rest" in changes:
+            changes["coarse_rest"] = in_lanes(model, changes["rest"])
+        now = replaced(fields, x_start=x, **changes)
+        if first and "mu" in changes and not x.is_cuda:  # of a bound moduli may be negative, the given ones may not
+            data = changes.get("energy_data", fields.energy_data)
+            with torch.no_grad():
+                sweep(replaced(plain, x_start=x, energy_data=data), model._packed_rest, model._plan,
+                      replaced(last, sweeps=0), tape_policy=ops.NO_TAPE, debug_step=debug_step)  # fmt: skip
+            first = False
         end, _, done = sweep(now, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
                              checked=first)  # fmt: skip
         corrections.extend([done] if done.numel() else [])
@@ -81,7 +95,7 @@ def sweep_renewed(model: System, record: Record, fields: ops.SweepFields, settin
     for n in range(settings.sweeps):
         if coarse and n and (n - 1) % coarse.every == 0:
             x = coarsely(x)
-        x = corrected(x) if n else x
+        x = corrected(x) if n and model.couplings else x
         x = run(x, plain, last if n + 1 == settings.sweeps else within)
     if coarse and settings.sweeps <= 1:
         x = coarsely(x)

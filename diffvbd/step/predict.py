@@ -15,11 +15,12 @@ from .._common.checks import input_name
 from .._common.constants import ELASTIC, FILTER_ETA
 from .._common.context import replaced
 from ..model.bodies import Bodies, OtherBodies
+from ..model.patches import law_at
 from ..model.system import System
 from ..ops import STARTS, distinct
 from ..ops.contact import join_data
 from .arguments import LOOKBACK, Prepared, broadcastable
-from .couplings import Record, record_of
+from .couplings import Law, Record, record_of
 
 
 def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -48,15 +49,25 @@ class Begun(NamedTuple):
     origin: Tensor | None
     h2a: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
     record: Record | None = None  # of a Model with couplings: data with their bound about a state
+    law: Law | None = None  # of a Model with patches: the bound of their energy about a state
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
-                     self.h2a.detach(), self.record)  # fmt: skip
+                     self.h2a.detach(), self.record, self.law)  # fmt: skip
 
     def at(self, x: Tensor) -> Begun:
         """The same with the bound of couplings about a state x [B, V, 3]."""
         return self if self.record is None else replaced(self, data=self.record(x))
+
+    @property
+    def renews(self) -> bool:
+        return self.record is not None or self.law is not None
+
+    def renewed(self, x: Tensor) -> dict[str, Tensor]:
+        """Fields of the sweeps that are bounds about a state x [B, V, 3]."""
+        out = {} if self.record is None else {"energy_data": self.record(x)}
+        return out if self.law is None else out | dict(zip(("mu", "lam", "rest"), self.law(x), strict=True))
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
@@ -112,25 +123,33 @@ def begin(
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
     record = record_of(model, prepared.parameters, data, origin, flat[0])
-    if record is not None:  # at the predictor a body that flies or falls as a whole has the right forces
+    law, moduli, at = None, (prepared.mu, prepared.lam, prepared.rest), start
+    if prepared.averaged is not None:
+        rest = model.rest_scalars if prepared.rest is None else prepared.rest
+        law = partial(law_at, model, prepared.averaged, prepared.mu, prepared.lam, rest)
+    if record is not None or law is not None:
+        # at the predictor a body that flies or falls as a whole has the right forces
         held = start if prescribed is None else prescribed
-        data = record(torch.where(model._pinned[:, None], held, start + h * velocity + (h * h) * acceleration))
+        at = torch.where(model._pinned[:, None], held, start + h * velocity + (h * h) * acceleration)
+    if record is not None:
+        data = record(at)
     filters = model.floor is not None and model.contact is None
     # one sweep would not bring the vertices of a body together again
     sweeps = prepared.settings.sweeps * min(model.relaxation, 1.0)
     parts = filters and model.corrects and sweeps >= 2
     rest = None
     if (model.starts_from == "auto" or parts) and model.energy_mask & ELASTIC:
-        rest = model.rest_scalars if prepared.rest is None else prepared.rest
+        moduli = moduli if law is None else law(at.detach())
+        rest = model.rest_scalars if moduli[2] is None else moduli[2]
     begins = partial(
-        start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, prepared.lam,
+        start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, *moduli[:2],
         rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
         start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
     x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
         x_start = torch.where(prepared.euler[..., None], begins(lookback=LOOKBACK)[0], x_start)
-    return Begun(x_start, start, y, data, origin, (h * h) * acceleration, record)
+    return Begun(x_start, start, y, data, origin, (h * h) * acceleration, record, law)
 
 
 # --- start of a step --------------------------------------------------------------------------------------------------

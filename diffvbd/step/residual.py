@@ -18,7 +18,7 @@ from ..model.material import shape_gradients
 from ..model.model import Model
 from ..model.moving import moving_vertices
 from ..model.system import System
-from ..ops.sums import segment_sum
+from ..ops.sums import Rows, segment_sum
 from ..ops.sweep import sweep
 from .arguments import Prepared, acceleration_of, collider_state
 from .coarse import lengths_of, with_corrections
@@ -52,8 +52,8 @@ def potential_of_step(
     """The potential of a step that has begun, at x [B, V, 3], relative to the step's origin where there is one."""
     fields = begun.at(x).fields(model, prepared)
     if contact is None:
-        return IncrementalPotential(model, x, fields, prepared.settings.numbers.time_step)
-    return ContactPotential(model, x, fields, contact)
+        return IncrementalPotential(model, x, fields, prepared.settings.numbers.time_step, prepared.averaged)
+    return ContactPotential(model, x, fields, contact, prepared.averaged)
 
 
 def of_scenes(values: Tensor) -> Tensor:
@@ -182,9 +182,14 @@ def _stiffness(model: System, of: _Functions, mu: Tensor, lam: Tensor) -> np.nda
         tets = model._topology[0][of.tets[first : first + CHUNK]]
         gradients, volume = shape_gradients(model._rest_points[tets].double())
         slopes = (gradients.mT @ values[tets]).flatten(1)  # of each function along each axis, [t, 3 f]
-        for total, modulus in ((shear, mu), (bulk, lam)):
+        means = slopes
+        if (patches := model.patches) is not None:  # whose volumes lam acts on
+            own = torch.unique(patches.label[of.tets[first : first + CHUNK]], return_inverse=True)[1]
+            rows = Rows.of(own, int(own.max()) + 1)
+            means = rows.gather(rows.sum((slopes * volume[:, None])[None]) / rows.sum(volume[None, :, None]))[0]
+        for total, modulus, slope in ((shear, mu, slopes), (bulk, lam, means)):
             part = modulus if len(modulus) == 1 else modulus[first : first + CHUNK]
-            total += (slopes * (volume * part)[:, None]).T @ slopes
+            total += (slope * (volume * part)[:, None]).T @ slope
     sheared, pressed = (m.reshape(3, count, 3, count).cpu().numpy() for m in (shear, bulk))
     out = pressed + sheared.transpose(2, 1, 0, 3)
     for c in range(3):
@@ -326,8 +331,9 @@ class ErrorEstimate(NamedTuple):
 
 def check_estimable(model: Model, name: str) -> None:
     """Raises where steps of the Model have no estimate; ``name``: of the argument that asks for one."""
-    if model.touches or model.couplings:
-        what = "contact or friction" if model.touches else "springs, tendons or pressure"
+    if model.touches or model.renews:
+        others = "springs, tendons or pressure" if model.couplings else "patches"
+        what = "contact or friction" if model.touches else others
         raise NotImplementedError(f"{name}: the error of a step with {what} is not estimated")
 
 

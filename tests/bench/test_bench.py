@@ -134,3 +134,11 @@ def test_a_forward_that_differs_is_refused() -> None:
     assert exactness.verified_forward(got, expected, h, OURS) <= tolerance("forward")
     with pytest.raises(RuntimeError, match="reverse sweep: expected the reference's end state"):
         exactness.verified_forward({**got, "x": got["x"] + 1e-12}, expected, h, OURS)
+
+
+def test_patches_deflect_more_than_plain_tets(quick: Callable[[str], dict[str, Any]]) -> None:
+    results = quick("locking")["results"]
+    rows = [*results["cantilever"], *results["cook"]]
+    assert rows and all(1.1 < row["patches"] / row["plain"] < 1.8 for row in rows)
+    assert all(abs(row["stress_along"] - 1) < 1e-4 > abs(row["across_over_along"]) for row in results["small_strain"])
+    assert {row["law"] for row in results["sweeps"]} == {"plain", "patches"}
