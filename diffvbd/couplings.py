@@ -44,6 +44,7 @@ class Coupling:
 
     name: ClassVar[str]
     bit: ClassVar[int] = 0  # of a scene's mask: it reaches the kernels as the record of an Anchor
+    strength: ClassVar[str] = "stiffness"  # the parameter in which the energy is linear, gas but for ambient
     parameters: ClassVar[dict[str, int]]  # as of VertexEnergy
     units: ClassVar[dict[str, str]]
 
@@ -79,6 +80,10 @@ class Coupling:
 
         x: [B, V, 3] [m].  values: parameters by key, [B, ...].
         """
+        raise NotImplementedError
+
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        """Terms [J] whose sum is the energy of a scene, but for a constant, [B, n]; arguments as of load()."""
         raise NotImplementedError
 
     def _take_numbers(self) -> None:
@@ -210,11 +215,17 @@ class Springs(Coupling):
         weights = np.concatenate([sign * end.weights.numpy() for end, sign in ends], -1)
         return self._with(_ends=_Differences.of(index[:, None], weights[:, None], pinned))
 
+    def _vectors(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        d = self._ends.take(x)[:, :, 0]
+        return d - values["points"] if "points" in values else d
+
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        longer = _length(self._vectors(x, values))[0] - values["rest_length"]
+        return values["stiffness"] / 2 * (longer.clamp(min=0) if self.tension_only else longer).square()
+
     def pull(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Gradient of each spring with respect to p - q, [B, S, 3]: the force on q, and against that on p."""
-        d = self._ends.take(x)[:, :, 0]
-        if "points" in values:
-            d = d - values["points"]
+        d = self._vectors(x, values)
         # at d = 0 the derivative is that of an attachment
         rate = values["stiffness"] * (1 - values["rest_length"] * _length(d)[1])
         return (rate.clamp(min=0) if self.tension_only else rate)[..., None] * d
@@ -313,6 +324,10 @@ class Tendons(Coupling):
     def _tension(self, length: Tensor, values: dict[str, Tensor]) -> Tensor:
         return values["stiffness"] * (length.sum(-1) - values["rest_length"]).clamp(min=0)
 
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        longer = _length(self._segments.take(x))[0].sum(-1) - values["rest_length"]
+        return values["stiffness"] / 2 * longer.clamp(min=0).square()
+
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         d, own = self._segments.take(x), self._own
         length, inverse = _length(d)
@@ -385,6 +400,7 @@ class Pressure(Coupling):
     name: ClassVar[str] = "pressure"
     parameters: ClassVar[dict[str, int]] = {"pressure": 1}
     units: ClassVar[dict[str, str]] = {"pressure": "Pa"}
+    strength: ClassVar[str] = "pressure"
 
     surfaces: ClassVar[tuple[IntArray, ...]]  # in a Model: the triangles of each cavity, normals into the walls
     _surfaces: ClassVar[_Surfaces]
@@ -471,6 +487,14 @@ class Pressure(Coupling):
             return values["pressure"]
         return (values["pressure"] + self.ambient) * self._rest_volume.to(volume.dtype) / volume - self.ambient
 
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        volume = self._faces(x)[0]
+        if not self.gas:
+            return -values["pressure"] * volume
+        rest = self._rest_volume.to(x.dtype)
+        work = (values["pressure"] + self.ambient) * rest * (volume / rest).log()  # not a number where turned inside out
+        return torch.cat([self.ambient * volume, -work], -1)
+
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         s = self._surfaces
         volume, normal = self._faces(x)
@@ -493,3 +517,9 @@ class Pressure(Coupling):
 
 
 COUPLINGS: tuple[type[Coupling], ...] = (Springs, Tendons, Pressure)
+
+
+def load_of(couplings: Sequence[Coupling], values: Sequence[dict[str, Tensor]], x: Tensor) -> Tensor:
+    """The sum of their loads at x [B, V, 3], [B, V, 4]; values: of each one."""
+    parts = [energy.load(x, own) for energy, own in zip(couplings, values, strict=True)]
+    return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]

@@ -17,7 +17,7 @@ from .._common.context import looks_at, replaced, transformed
 from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
-from ..couplings import Pressure, Springs, Tendons
+from ..couplings import Pressure, Springs, Tendons, load_of
 from ..energies import StableNeoHookean
 from ..model.material import deformed, shape_gradients
 from ..model.model import Model
@@ -36,7 +36,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
-from ..step.couplings import load_of, parameters_at
+from ..step.couplings import parameters_at
 from ..step.damping import damped
 from ..step.predict import energy_data
 
@@ -341,7 +341,7 @@ def reactions(
         normal, friction = _contact_at(given, x, previous).on_vertices()
         total = total - normal - friction
     if given.model.couplings:
-        total = total + load_of(given.model, given.parameters(len(at)), at)[..., :3]
+        total = total + load_of(given.model.couplings, given.parameters(len(at)), at)[..., :3]
     acceleration = -full(pull)
     if previous is not None:
         start, speed = (full(t) for t in previous)
@@ -395,7 +395,7 @@ def coupling_forces(model: Model, x: Tensor, **inputs: Any) -> CouplingForces:
     given = widen(model, x, None, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, {}))
     at = x.double().reshape(x.shape[:-2].numel(), *x.shape[-2:])
     values = given.parameters(len(at))
-    found: dict[str, Tensor] = {"vertices": -load_of(given.model, values, at)[..., :3]}
+    found: dict[str, Tensor] = {"vertices": -load_of(given.model.couplings, values, at)[..., :3]}
     for energy, own in zip(given.model.couplings, values, strict=True):
         if isinstance(energy, Springs):
             found["springs"] = -energy.pull(at, own)

@@ -22,6 +22,7 @@ from .._common.messages import page, warn
 from ..adjoint.implicit import solve_adjoint
 from ..adjoint.routes import GlobalAdjoint
 from ..adjoint.statics import StaticPotential, Statics, newton_operators
+from ..couplings import Pressure
 from ..model.inputs import parameter_of
 from ..model.model import Model
 from ..model.solver import VBD
@@ -38,6 +39,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
+from ..step.couplings import parameters_at
 from ..step.predict import energy_data
 from ..step.warnings import system_for
 from .newton import Limits, Rest, find_rest
@@ -138,9 +140,6 @@ def _statics(model: System, x: Tensor, lead: tuple[int, ...], inputs: dict[str, 
     """Where pinned vertices are held [B, V, 3] [m], and what the potential depends on; differentiable."""
     sorted_inputs = given_of(model, inputs)
     material, parameters, loads = sorted_inputs
-    if model.couplings:
-        raise NotImplementedError("model: expected one without springs, tendons and pressure, got one with "
-                                  f"{model.couplings[0]}; take a rollout of long steps until it rests")  # fmt: skip
     for name in ("colliders_before", *VISCOSITIES, "drag"):
         if {**loads, **material}[name] is not None:
             fail(name, "none: at rest nothing has moved", "a value")
@@ -167,8 +166,16 @@ def _statics(model: System, x: Tensor, lead: tuple[int, ...], inputs: dict[str, 
     kappa = parameter_of(model, prepared.parameters, "pair_kappa")
     given = Statics(load, prepared.mu, prepared.lam, model.rest_scalars if prepared.rest is None else prepared.rest,
                     energy_data(model, prepared, None), x.new_zeros((flat[0], 0, 3)) if colliders is None else
-                    colliders[1], x.new_zeros((1,)) if kappa is None else kappa)  # fmt: skip
+                    colliders[1], x.new_zeros((1,)) if kappa is None else kappa,
+                    _couplings(model, prepared.parameters, flat[0]))  # fmt: skip
     return held.double(), Statics(*(t.double() for t in given))
+
+
+def _couplings(model: System, given: dict[str, Tensor], scenes: int) -> Tensor:
+    """The parameters of all couplings [B, n]."""
+    values = parameters_at(model, given, scenes)
+    flat = [value.flatten(1) for own in values for value in own.values()]
+    return torch.cat(flat, 1) if flat else model._mass.new_zeros((1, 0))
 
 
 class _Rest(Function):
@@ -190,7 +197,7 @@ class _Rest(Function):
         if is_batched(x_bar):
             raise NotImplementedError("equilibrium: expected gradients one at a time, got batched ones "
                                       "(is_grads_batched)")  # fmt: skip
-        needs = ctx.needs_input_grad[:8]
+        needs = ctx.needs_input_grad[: 1 + len(Statics._fields)]
         return of_inputs(_RestBackward.apply(x_bar, *ctx.saved_tensors, ctx.model, ctx.adjoint, needs), needs, 4)
 
 
@@ -226,7 +233,9 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
         if bool(below.any()):
             fail("x", "every unpinned vertex above the floor", f"one at or below it, [scene, vertex] "
                  f"{below.nonzero()[0].tolist()}")  # fmt: skip
-    if model.floor is not None or model.contact is not None:
+    if not bool(torch.isfinite(at.coupling_terms).all()):
+        fail("x", "cavities of positive volume, for their gas", "one without")
+    if model.floor is not None or model.contact is not None or not all(isinstance(e, Pressure) for e in model.couplings):
         return  # which may come to hold a body
     labels, blocks = model.body, at.vertex_blocks()
     holds = model._pinned.expand(len(x), -1) if blocks is None else model._pinned | (blocks != 0).any(-1).any(-1)

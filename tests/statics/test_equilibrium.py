@@ -201,11 +201,7 @@ def test_what_swells_freely_ends_without_stress(factor: float, pins: list[int]) 
 
 def test_what_equilibrium_does_not_know_is_refused() -> None:
     mesh = dv.mesh.cube(2, size=0.1)
-    springs = dv.Springs(dv.Embedding.of_vertices([7]), torch.zeros((1, 3), dtype=torch.float64), 10.0)
-    joined = dv.Model(mesh, pinned=[0], energies=(dv.StableNeoHookean(), springs))
     solver = dv.VBD(1.0, 0)
-    with pytest.raises(NotImplementedError, match="model: expected one without springs"):
-        dv.equilibrium(joined, joined.rest_points, solver, mu=1e4, lam=1e4)
     model = dv.Model(mesh, pinned=[0])
     for name in ("viscosity", "drag"):
         with pytest.raises(ValueError, match=f"{name}: expected none: at rest nothing has moved"):
