@@ -24,7 +24,7 @@ from .potential import IncreaseInputs, IncrementalPotential, increase_of_bodies
 
 CLOSED = 0.8  # of a gap, at most, in one iteration
 REACH = 0.5  # of the trust-region radius of steps, which a vertex goes at most in one iteration
-SINGULAR = 1e-14  # of the largest eigenvalue of a coarse matrix; smaller ones count as so large
+SINGULAR = 1e-12  # of the largest eigenvalue of a coarse matrix; smaller ones are rounding of free motions, left alone
 
 
 class Statics(NamedTuple):
@@ -255,7 +255,7 @@ def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[
     matrix = columns.flatten(0, 1).T @ image
     value, vector = torch.linalg.eigh((matrix + matrix.mT) / 2)
     value = value.abs()  # positive definite, whatever the Hessian is
-    value = torch.maximum(value, SINGULAR * value.amax(-1, keepdim=True))
+    value = torch.where(value > SINGULAR * value.amax(-1, keepdim=True), value, torch.inf)
 
     def precondition(r: Tensor) -> Tensor:
         coarse = (weights.T @ r).reshape(scenes, -1, 1)

@@ -22,7 +22,7 @@ from .._common.messages import page, warn
 from ..adjoint.implicit import solve_adjoint
 from ..adjoint.routes import GlobalAdjoint
 from ..adjoint.statics import StaticPotential, Statics, newton_operators
-from ..couplings import Pressure
+from ..couplings import joined
 from ..model.inputs import parameter_of
 from ..model.model import Model
 from ..model.solver import VBD
@@ -78,7 +78,7 @@ def equilibrium(
     progress: bool = False,
     **inputs: Any,
 ) -> Equilibrium:
-    """State of rest near x under gravity, forces, pins, floors, anchors and contact, by Newton's method.
+    """State of rest near x under loads, pins, floors, anchors, couplings and contact, by Newton's method.
 
     What is found is a local minimum of the potential energy, without inertia, and from x downhill: where there are
     several, as after buckling, x decides. Friction and damping have no part in it: a body that only friction would hold
@@ -235,10 +235,13 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
                  f"{below.nonzero()[0].tolist()}")  # fmt: skip
     if not bool(torch.isfinite(at.coupling_terms).all()):
         fail("x", "cavities of positive volume, for their gas", "one without")
-    if model.floor is not None or model.contact is not None or not all(isinstance(e, Pressure) for e in model.couplings):
+    if model.floor is not None or model.contact is not None:
         return  # which may come to hold a body
-    labels, blocks = model.body, at.vertex_blocks()
-    holds = model._pinned.expand(len(x), -1) if blocks is None else model._pinned | (blocks != 0).any(-1).any(-1)
+    labels, holds, blocks = model.body, model._pinned, at.vertex_blocks()
+    if model.couplings and labels.numel():
+        tied = torch.cat([energy.joins()[1] for energy in model.couplings]).to(labels.device)
+        labels, holds = joined(model.couplings, labels), holds.index_fill(0, tied, True)
+    holds = holds.expand(len(x), -1) if blocks is None else holds | (blocks != 0).any(-1).any(-1)
     sums = x.new_zeros((len(x), int(labels.max()) + 1, 4)) if labels.numel() else x.new_zeros((len(x), 0, 4))
     size = given.load.norm(dim=-1, keepdim=True)
     sums = sums.index_add(1, labels, torch.cat([given.load, size], -1))
@@ -247,7 +250,7 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
     falls = ~held & (net > NET * sums[..., 3])
     if bool(falls.any()):
         scene, body = falls.nonzero()[0].tolist()
-        raise RuntimeError(f"equilibrium: expected bodies that are held (pinned, Anchor, FloorBarrier, PairBarrier), "
+        raise RuntimeError(f"equilibrium: expected bodies that are held (pinned, Anchor, Springs, floor, PairBarrier), "
                            f"got body {body} of scene {scene}, which nothing holds against a net load of "
                            f"{float(net[scene, body]):.3g} N: it has no equilibrium")  # fmt: skip
 
