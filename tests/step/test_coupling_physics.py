@@ -11,9 +11,8 @@ from helpers.marks import slow
 
 import diffvbd as dv
 from diffvbd.testing import tolerance
-from diffvbd.testing.soft_scenes import finger, icosphere, pressed_sphere
+from diffvbd.testing.soft_scenes import STILL, finger, icosphere, pressed_sphere
 
-STILL = (0.0, 0.0, 0.0)
 STATIC = dv.VBD(0.9, 200, relaxation=1.5, subspace="coarse")  # a long step: inertia hardly matters
 
 
