@@ -275,3 +275,54 @@ def pressed_sphere(young: float, poisson: float, pressure: float, thickness: flo
     """Growth [m] of the middle radius, 1 m, of a sphere under pressure (Lame's thick sphere)."""
     a, b = 1 - thickness / 2, 1 + thickness / 2
     return pressure * a**3 / (young * (b**3 - a**3)) * ((1 - 2 * poisson) + (1 + poisson) * b**3 / 2)
+
+
+class Linked(NamedTuple):
+    """A finger of three stiff links and two soft hinges, that a tendon along its upper side bends in its plane."""
+
+    model: Model
+    young: Tensor  # [T] [Pa]
+    tip: Tensor  # bool [V], the last link
+    hinge: float = 0.04  # length [m]
+    height: float = 0.01
+    width: float = 0.01
+    soft: float = 1e5  # [Pa]
+
+    @classmethod
+    def of(cls, over_height: int, contrast: float = 100.0) -> Linked:
+        length, link = 0.14, 0.02
+        cells = round(length / cls._field_defaults["height"] * over_height)
+        size = (length, cls._field_defaults["height"], cls._field_defaults["width"])
+        mesh = meshes.beam(cells + 1, over_height + 1, 2, size=size)
+        along = mesh.points[mesh.tets].mean(1)[:, 0]
+        soft = ((along > link) & (along < link + 0.04)) | ((along > 2 * link + 0.04) & (along < length - link))
+        places = [0.0, link, link + 0.04, 2 * link + 0.04, length - link, length]
+        route = Embedding.of_points(mesh, [[x, size[1], size[2] / 2] for x in places])
+        energies = (StableNeoHookean(), Tendons(route, [range(6)], 1e3, length))
+        model = Model(mesh, pinned=mesh.points[:, 0] < link + 1e-9, energies=energies)
+        young = torch.where(torch.from_numpy(soft), 1e5, 1e5 * contrast).double()
+        return cls(model, young, torch.from_numpy(mesh.points[:, 0] > length - link - 1e-9))
+
+    def angle(self, x: Tensor) -> float:
+        """Of the last link, in the plane [rad]."""
+        rest, now = self.model.rest_points[self.tip], x[self.tip]
+        rest, now = rest - rest.mean(0), now - now.mean(0)
+        sine = (rest[:, 0] * now[:, 1] - rest[:, 1] * now[:, 0]).sum()
+        return float(torch.atan2(sine, (rest[:, :2] * now[:, :2]).sum()))
+
+    def balanced(self, tension: float) -> float:
+        """The angle at which moments balance: each hinge is an arc of a beam, and the tendon its chord, above it."""
+        area = self.height * self.width
+        inertia, arm = area * self.height**2 / 12, self.height / 2
+        state = torch.tensor([0.01, 0.0], dtype=torch.float64)  # angle of a hinge, strain of its middle
+
+        def energy(state: Tensor) -> Tensor:
+            angle, strain = state
+            length = self.hinge * (1 + strain)
+            chord = 2 * (length / angle - arm) * torch.sin(angle / 2)
+            bending = inertia * angle**2 / self.hinge**2 + area * strain**2
+            return self.soft * self.hinge / 2 * bending + tension * chord
+
+        for _ in range(30):
+            state = state - torch.linalg.solve(torch.func.hessian(energy)(state), torch.func.grad(energy)(state))
+        return 2 * float(state[0])
