@@ -14,6 +14,7 @@ from torch.linalg import cross
 from .. import ops
 from .._common.checks import check_kind, fail, name_value, real_array
 from .._common.context import looks_at, replaced, transformed
+from .._common.messages import warn
 from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
@@ -25,6 +26,7 @@ from ..model.solver import VBD
 from ..model.system import System, system_of
 from ..step.arguments import (
     COLLIDERS,
+    VISCOSITIES,
     Given,
     Prepared,
     acceleration_of,
@@ -370,6 +372,10 @@ class CouplingForces(NamedTuple):
     volume: Tensor | None
     vertices: Tensor
 
+    def __repr__(self) -> str:
+        own = (f"{name} of shape {list(t.shape)}" for name, t in self._asdict().items() if t is not None)
+        return f"CouplingForces({', '.join(own)})"
+
 
 def coupling_forces(model: Model, x: Tensor, **inputs: Any) -> CouplingForces:
     """Forces of springs and tendons, and pressure and volume of cavities, at x. Differentiable by autograd in every
@@ -415,14 +421,14 @@ class Stress(NamedTuple):
 
 
 def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
-    """Elastic Cauchy stress of each tet and the von Mises stress that follows from it.
+    """Elastic Cauchy stress of each tet and the von Mises stress that follows from it; without that of viscosity.
 
         cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
 
     Args:
         model: A scene with StableNeoHookean tets.
         x: Positions [m], shape [..., V, 3].
-        inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read.
+        inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read. A viscosity is warned of.
 
     Returns:
         A :class:`diffvbd.results.Stress` of x's dtype, differentiable by autograd in every tensor. The
@@ -439,6 +445,9 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
         fail("model", "StableNeoHookean among its energies", "none")
     given_inputs = given_of(model, inputs)
     rest_points, stress_free = (given_inputs.material[name] for name in ("rest_points", "stress_free"))
+    for name in VISCOSITIES:
+        if given_inputs.material[name] is not None:
+            warn(f"{name}: the stress is the elastic one alone; that of viscosity needs a motion and is not in it")
     given = widen(model, x, None, Given(given_inputs.material, {}, {}))
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)

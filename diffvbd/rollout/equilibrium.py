@@ -46,6 +46,7 @@ from .newton import Limits, Rest, find_rest
 
 ROUNDINGS = 4.0  # of a product with the Hessian, that the backward's residual may keep
 NET = 1e-9  # of the sizes of a body's loads, below which their sum counts as zero
+SINGULAR = 1e-14  # determinant of a vertex's block over its trace cubed
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,10 @@ class Equilibrium:
     residual: float
     iterations: int
     converged: bool
+
+    def __repr__(self) -> str:
+        return (f"Equilibrium(x of shape {list(self.x.shape)}, residual={self.residual:.3g}, "
+                f"iterations={self.iterations}, converged={self.converged})")  # fmt: skip
 
 
 def equilibrium(
@@ -226,7 +231,7 @@ class _RestBackward(Function):
 
 
 def _check_start(model: System, x: Tensor, given: Statics) -> None:
-    """Raises where x is below a floor, and for bodies that nothing holds against their loads."""
+    """Raises where x is below a floor, for vertices without stiffness, and for bodies that nothing holds."""
     at = StaticPotential(model, x, given)
     if model.floor is not None:
         below = (model.floor.gaps(x, given.data[:, : model.floor.count()], None)[0] <= 0).any(-1) & (at.free[:, 0] > 0)
@@ -235,6 +240,12 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
                  f"{below.nonzero()[0].tolist()}")  # fmt: skip
     if not bool(torch.isfinite(at.coupling_terms).all()):
         fail("x", "cavities of positive volume, for their gas", "one without")
+    blocks = at.diagonal()
+    size = blocks.diagonal(dim1=-2, dim2=-1).sum(-1)
+    loose = (at.free[:, 0] > 0) & (torch.linalg.det(blocks) <= SINGULAR * size**3)
+    if bool(loose.any()):
+        fail("young, mu or energies", "stiffness at every free vertex, by its tets, an Anchor or springs",
+             f"none at one, [scene, vertex] {loose.nonzero()[0].tolist()}")  # fmt: skip
     if model.floor is not None or model.contact is not None:
         return  # which may come to hold a body
     labels, holds, blocks = model.body, model._pinned, at.vertex_blocks()

@@ -207,6 +207,14 @@ def test_gradient_of_a_viscosity_of_zero_without_shear_modulus() -> None:
     assert float(slope) == pytest.approx(float((loss(at[1]) - loss(at[0])).detach()) / 1e-4, rel=1e-3)
 
 
+def test_stress_is_the_elastic_one_and_says_so() -> None:
+    model = dv.Model(dv.mesh.cube(2, size=0.2))
+    x = model.rest_points * 1.1
+    with pytest.warns(UserWarning, match="viscosity: the stress is the elastic one alone"):
+        damped = dv.stress(model, x, viscosity=1.0, **MODULI)
+    assert torch.equal(damped.cauchy, dv.stress(model, x, **MODULI).cauchy)
+
+
 def test_float32() -> None:
     model = dv.Model(dv.mesh.cube(3, size=0.2), dtype=torch.float32)
     twin = dv.Model(dv.mesh.cube(3, size=0.2))
@@ -230,6 +238,9 @@ def test_bad_input() -> None:
             raises(lambda name=name, value=value: step(**{name: value}), name, f"got {value:g}")
         raises(lambda name=name: step(**{name: torch.ones(5, dtype=torch.float64)}), name, r"shape \[5\]")
         raises(lambda name=name: step(**{name: torch.ones(6)}), name, "torch.float32")
+        batch = torch.tensor([1.0, -1.0], dtype=torch.float64)
+        raises(lambda name=name, batch=batch: torch.func.vmap(lambda b: dv.step(
+            model, x, v, dv.VBD(0.01, 2), **MODULI, **{name: b})[0])(batch), name, "got -1")  # fmt: skip
     raises(lambda: step(solver=dv.VBD.paper(0.01, 2), viscosity=1.0), "viscosity", 'block="paper"')
     with pytest.raises(NotImplementedError, match="damping with SDIRK2"):
         dv.step(model, x, v, dv.VBD(0.01, 2, integrator=dv.SDIRK2()), adjoint=dv.Unrolled(), drag=1.0, **MODULI)
