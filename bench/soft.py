@@ -158,7 +158,7 @@ def spheres(quick: bool) -> list[Row]:
         pressure = 0.002 * YOUNG * thickness
         inputs = {"young": YOUNG, "poisson": POISSON, "pressure": pressure, "gravity": STILL}
         ends = {"equilibrium": spent(lambda m=model, i=inputs: dv.equilibrium(m, m.rest_points, STATIC, **i).x)}
-        for h, sweeps in ((1e-2, 60), (1e-3, 10)) if levels == 2 or quick else ():
+        for h, sweeps in ((1e-2, 80), (1e-3, 12)) if levels == 2 or thickness < 0.05 or quick else ():
             solver = dv.VBD(h, sweeps, relaxation=1.6, subspace="coarse")
             ends[f"steps of {1e3 * h:g} ms"] = spent(lambda m=model, s=solver, i=inputs: settled(m, s, **i))
         thick = pressed_sphere(YOUNG, POISSON, pressure, thickness)

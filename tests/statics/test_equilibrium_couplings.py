@@ -5,12 +5,13 @@ from typing import Any
 import pytest
 import torch
 from helpers.coupled import coupled, inputs_of
+from helpers.marks import quick_and_slow
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.testing import tolerance
 from diffvbd.testing.dense_statics import coupling_energy, newton, potential, residual, weight
-from diffvbd.testing.soft_scenes import STILL, icosphere, pressed_sphere
+from diffvbd.testing.soft_scenes import STILL, Linked, icosphere, pressed_sphere
 
 SOLVER = dv.VBD(1.0, 0, subspace="coarse")
 
@@ -23,7 +24,7 @@ SCENES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", quick_and_slow(["cables", "soft"], SCENES))
 def test_rest_states(name: str) -> None:
     options, factors = SCENES[name]
     model = coupled(**options)
@@ -119,3 +120,13 @@ def test_float32_rests_where_float64_does(device: str) -> None:
     ends = [dv.equilibrium(m, m.rest_points, SOLVER, mu=4e4, lam=4e4, on_failure="warn").x for m in (double, single)]
     assert ends[1].dtype == torch.float32
     assert float((ends[0] - ends[1]).abs().max()) < 1e-4 < float((ends[0] - double.rest_points).abs().max())
+
+
+@pytest.mark.parametrize("short", (2e-3, 1e-2))
+def test_hinges_between_stiff_links_bend_until_moments_balance(short: float) -> None:
+    finger = Linked.of(8)
+    inputs = {"tendon_rest_length": 0.14 - short, "tendon_stiffness": 10.0}
+    x = rests(finger.model, young=finger.young, poisson=0.0, **inputs)
+    tension = dv.coupling_forces(finger.model, x, **inputs).tendons
+    assert tension is not None
+    assert finger.angle(x) == pytest.approx(finger.balanced(float(tension)), rel=tolerance("beam_of_tets"))

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.coupled import coupled, inputs_of
+from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -104,7 +105,7 @@ def test_colliders(kind: str) -> None:
            gravity=(0.4, -9.0, -0.2))  # fmt: skip
 
 
-@pytest.mark.parametrize("gas", (False, True))
+@pytest.mark.parametrize("gas", (False, slow(True)))
 def test_springs_tendons_and_pressure(gas: bool) -> None:
     model = coupled(gas=gas, places=gas)
     arguments = inputs_of(model)
