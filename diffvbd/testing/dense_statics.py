@@ -90,8 +90,8 @@ def coupling_energy(model: Model, x: Tensor, values: dict[str, Any]) -> Tensor:
     total = x.new_zeros(())
     for energy in model.couplings:
         if isinstance(energy, Springs):
-            places = not isinstance(energy.second, Embedding)
-            second = values["spring_points"] if places else points_of(energy.second, x)
+            second = energy.second
+            second = points_of(second, x) if isinstance(second, Embedding) else values["spring_points"]
             longer = (points_of(energy.first, x) - second).norm(dim=-1) - values["spring_rest_length"]
             longer = longer.clamp(min=0) if energy.tension_only else longer
             total = total + (values["spring_stiffness"] / 2 * longer**2).sum()

@@ -130,3 +130,13 @@ def test_hinges_between_stiff_links_bend_until_moments_balance(short: float) -> 
     tension = dv.coupling_forces(finger.model, x, **inputs).tendons
     assert tension is not None
     assert finger.angle(x) == pytest.approx(finger.balanced(float(tension)), rel=tolerance("beam_of_tets"))
+
+
+def test_each_scene_of_a_batch_rests_as_it_does_alone(device: str) -> None:
+    model = coupled(gas=True, device=device)
+    x, pressure = model.rest_points, torch.tensor([[0.0], [2000.0]], dtype=torch.float64, device=device)
+    both = dv.equilibrium(model, x.expand(2, -1, -1), SOLVER, mu=4e4, lam=4e4, pressure=pressure, tolerance=1e-11).x
+    for scene in range(2):
+        alone = dv.equilibrium(model, x, SOLVER, mu=4e4, lam=4e4, pressure=pressure[scene], tolerance=1e-11).x
+        assert float((both[scene] - alone).abs().max()) < 1e-8
+    assert float((both[1] - both[0]).abs().max()) > 1e-4
