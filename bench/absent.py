@@ -70,7 +70,7 @@ def run(quick: bool) -> dict[str, Any]:
     here = Path(__file__).resolve().parents[1]
     trees = {"this": here, "other": Path(os.environ.get("DIFFVBD_OTHER", here))}
     found: dict[str, list[dict[str, dict[str, float]]]] = {name: [] for name in trees}
-    for _ in range(1 if quick else 10):
+    for _ in range(1 if quick else 5):
         for name, tree in trees.items():
             command = [sys.executable, str(Path(__file__)), "2" if quick else "20"]
             done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(tree)}, capture_output=True, text=True,

@@ -183,7 +183,8 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
-    mu, lam, young, poisson, rest_points, density, stress_free, *dampings = given_inputs.material.values()
+    material = given_inputs.material
+    mu, lam, young, poisson, rest_points, density, stress_free, viscosity, bulk, drag = material.values()
     parameters = given_inputs.parameters
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
@@ -249,14 +250,14 @@ def prepare(
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
         unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, parameters, layout,
-                           given_inputs.material)  # fmt: skip
+                           material)  # fmt: skip
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
     damping = None
-    if any(value is not None for value in dampings):
-        damping = _damping(model, like, lead, given_inputs.material, corners)
+    if viscosity is not None or bulk is not None or drag is not None:
+        damping = _damping(model, like, lead, material, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],

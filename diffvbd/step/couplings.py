@@ -27,15 +27,12 @@ def parameters_at(model: System, given: dict[str, Tensor], scenes: int) -> list[
     ]  # fmt: skip
 
 
-def record_of(model: System, given: dict[str, Tensor], data: Tensor, origin: Tensor | None, scenes: int
-              ) -> Record | None:  # fmt: skip
-    """The record of a Model's couplings for a step; None: it has none.
+def record_of(model: System, given: dict[str, Tensor], data: Tensor, origin: Tensor | None, scenes: int) -> Record:
+    """The record of a Model's couplings for a step.
 
     Args:
         given: Parameters of energies, as in Prepared.  data: Of the other energies [1 | B, n], the anchors last.
     """
-    if not model.couplings:
-        return None
     data = ops.broadcast(data, (scenes, data.shape[1]))
     return partial(_refreshed, model, parameters_at(model, given, scenes), data, origin)
 

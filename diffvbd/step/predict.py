@@ -111,8 +111,9 @@ def begin(
         prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
-    record = record_of(model, prepared.parameters, data, origin, flat[0])
-    if record is not None:  # at the predictor a body that flies or falls as a whole has the right forces
+    record = None
+    if model.couplings:  # at the predictor a body that flies or falls as a whole has the right forces
+        record = record_of(model, prepared.parameters, data, origin, flat[0])
         held = start if prescribed is None else prescribed
         data = record(torch.where(model._pinned[:, None], held, start + h * velocity + (h * h) * acceleration))
     filters = model.floor is not None and model.contact is None

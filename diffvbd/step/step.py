@@ -81,7 +81,8 @@ def step(
         check_prescribed(system, value, x)
     warn_of_sweeps(system, prepared, scheme)
     if isinstance(scheme, ImplicitEuler):
-        x_end, v_end = advance(system, x, v, damped(system, prepared, x), adjoint=adjoint, **given.loads)
+        prepared = prepared if prepared.damping is None else damped(system, prepared, x)
+        x_end, v_end = advance(system, x, v, prepared, adjoint=adjoint, **given.loads)
     else:
         taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
         x_end, v_end = taken.x, taken.v
