@@ -44,6 +44,7 @@ class Coupling:
 
     name: ClassVar[str]
     bit: ClassVar[int] = 0  # of a scene's mask: it reaches the kernels as the record of an Anchor
+    strength: ClassVar[str] = "stiffness"  # the parameter in which the energy is linear, gas but for ambient
     parameters: ClassVar[dict[str, int]]  # as of VertexEnergy
     units: ClassVar[dict[str, str]]
 
@@ -81,6 +82,15 @@ class Coupling:
         """
         raise NotImplementedError
 
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        """Terms [J] whose sum is the energy of a scene, but for a constant, [B, n]; arguments as of load()."""
+        raise NotImplementedError
+
+    def joins(self) -> tuple[Tensor, Tensor]:
+        """Pairs of vertices [n, 2] whose bodies it joins, and vertices [m] that it ties to places; on the CPU."""
+        none = torch.zeros((0, 2), dtype=torch.int64, device="cpu")
+        return none, none[:, 0]
+
     def _take_numbers(self) -> None:
         """The parameters as float64 tensors, checked."""
         refuse_gradients(self)
@@ -99,6 +109,11 @@ class Coupling:
 
 def _moved(value: Any, device: torch.device) -> Any:
     return value.to(device) if hasattr(value, "to") else type(value)(*(part.to(device) for part in value))
+
+
+def _pairs(rows: Tensor) -> Tensor:
+    """The first of each row [N, n] with the others, [N (n - 1), 2]."""
+    return torch.stack([rows[:, :1].expand(-1, rows.shape[1] - 1), rows[:, 1:]], -1).reshape(-1, 2)
 
 
 def _length(d: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,11 +225,26 @@ class Springs(Coupling):
         weights = np.concatenate([sign * end.weights.numpy() for end, sign in ends], -1)
         return self._with(_ends=_Differences.of(index[:, None], weights[:, None], pinned))
 
+    def joins(self) -> tuple[Tensor, Tensor]:
+        one = self.first.vertices
+        if not isinstance(self.second, Embedding):
+            return _pairs(one), one.reshape(-1)
+        return _pairs(torch.cat([one, self.second.vertices], 1)), one.new_zeros((0,))
+
+    def _vectors(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        d = self._ends.take(x)[:, :, 0]
+        return d - values["points"] if "points" in values else d
+
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        d, rest = self._vectors(x, values), values["rest_length"]
+        length, inverse = _length(d)
+        longer = (length - rest).clamp(min=0) if self.tension_only else length - rest
+        at_zero = (d * d).sum(-1) * (rest == 0 if self.tension_only else 1)  # an attachment, with its second derivative
+        return values["stiffness"] / 2 * torch.where(inverse > 0, longer.square(), at_zero + longer.square())
+
     def pull(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Gradient of each spring with respect to p - q, [B, S, 3]: the force on q, and against that on p."""
-        d = self._ends.take(x)[:, :, 0]
-        if "points" in values:
-            d = d - values["points"]
+        d = self._vectors(x, values)
         # at d = 0 the derivative is that of an attachment
         rate = values["stiffness"] * (1 - values["rest_length"] * _length(d)[1])
         return (rate.clamp(min=0) if self.tension_only else rate)[..., None] * d
@@ -306,12 +336,20 @@ class Tendons(Coupling):
                    (~pinned[vertex]).double())  # fmt: skip
         return self._with(_segments=segments, _own=own)
 
+    def joins(self) -> tuple[Tensor, Tensor]:
+        vertices = self.points.vertices
+        return torch.cat([_pairs(vertices[list(route)].reshape(1, -1)) for route in self.routes]), vertices.new_zeros(0)
+
     def tension(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Tension of each tendon [N], [B, R]."""
         return self._tension(_length(self._segments.take(x))[0], values)
 
     def _tension(self, length: Tensor, values: dict[str, Tensor]) -> Tensor:
         return values["stiffness"] * (length.sum(-1) - values["rest_length"]).clamp(min=0)
+
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        longer = _length(self._segments.take(x))[0].sum(-1) - values["rest_length"]
+        return values["stiffness"] / 2 * longer.clamp(min=0).square()
 
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         d, own = self._segments.take(x), self._own
@@ -385,6 +423,7 @@ class Pressure(Coupling):
     name: ClassVar[str] = "pressure"
     parameters: ClassVar[dict[str, int]] = {"pressure": 1}
     units: ClassVar[dict[str, str]] = {"pressure": "Pa"}
+    strength: ClassVar[str] = "pressure"
 
     surfaces: ClassVar[tuple[IntArray, ...]]  # in a Model: the triangles of each cavity, normals into the walls
     _surfaces: ClassVar[_Surfaces]
@@ -471,6 +510,14 @@ class Pressure(Coupling):
             return values["pressure"]
         return (values["pressure"] + self.ambient) * self._rest_volume.to(volume.dtype) / volume - self.ambient
 
+    def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
+        volume = self._faces(x)[0]
+        if not self.gas:
+            return -values["pressure"] * volume
+        rest = self._rest_volume.to(x.dtype)
+        work = (values["pressure"] + self.ambient) * rest * (volume / rest).log()  # NaN where inside out
+        return torch.cat([self.ambient * volume, -work], -1)
+
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         s = self._surfaces
         volume, normal = self._faces(x)
@@ -493,3 +540,22 @@ class Pressure(Coupling):
 
 
 COUPLINGS: tuple[type[Coupling], ...] = (Springs, Tendons, Pressure)
+
+
+def load_of(couplings: Sequence[Coupling], values: Sequence[dict[str, Tensor]], x: Tensor) -> Tensor:
+    """The sum of their loads at x [B, V, 3], [B, V, 4]; values: of each one."""
+    parts = [energy.load(x, own) for energy, own in zip(couplings, values, strict=True)]
+    return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
+
+
+def joined(couplings: Sequence[Coupling], body: Tensor) -> Tensor:
+    """``body`` [V] with one number for all bodies that couplings join."""
+    pairs = torch.cat([energy.joins()[0] for energy in couplings])
+    own = torch.arange(int(body.max()) + 1, device="cpu")
+    pairs = body.cpu()[pairs]
+    while True:
+        low = own[pairs].amin(1, keepdim=True).expand(-1, 2)
+        after = own.scatter_reduce(0, pairs.reshape(-1), low.reshape(-1), "amin")
+        if torch.equal(after, own):
+            return own.to(body.device)[body]
+        own = after

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ._common.checks import check_bool, fail, kind_of
+from ._common.messages import warn
 from .mesh import TetMesh
 from .mesh.arrays import FloatArray, IntArray, check_mesh, float_array, int_array
 from .mesh.tet_mesh import boundary_faces
@@ -19,6 +20,7 @@ from .ops.sums import Rows
 
 CHUNK = 500_000  # distances that are held at once
 INSIDE = -1e-9  # least weight of a point that counts as inside a tet
+FAR = 1.5  # of the height of a tet, from which extrapolated points are warned of
 
 
 class Embedding:
@@ -65,7 +67,8 @@ class Embedding:
             surface: Take the closest point on the surface instead, with the weights of its triangle.
 
         Raises:
-            TypeError, ValueError: No TetMesh, one without tets, points of another shape, NaN.
+            TypeError, ValueError: No TetMesh, one without tets, points of another shape, NaN. Points that lie farther
+                outside than a tet is high are warned of.
         """
         check_mesh(mesh)
         check_bool("surface", surface)
@@ -82,6 +85,7 @@ class Embedding:
             out = np.flatnonzero(~inside)
             tet[out] = owner[_closest(given[out], mesh.points[faces])[0]]
             weights[out] = _barycentric(given[out], mesh.points[mesh.tets[tet[out]]])
+            _warn_of_far(out, given, weights)
         return cls(mesh.tets[tet], weights)
 
     def check(self, name: str, num_vertices: int) -> None:
@@ -121,6 +125,16 @@ class Embedding:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_placed": {}}
+
+
+def _warn_of_far(out: IntArray, points: FloatArray, weights: FloatArray) -> None:
+    """Warns of points outside by more than a tet is high: a small strain of that tet moves them by far."""
+    far = out[-weights[out].min(1) > FAR]
+    if len(far):
+        worst = far[weights[far].min(1).argmin()]
+        warn(f"points: {len(far)} of {len(points)} lie farther outside the mesh than its tets are high, the farthest "
+             f"is point {worst} at {points[worst].tolist()}; their motion is extrapolated, surface=True takes the "
+             "closest points of the surface")  # fmt: skip
 
 
 def _pairs(points: FloatArray, corners: FloatArray, nearest: bool) -> Iterator[tuple[IntArray, IntArray]]:

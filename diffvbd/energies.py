@@ -45,6 +45,8 @@ def numbers_of(name: str, value: Any) -> Tensor:
         fail(name, "numbers that a float can hold", "an integer beyond 1.8e308")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{name}: expected numbers, got {value!r}") from None
+    if given.dtype == torch.bool or not isinstance(value, Tensor) and np.asarray(value).dtype == bool:
+        raise TypeError(f"{name}: expected numbers, got {value!r}")
     good = torch.isfinite(out)
     if not bool(good.all()):
         fail(name, "finite numbers", float(out[~good][0]) if isinstance(value, Tensor) else value)

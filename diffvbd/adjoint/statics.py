@@ -1,4 +1,4 @@
-"""The static potential of a scene at one state: elastic energy, barriers and springs, less the work of the loads.
+"""The static potential of a scene at one state: elastic energy, barriers and couplings, less the work of the loads.
 
     U(x) = E(x) - f . x          [J]
 
@@ -17,13 +17,14 @@ from torch import Tensor
 from .. import ops
 from .._contact.pair_forces import NearPairs, corner_points, near_pairs, pair_energy, safe_fraction
 from .._contact.surface import ContactSurface
+from ..couplings import load_of
 from ..model.system import System
 from .implicit import Assembled, Operator, inverse_blocks
 from .potential import IncreaseInputs, IncrementalPotential, increase_of_bodies
 
 CLOSED = 0.8  # of a gap, at most, in one iteration
 REACH = 0.5  # of the trust-region radius of steps, which a vertex goes at most in one iteration
-SINGULAR = 1e-14  # of the largest eigenvalue of a coarse matrix; smaller ones count as so large
+SINGULAR = 1e-12  # of the largest eigenvalue of a coarse matrix; smaller ones are rounding of free motions, left alone
 
 
 class Statics(NamedTuple):
@@ -36,6 +37,7 @@ class Statics(NamedTuple):
     data: Tensor  # [1 | B, n], of the energies of vertices, without damping
     colliders: Tensor  # [B, Vc, 3] [m]
     kappa: Tensor  # [1 | B] [N/m], of pairs
+    couplings: Tensor  # [1 | B, n], the parameters of each coupling, one after another
 
     def fields(self, x: Tensor) -> ops.SweepFields:
         massless = x.new_zeros((1, x.shape[1]))
@@ -56,6 +58,39 @@ class StaticPotential(IncrementalPotential):
     def __init__(self, model: System, x: Tensor, given: Statics) -> None:
         super().__init__(model, x, given.fields(x), 1.0)
         self.given = given
+
+    def _values(self, couplings: Tensor) -> list[dict[str, Tensor]]:
+        """Parameters of each coupling by key, [B, ...]."""
+        out, first = [], 0
+        couplings = ops.broadcast(couplings, (len(self.x), couplings.shape[1]))
+        for energy in self.model.couplings:
+            out.append({})
+            for key, own in self.model.constants(energy).items():
+                out[-1][key] = couplings[:, first : first + own.numel()].unflatten(1, own.shape)
+                first += own.numel()
+        return out
+
+    @cached_property
+    def coupling_terms(self) -> Tensor:
+        """Terms [J] of the energies of couplings, [B, n]; their sum is the energy but for a constant."""
+        return self._terms(self.x, self.given.couplings)
+
+    def _terms(self, x: Tensor, couplings: Tensor) -> Tensor:
+        values, none = self._values(couplings), [x.new_zeros((len(x), 0))]
+        parts = [energy.terms(x, own) for energy, own in zip(self.model.couplings, values, strict=True)]
+        return torch.cat(parts or none, -1)
+
+    @cached_property
+    def _coupled(self) -> tuple[Tensor, Tensor, Tensor]:
+        """x, the parameters of couplings, and the gradient of their energies [N], which autograd differentiates."""
+        with torch.enable_grad():
+            x, couplings = (t.detach().requires_grad_() for t in (self.x, self.given.couplings))
+            (slope,) = torch.autograd.grad(self._terms(x, couplings).sum(), x, create_graph=True)
+            return x, couplings, slope
+
+    def coupled(self) -> Tensor:
+        """The gradient of the energies of couplings [N], [B, V, 3], rows of pinned vertices included."""
+        return self._coupled[2].detach() if self.model.couplings else torch.zeros_like(self.x)
 
     @cached_property
     def points(self) -> Tensor:
@@ -96,7 +131,7 @@ class StaticPotential(IncrementalPotential):
                                                                 self.given.kappa))  # fmt: skip
 
     def internal(self) -> Tensor:
-        """dE/dx [N], [B, V, 3], rows of pinned vertices included."""
+        """dE/dx of all but couplings [N], [B, V, 3], rows of pinned vertices included."""
         total = self.forces()
         if self.pairs is None:
             return total
@@ -117,27 +152,35 @@ class StaticPotential(IncrementalPotential):
         return blocks.flatten(2).movedim(0, 1)
 
     def product(self, w: Tensor) -> Tensor:
-        return super().product(w) + self.pair_product(w)
+        return self.with_others(w, super().product(w))
 
-    def pair_product(self, w: Tensor) -> Tensor:
-        """The part of product() that is that of pairs."""
-        if self.pairs is None:
-            return torch.zeros_like(w)
-        at = self.pairs.positions(self._with_colliders(w)).reshape(-1, 12, 1)
-        return self._on_vertices(self.pairs, (self.pair_blocks @ at).reshape(-1, 4, 3))
+    def with_others(self, w: Tensor, out: Tensor) -> Tensor:
+        """``out`` and the part of product() that is that of pairs and couplings."""
+        if self.pairs is not None:
+            at = self.pairs.positions(self._with_colliders(w)).reshape(-1, 12, 1)
+            out = out + self._on_vertices(self.pairs, (self.pair_blocks @ at).reshape(-1, 4, 3))
+        if self.model.couplings:
+            x, _, slope = self._coupled  # the Hessian is symmetric: a product with its transpose is one with it
+            out = out + torch.autograd.grad(slope, x, w, retain_graph=True)[0]
+        return out
 
     @cached_property
-    def pair_diagonal(self) -> Tensor:
-        """The blocks on the diagonal of pairs, [B, V, 3, 3], without what is negative in them."""
+    def other_diagonal(self) -> Tensor:
+        """The blocks on the diagonal of pairs, [B, V, 3, 3], without what is negative in them, and the bound of
+        couplings, which is above theirs."""
+        total = self.x.new_zeros(*self.x.shape, 3)
+        if self.model.couplings:
+            bound = load_of(self.model.couplings, self._values(self.given.couplings), self.x)[..., 3:]
+            total.diagonal(dim1=-2, dim2=-1).add_(bound)
         if self.pairs is None:
-            return self.x.new_zeros(*self.x.shape, 3)
+            return total
         blocks = self.pair_blocks.reshape(-1, 4, 3, 4, 3).diagonal(dim1=1, dim2=3).movedim(-1, 1)
         value, vector = torch.linalg.eigh(blocks)
         blocks = (vector * value.clamp(min=0)[..., None, :]) @ vector.mT
-        return self._on_vertices(self.pairs, blocks.flatten(-2)).unflatten(-1, (3, 3))
+        return total + self._on_vertices(self.pairs, blocks.flatten(-2)).unflatten(-1, (3, 3))
 
     def diagonal(self) -> Tensor:
-        return super().diagonal() + self.pair_diagonal
+        return super().diagonal() + self.other_diagonal
 
     def increase(self, inputs: IncreaseInputs, to: StaticPotential) -> tuple[Tensor, Tensor]:
         """Increase of U from here to another state with the same pinned positions, and the sum of the sizes of its
@@ -145,7 +188,9 @@ class StaticPotential(IncrementalPotential):
         more, size = increase_of_bodies(inputs, self.x, to.x).sum(1).unbind(-1)
         work = self.given.load * (to.x - self.x)
         before, after = self.pair_energies(), to.pair_energies()
-        return more - work.sum((1, 2)) + after - before, size + work.abs().sum((1, 2)) + after + before
+        more, size = more - work.sum((1, 2)) + after - before, size + work.abs().sum((1, 2)) + after + before
+        before, after = self.coupling_terms, to.coupling_terms
+        return more + (after - before).sum(-1), size + before.abs().sum(-1) + after.abs().sum(-1)
 
     def admissible(self, move: Tensor) -> Tensor:
         """Largest fraction, at most 1, of a motion [B, V, 3] on which no gap of a floor or pair closes, [B]."""
@@ -178,9 +223,13 @@ class StaticPotential(IncrementalPotential):
                 slope = self._pair_gradient(self.pairs, at, kappa)
                 along = -(slope * self.pairs.positions(self._with_colliders(w))).sum()
                 colliders, kappa = torch.autograd.grad(along, (colliders, kappa), materialize_grads=True)
+        couplings = self.given.couplings
+        if self.model.couplings:
+            _, couplings, slope = self._coupled
+            (couplings,) = torch.autograd.grad(slope, couplings, -w, retain_graph=True)
         data = torch.zeros_like(self.data) if data is None else data
         assert mu is not None and lam is not None and rest is not None
-        return Statics(w, mu, lam, rest, data, colliders, kappa)
+        return Statics(w, mu, lam, rest, data, colliders, kappa, couplings)
 
 
 def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[Operator, Operator]:
@@ -191,15 +240,16 @@ def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[
     blocks = at.diagonal() + shift[..., None] * eye
     smooth = inverse_blocks(blocks, at.free)
     stored = at.x.is_cuda or torch.backends.mkl.is_available()  # sparse products on a CPU need MKL
-    of_tets = blocks - at.pair_diagonal if at.patches is None else blocks - at.pair_diagonal - at.patches.diagonal
+    of_tets = blocks - at.other_diagonal
+    of_tets = of_tets if at.patches is None else of_tets - at.patches.diagonal
     elastic = Assembled(at, of_tets) if stored else (
-        lambda w: at.free * (IncrementalPotential.product(at, w) + shift * w))  # fmt: skip
+        lambda w: IncrementalPotential.product(at, w) + shift * w)  # fmt: skip
 
     def product(w: Tensor) -> Tensor:
         out = elastic(w)
         if stored and at.patches is not None:  # a matrix of tets has no room for what couples several
-            out = out + at.free * at.patches.product(w)
-        return out if at.pairs is None else out + at.free * at.pair_product(w)
+            out = out + at.patches.product(w)
+        return at.free * at.with_others(w, out)
 
     weights = _coarse_functions(at.model)
     if weights is None:
@@ -210,7 +260,7 @@ def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[
     matrix = columns.flatten(0, 1).T @ image
     value, vector = torch.linalg.eigh((matrix + matrix.mT) / 2)
     value = value.abs()  # positive definite, whatever the Hessian is
-    value = torch.maximum(value, SINGULAR * value.amax(-1, keepdim=True))
+    value = torch.where(value > SINGULAR * value.amax(-1, keepdim=True), value, torch.inf)
 
     def precondition(r: Tensor) -> Tensor:
         coarse = (weights.T @ r).reshape(scenes, -1, 1)

@@ -14,10 +14,11 @@ from torch.linalg import cross
 from .. import ops
 from .._common.checks import check_kind, fail, name_value, real_array
 from .._common.context import looks_at, replaced, transformed
+from .._common.messages import warn
 from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
-from ..couplings import Pressure, Springs, Tendons
+from ..couplings import Pressure, Springs, Tendons, load_of
 from ..energies import StableNeoHookean
 from ..model.material import deformed, shape_gradients
 from ..model.model import Model
@@ -25,6 +26,7 @@ from ..model.solver import VBD
 from ..model.system import System, system_of
 from ..step.arguments import (
     COLLIDERS,
+    VISCOSITIES,
     Given,
     Prepared,
     acceleration_of,
@@ -36,7 +38,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
-from ..step.couplings import load_of, parameters_at
+from ..step.couplings import parameters_at
 from ..step.damping import damped
 from ..step.predict import energy_data
 
@@ -341,7 +343,7 @@ def reactions(
         normal, friction = _contact_at(given, x, previous).on_vertices()
         total = total - normal - friction
     if given.model.couplings:
-        total = total + load_of(given.model, given.parameters(len(at)), at)[..., :3]
+        total = total + load_of(given.model.couplings, given.parameters(len(at)), at)[..., :3]
     acceleration = -full(pull)
     if previous is not None:
         start, speed = (full(t) for t in previous)
@@ -370,6 +372,10 @@ class CouplingForces(NamedTuple):
     volume: Tensor | None
     vertices: Tensor
 
+    def __repr__(self) -> str:
+        own = (f"{name} of shape {list(t.shape)}" for name, t in self._asdict().items() if t is not None)
+        return f"CouplingForces({', '.join(own)})"
+
 
 def coupling_forces(model: Model, x: Tensor, **inputs: Any) -> CouplingForces:
     """Forces of springs and tendons, and pressure and volume of cavities, at x. Differentiable by autograd in every
@@ -395,7 +401,7 @@ def coupling_forces(model: Model, x: Tensor, **inputs: Any) -> CouplingForces:
     given = widen(model, x, None, Given(material_of(mu=0.0, lam=0.0).material, given_inputs.parameters, {}))
     at = x.double().reshape(x.shape[:-2].numel(), *x.shape[-2:])
     values = given.parameters(len(at))
-    found: dict[str, Tensor] = {"vertices": -load_of(given.model, values, at)[..., :3]}
+    found: dict[str, Tensor] = {"vertices": -load_of(given.model.couplings, values, at)[..., :3]}
     for energy, own in zip(given.model.couplings, values, strict=True):
         if isinstance(energy, Springs):
             found["springs"] = -energy.pull(at, own)
@@ -415,7 +421,7 @@ class Stress(NamedTuple):
 
 
 def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
-    """Elastic Cauchy stress of each tet and the von Mises stress that follows from it.
+    """Elastic Cauchy stress of each tet and the von Mises stress that follows from it; without that of viscosity.
 
         cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
 
@@ -424,7 +430,7 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     Args:
         model: A scene with StableNeoHookean tets.
         x: Positions [m], shape [..., V, 3].
-        inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read.
+        inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read. A viscosity is warned of.
 
     Returns:
         A :class:`diffvbd.results.Stress` of x's dtype, differentiable by autograd in every tensor. The
@@ -441,6 +447,9 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
         fail("model", "StableNeoHookean among its energies", "none")
     given_inputs = given_of(model, inputs)
     rest_points, stress_free = (given_inputs.material[name] for name in ("rest_points", "stress_free"))
+    for name in VISCOSITIES:
+        if given_inputs.material[name] is not None:
+            warn(f"{name}: the stress is the elastic one alone; that of viscosity needs a motion and is not in it")
     given = widen(model, x, None, Given(given_inputs.material, {}, {}))
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)

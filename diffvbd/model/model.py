@@ -277,6 +277,8 @@ class Model:
     @lasting_tensors()
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
         """A new Model on another device or of another dtype; raises TypeError unless that is float64 or float32."""
+        if isinstance(device, torch.dtype):
+            raise TypeError(f"device: expected a device, got {device}: give it as to(dtype={device})")
         dtype = self.dtype if dtype is None else dtype
         check_dtype(dtype)
         device = self.device if device is None else checked_device(device)

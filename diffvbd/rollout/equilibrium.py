@@ -22,6 +22,7 @@ from .._common.messages import page, warn
 from ..adjoint.implicit import solve_adjoint
 from ..adjoint.routes import GlobalAdjoint
 from ..adjoint.statics import StaticPotential, Statics, newton_operators
+from ..couplings import joined
 from ..model.inputs import parameter_of
 from ..model.model import Model
 from ..model.solver import VBD
@@ -38,12 +39,14 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
+from ..step.couplings import parameters_at
 from ..step.predict import energy_data
 from ..step.warnings import system_for
 from .newton import Limits, Rest, find_rest
 
 ROUNDINGS = 4.0  # of a product with the Hessian, that the backward's residual may keep
 NET = 1e-9  # of the sizes of a body's loads, below which their sum counts as zero
+SINGULAR = 1e-14  # determinant of a vertex's block over its trace cubed
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,10 @@ class Equilibrium:
     iterations: int
     converged: bool
 
+    def __repr__(self) -> str:
+        return (f"Equilibrium(x of shape {list(self.x.shape)}, residual={self.residual:.3g}, "
+                f"iterations={self.iterations}, converged={self.converged})")  # fmt: skip
+
 
 def equilibrium(
     model: Model,
@@ -76,7 +83,7 @@ def equilibrium(
     progress: bool = False,
     **inputs: Any,
 ) -> Equilibrium:
-    """State of rest near x under gravity, forces, pins, floors, anchors and contact, by Newton's method.
+    """State of rest near x under loads, pins, floors, anchors, couplings and contact, by Newton's method.
 
     What is found is a local minimum of the potential energy, without inertia, and from x downhill: where there are
     several, as after buckling, x decides. Friction and damping have no part in it: a body that only friction would hold
@@ -138,9 +145,6 @@ def _statics(model: System, x: Tensor, lead: tuple[int, ...], inputs: dict[str, 
     """Where pinned vertices are held [B, V, 3] [m], and what the potential depends on; differentiable."""
     sorted_inputs = given_of(model, inputs)
     material, parameters, loads = sorted_inputs
-    if model.couplings:
-        raise NotImplementedError("model: expected one without springs, tendons and pressure, got one with "
-                                  f"{model.couplings[0]}; take a rollout of long steps until it rests")  # fmt: skip
     for name in ("colliders_before", *VISCOSITIES, "drag"):
         if {**loads, **material}[name] is not None:
             fail(name, "none: at rest nothing has moved", "a value")
@@ -167,8 +171,16 @@ def _statics(model: System, x: Tensor, lead: tuple[int, ...], inputs: dict[str, 
     kappa = parameter_of(model, prepared.parameters, "pair_kappa")
     given = Statics(load, prepared.mu, prepared.lam, model.rest_scalars if prepared.rest is None else prepared.rest,
                     energy_data(model, prepared, None), x.new_zeros((flat[0], 0, 3)) if colliders is None else
-                    colliders[1], x.new_zeros((1,)) if kappa is None else kappa)  # fmt: skip
+                    colliders[1], x.new_zeros((1,)) if kappa is None else kappa,
+                    _couplings(model, prepared.parameters, flat[0]))  # fmt: skip
     return held.double(), Statics(*(t.double() for t in given))
+
+
+def _couplings(model: System, given: dict[str, Tensor], scenes: int) -> Tensor:
+    """The parameters of all couplings [B, n]."""
+    values = parameters_at(model, given, scenes)
+    flat = [value.flatten(1) for own in values for value in own.values()]
+    return torch.cat(flat, 1) if flat else model._mass.new_zeros((1, 0))
 
 
 class _Rest(Function):
@@ -190,7 +202,7 @@ class _Rest(Function):
         if is_batched(x_bar):
             raise NotImplementedError("equilibrium: expected gradients one at a time, got batched ones "
                                       "(is_grads_batched)")  # fmt: skip
-        needs = ctx.needs_input_grad[:8]
+        needs = ctx.needs_input_grad[: 1 + len(Statics._fields)]
         return of_inputs(_RestBackward.apply(x_bar, *ctx.saved_tensors, ctx.model, ctx.adjoint, needs), needs, 4)
 
 
@@ -219,17 +231,28 @@ class _RestBackward(Function):
 
 
 def _check_start(model: System, x: Tensor, given: Statics) -> None:
-    """Raises where x is below a floor, and for bodies that nothing holds against their loads."""
+    """Raises where x is below a floor, for vertices without stiffness, and for bodies that nothing holds."""
     at = StaticPotential(model, x, given)
     if model.floor is not None:
         below = (model.floor.gaps(x, given.data[:, : model.floor.count()], None)[0] <= 0).any(-1) & (at.free[:, 0] > 0)
         if bool(below.any()):
             fail("x", "every unpinned vertex above the floor", f"one at or below it, [scene, vertex] "
                  f"{below.nonzero()[0].tolist()}")  # fmt: skip
+    if not bool(torch.isfinite(at.coupling_terms).all()):
+        fail("x", "cavities of positive volume, for their gas", "one without")
+    blocks = at.diagonal()
+    size = blocks.diagonal(dim1=-2, dim2=-1).sum(-1)
+    loose = (at.free[:, 0] > 0) & (torch.linalg.det(blocks) <= SINGULAR * size**3)
+    if bool(loose.any()):
+        fail("young, mu or energies", "stiffness at every free vertex, by its tets, an Anchor or springs",
+             f"none at one, [scene, vertex] {loose.nonzero()[0].tolist()}")  # fmt: skip
     if model.floor is not None or model.contact is not None:
         return  # which may come to hold a body
-    labels, blocks = model.body, at.vertex_blocks()
-    holds = model._pinned.expand(len(x), -1) if blocks is None else model._pinned | (blocks != 0).any(-1).any(-1)
+    labels, holds, blocks = model.body, model._pinned, at.vertex_blocks()
+    if model.couplings and labels.numel():
+        tied = torch.cat([energy.joins()[1] for energy in model.couplings]).to(labels.device)
+        labels, holds = joined(model.couplings, labels), holds.index_fill(0, tied, True)
+    holds = holds.expand(len(x), -1) if blocks is None else holds | (blocks != 0).any(-1).any(-1)
     sums = x.new_zeros((len(x), int(labels.max()) + 1, 4)) if labels.numel() else x.new_zeros((len(x), 0, 4))
     size = given.load.norm(dim=-1, keepdim=True)
     sums = sums.index_add(1, labels, torch.cat([given.load, size], -1))
@@ -238,7 +261,7 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
     falls = ~held & (net > NET * sums[..., 3])
     if bool(falls.any()):
         scene, body = falls.nonzero()[0].tolist()
-        raise RuntimeError(f"equilibrium: expected bodies that are held (pinned, Anchor, FloorBarrier, PairBarrier), "
+        raise RuntimeError(f"equilibrium: expected bodies that are held (pinned, Anchor, Springs, floor, PairBarrier), "
                            f"got body {body} of scene {scene}, which nothing holds against a net load of "
                            f"{float(net[scene, body]):.3g} N: it has no equilibrium")  # fmt: skip
 

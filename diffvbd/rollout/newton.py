@@ -119,7 +119,7 @@ def _in_increments(model: System, x: Tensor, held: Tensor, given: Statics, limit
     lost = ~good
     rest = Rest(x, x.new_full((len(x),), torch.inf), good, lost, lost, 0)
     for n in range(1, parts + 1):
-        part = given._replace(load=n / parts * given.load)
+        part = _part(model, given, n / parts)
         step = torch.where(model._pinned[:, None], x + n / parts * move - rest.x, 0)
         start, follows = _follow(model, rest.x, step, part)
         goal = limits.tolerance if n == parts else max(limits.tolerance, INCREMENT)
@@ -131,6 +131,16 @@ def _in_increments(model: System, x: Tensor, held: Tensor, given: Statics, limit
         if not bool(good.any()):
             break
     return rest._replace(iterations=count)
+
+
+def _part(model: System, given: Statics, fraction: float) -> Statics:
+    """The given loads, and the couplings with such a fraction of their strength."""
+    strong = [torch.full_like(own, key == energy.strength, dtype=torch.bool).flatten()
+              for energy in model.couplings for key, own in model.constants(energy).items()]  # fmt: skip
+    couplings = given.couplings
+    if strong and fraction < 1:
+        couplings = torch.where(torch.cat(strong), fraction * couplings, couplings)
+    return given._replace(load=fraction * given.load, couplings=couplings)
 
 
 def _inside_out(model: System, x: Tensor, given: Statics) -> Tensor:
@@ -204,13 +214,13 @@ def _state(at: StaticPotential, x: Tensor) -> StaticPotential:
 def residual_of(at: StaticPotential, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
     """Force left over at free vertices [N], [B, V, 3]; its size over those of internal forces, loads and SMALL_STRAIN
     [-], [B]; whether that meets the tolerance, or is no more than rounding leaves, bool [B]."""
-    internal = at.internal()  # where pinned, too: without loads the reactions are what balances
-    left = at.free * (internal - at.given.load)
+    internal, coupled = at.internal(), at.coupled()  # where pinned, too: without loads the reactions are what balances
+    left = at.free * (internal + coupled - at.given.load)
     size = of_scenes(left)
     # a state without stress and loads has no forces to compare with: those of a small strain stand for them
     extent = (at.x.amax(1) - at.x.amin(1)).amax(-1, keepdim=True) if at.x.numel() else size
     least = SMALL_STRAIN * extent / max(at.x.shape[1], 1) * of_scenes(at.free * at.stiffness())
-    ratio = share(size, of_scenes(internal) + of_scenes(at.given.load) + least)
+    ratio = share(size, of_scenes(internal) + of_scenes(coupled) + of_scenes(at.given.load) + least)
     return left, ratio[:, 0], ((ratio <= tolerance) | (size <= rounding(at, of_scenes)))[:, 0]
 
 

@@ -185,7 +185,8 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
-    mu, lam, young, poisson, rest_points, density, stress_free, *dampings = given_inputs.material.values()
+    material = given_inputs.material
+    mu, lam, young, poisson, rest_points, density, stress_free, viscosity, bulk, drag = material.values()
     parameters = given_inputs.parameters
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
@@ -257,14 +258,14 @@ def prepare(
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
         unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, parameters, layout,
-                           given_inputs.material)  # fmt: skip
+                           material)  # fmt: skip
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
     damping = None
-    if any(value is not None for value in dampings):
-        damping = _damping(model, like, lead, given_inputs.material, corners)
+    if viscosity is not None or bulk is not None or drag is not None:
+        damping = _damping(model, like, lead, material, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],
@@ -295,6 +296,15 @@ def _stress_free(given: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     return corners, rest_metric(corners)[0]
 
 
+def _not_negative(value: Tensor, name: str, axes: tuple[str, ...]) -> Tensor:
+    rows = value.detach().flatten(0, -2)  # inside vmap with the batch
+    name_value(name, "finite numbers >= 0", rows, rows >= 0, axes)
+    return value
+
+
+_looked_at = ops.Linear(_not_negative, lambda bar, shape, *_: bar, 3, lambda info, *args: _looked_at(*args))
+
+
 def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str, Any], corners: Tensor | None
              ) -> Damping:  # fmt: skip
     """corners: of the tets' rest shapes [B, T, 4, 3] where a step is given those."""
@@ -303,9 +313,10 @@ def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str
         value, own = given[name], (model.num_vertices if name == "drag" else model.num_tets,)
         if value is not None:
             value = _scenes_first(name, value, like, lead, own)
-            if not transformed() and (checking() or not like.is_cuda):
+            if checking() or not like.is_cuda:
                 axes = ("scene", "vertex") if name == "drag" else SCENE_TET
-                name_value(name, "finite numbers >= 0", value, value >= 0, axes)
+                # inside vmap values can be looked at by functions with a rule for it alone
+                value = _looked_at(value, name, axes) if transformed() else _not_negative(value, name, axes)
             if model.block == "paper" and name != "drag":
                 fail(name, 'a solver with block="exact"', 'one with block="paper"')
         out[name] = value

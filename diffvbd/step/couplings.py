@@ -12,6 +12,7 @@ from torch import Tensor
 from .. import ops
 from .._common.checks import input_name
 from .._common.context import replaced
+from ..couplings import load_of
 from ..model.system import System
 from ..ops.sweep import sweep
 from .coarse import in_lanes
@@ -29,28 +30,19 @@ def parameters_at(model: System, given: dict[str, Tensor], scenes: int) -> list[
     ]  # fmt: skip
 
 
-def load_of(model: System, values: list[dict[str, Tensor]], x: Tensor) -> Tensor:
-    """Gradient [N] and bound [N/m] of all couplings at x [B, V, 3], [B, V, 4]."""
-    parts = [energy.load(x, own) for energy, own in zip(model.couplings, values, strict=True)]
-    return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
-
-
-def record_of(model: System, given: dict[str, Tensor], data: Tensor, origin: Tensor | None, scenes: int
-              ) -> Record | None:  # fmt: skip
-    """The record of a Model's couplings for a step; None: it has none.
+def record_of(model: System, given: dict[str, Tensor], data: Tensor, origin: Tensor | None, scenes: int) -> Record:
+    """The record of a Model's couplings for a step.
 
     Args:
         given: Parameters of energies, as in Prepared.  data: Of the other energies [1 | B, n], the anchors last.
     """
-    if not model.couplings:
-        return None
     data = ops.broadcast(data, (scenes, data.shape[1]))
     return partial(_refreshed, model, parameters_at(model, given, scenes), data, origin)
 
 
 def _refreshed(model: System, values: list[dict[str, Tensor]], data: Tensor, origin: Tensor | None, x: Tensor
                ) -> Tensor:  # fmt: skip
-    load = load_of(model, values, x if origin is None else x + origin)
+    load = load_of(model.couplings, values, x if origin is None else x + origin)
     others = data.shape[1] - 4 * model.num_vertices
     stiffness, point = data[:, others:].unflatten(1, (-1, 4)).split((1, 3), -1)
     # two springs of a vertex are one, but for a constant

@@ -122,7 +122,7 @@ def begin(
         prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
-    record = record_of(model, prepared.parameters, data, origin, flat[0])
+    record = record_of(model, prepared.parameters, data, origin, flat[0]) if model.couplings else None
     law, moduli, at = None, (prepared.mu, prepared.lam, prepared.rest), start
     if prepared.averaged is not None:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest

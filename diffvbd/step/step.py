@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
-from .._common.checks import check_tensor, fail, to_float
+from .._common.checks import check_tensor, fail, to_float, where_it_is
 from .._common.context import refuse_refinement, refuse_transforms
 from ..adjoint.routes import Adjoint, TapedSweep, check_adjoint
 from ..model.model import Model
@@ -81,7 +81,8 @@ def step(
         check_prescribed(system, value, x)
     warn_of_sweeps(system, prepared, scheme)
     if isinstance(scheme, ImplicitEuler):
-        x_end, v_end = advance(system, x, v, damped(system, prepared, x), adjoint=adjoint, **given.loads)
+        prepared = prepared if prepared.damping is None else damped(system, prepared, x)
+        x_end, v_end = advance(system, x, v, prepared, adjoint=adjoint, **given.loads)
     else:
         taken = take(scheme, system, x, v, None, prepared, given.loads, partial(advance, adjoint=adjoint))
         x_end, v_end = taken.x, taken.v
@@ -143,7 +144,9 @@ def step_forward(
             value = torch.tensor(to_float(name, value), dtype=model.dtype, device=model.device)
         if not isinstance(value, Tensor):
             known = [k for k, v in values.items() if isinstance(v, (Tensor, float)) or type(v) is int]
-            fail("wrt", f"names of given tensors ({', '.join(known)})", f"{name!r}, which is {type(value).__name__}")
+            what = f"which is {type(value).__name__}" if name in values else "which is not given"
+            meant = "" if name in values or name in model.inputs else where_it_is(name, (*values, *model.inputs))
+            fail("wrt", f"names of given tensors ({', '.join(known)})", f"{name!r}, {what}{meant}")
         check_tensor(name, value, model._mass)
         values[name] = leaves[name] = value.detach().requires_grad_()
     with torch.enable_grad():

@@ -1,6 +1,7 @@
 """Claim: an Embedding places points by weights of vertices: exactly in tets, closest on surfaces, differentiably."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -25,6 +26,14 @@ def test_points_inside_and_outside_stay_where_they_were_given() -> None:
     others = np.linalg.solve(edges[None], (POINTS[:, None] - corners[None, :, 0])[..., None])[..., 0]
     least = np.minimum(others.min(-1), 1 - others.sum(-1)).max(1)
     assert np.array_equal(least >= 0, inside.numpy())
+
+
+def test_points_far_outside_are_warned_of() -> None:
+    with pytest.warns(UserWarning, match=r"points: 1 of 2 lie farther outside .* is point 1 at \[3.0, 0.0, 0.0\]"):
+        dv.Embedding.of_points(MESH, [[0.01, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dv.Embedding.of_points(MESH, [[3.0, 0.0, 0.0]], surface=True)
 
 
 def test_points_on_the_surface_are_the_closest_ones() -> None:

@@ -355,6 +355,7 @@ ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
     ),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=torch.zeros(7, dtype=torch.bool)),)), "7"),
     ("dtype", lambda: dv.Model(MESH).to(dtype=torch.int64), "int64"),
+    ("device", lambda: dv.Model(MESH).to(torch.float32), r"give it as to\(dtype=torch.float32\)"),
     *(
         (n, lambda n=n, bad=bad: dv.memory(dv.Model(MESH), dv.VBD(0.01, 1), **{n: bad}), got)
         for n, bad, got in (("steps", 1.5, "1.5"), ("scenes", True, "bool"), ("save", "most", "most"), ("save", 0, "0"))

@@ -1,109 +1,15 @@
 """Claim: dv.equilibrium finds the rest states that an independent dense Newton solver finds on its own energy."""
 
-import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
-
 import pytest
 import torch
-from helpers.dense_statics import Energy, barrier, newton, potential, residual, weight
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.reference.distance import EDGE_EDGE, POINT_TRIANGLE, distance, log_barrier, mollifier
+from diffvbd.testing.dense_statics import newton, potential, residual, weight
+from diffvbd.testing.soft_scenes import PROBLEMS, Problem, necked, on_floor
 
 SOLVER = dv.VBD(1.0, 0, subspace="coarse")
-
-
-class Problem(NamedTuple):
-    model: dv.Model
-    inputs: dict[str, Any]
-    more: Energy | None = None  # energies beside that of the tets
-    weighs: bool = True
-
-
-def beam(young: Any, poisson: float = 0.3, shape: tuple[int, int, int] = (7, 3, 3),
-         size: tuple[float, float, float] = (0.6, 0.1, 0.1)) -> Problem:  # fmt: skip
-    mesh = dv.mesh.beam(*shape, size=size)
-    return Problem(dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9), {"young": young, "poisson": poisson})
-
-
-def held(place: Callable[[Tensor], Tensor], axis: int = 0) -> Problem:
-    """A beam whose two ends are put somewhere else."""
-    mesh = dv.mesh.beam(7, 3, 3, size=(0.3, 0.1, 0.1)) if axis == 0 else dv.mesh.cube(4, size=0.2)
-    along = mesh.points[:, axis]
-    model = dv.Model(mesh, pinned=(along < along.min() + 1e-9) | (along > along.max() - 1e-9))
-    where = torch.where(model.pinned[:, None], place(model.rest_points), torch.nan)
-    inputs = {"young": 1e5, "poisson": 0.3, "prescribed": where, "gravity": (0.0, 0.0, 0.0)}
-    return Problem(model, inputs, weighs=False)
-
-
-def twisted(x: Tensor) -> Tensor:
-    angle, arm = math.pi / 2 * x[:, 0] / 0.3, x[:, 1:] - x[:, 1:].mean(0)
-    y, z = arm.unbind(1)
-    turned = torch.stack([angle.cos() * y - angle.sin() * z, angle.sin() * y + angle.cos() * z], 1)
-    return torch.cat([x[:, :1], x[:, 1:].mean(0) + turned], 1)
-
-
-def springs(model: dv.Model, stiffness: float, vertices: Tensor) -> Energy:
-    points = model.rest_points[vertices]
-    return lambda x: stiffness / 2 * (x[vertices] - points).square().sum()
-
-
-def anchored() -> Problem:
-    mesh = dv.mesh.beam(7, 3, 3, size=(0.4, 0.1, 0.1))
-    ends = torch.as_tensor((mesh.points[:, 0] < 1e-9) | (mesh.points[:, 0] > 0.4 - 1e-9))
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.Anchor(200.0, vertices=ends)))
-    return Problem(model, {"young": 3e4, "poisson": 0.3}, springs(model, 200.0, ends))
-
-
-def on_floor() -> Problem:
-    mesh = dv.mesh.cube(4, size=0.2)
-    top = torch.as_tensor(mesh.points[:, 1] > 0.2 - 1e-9)
-    floor = dv.FloorBarrier(height=-0.01, kappa=1e4, dhat=0.02)
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor, dv.Anchor(0.1, vertices=top)))
-    hold = springs(model, 0.1, top)
-    return Problem(model, {"young": 1e4, "poisson": 0.3},
-                   lambda x: hold(x) + barrier(x[:, 1] + 0.01, 1e4, 0.02).sum())  # fmt: skip
-
-
-def two_materials() -> Problem:
-    young = torch.where(torch.arange(120) % 2 == 0, 1e5, 1e6).double()
-    return beam(young)
-
-
-def necked(inner: float, outer: float, density: float = 1000.0) -> Problem:
-    """Two blobs that a thin neck joins, and the Young's moduli of the one that is pinned and of the other."""
-    mesh = dv.mesh.beam(11, 3, 3, size=(0.5, 0.2, 0.2))
-    points = mesh.points - mesh.points.mean(0)
-    section = abs(points[:, 0]).clip(0.06, 0.12) * (0.8 / 0.06) - 0.6  # 0.2 in the neck, 1 outside
-    points[:, 1:] *= section[:, None]
-    young = torch.where(torch.as_tensor(points[mesh.tets].mean(1)[:, 0] > 0), outer, inner).double()
-    pinned = points[:, 0] < points[:, 0].min() + 1e-9
-    model = dv.Model(dv.TetMesh(points, mesh.tets), density=density, pinned=pinned)
-    return Problem(model, {"young": young, "poisson": 0.3})
-
-
-def slender(young: float) -> Problem:
-    """40 times as long as thick."""
-    return beam(young, shape=(31, 2, 2), size=(1.2, 0.03, 0.03))
-
-
-PROBLEMS: dict[str, Callable[[], Problem]] = {
-    "small sag": lambda: beam(1e6),
-    "large sag": lambda: beam(5e4),
-    "twisted": lambda: held(twisted),
-    "stretched": lambda: held(lambda x: x * x.new_tensor([2.0, 1.0, 1.0])),
-    "compressed": lambda: held(lambda x: x * x.new_tensor([1.0, 0.7, 1.0]), axis=1),
-    "anchors": anchored,
-    "floor": on_floor,
-    "two materials": two_materials,
-    "neck": lambda: necked(1e6, 1e6),
-    "neck, contrast": lambda: necked(1e8, 1e4),
-    "slender": lambda: slender(2.4e7),
-    "hanging": lambda: slender(4.5e4),  # and stretched by its weight
-    "incompressible": lambda: beam(1e6, 0.4999),
-}
 
 
 def check(problem: Problem, from_rest: bool = True) -> None:
@@ -201,11 +107,7 @@ def test_what_swells_freely_ends_without_stress(factor: float, pins: list[int]) 
 
 def test_what_equilibrium_does_not_know_is_refused() -> None:
     mesh = dv.mesh.cube(2, size=0.1)
-    springs = dv.Springs(dv.Embedding.of_vertices([7]), torch.zeros((1, 3), dtype=torch.float64), 10.0)
-    joined = dv.Model(mesh, pinned=[0], energies=(dv.StableNeoHookean(), springs))
     solver = dv.VBD(1.0, 0)
-    with pytest.raises(NotImplementedError, match="model: expected one without springs"):
-        dv.equilibrium(joined, joined.rest_points, solver, mu=1e4, lam=1e4)
     model = dv.Model(mesh, pinned=[0])
     for name in ("viscosity", "drag"):
         with pytest.raises(ValueError, match=f"{name}: expected none: at rest nothing has moved"):

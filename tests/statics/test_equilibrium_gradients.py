@@ -5,6 +5,8 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.coupled import coupled, inputs_of
+from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -13,12 +15,13 @@ SOLVER = dv.VBD(1.0, 0, subspace="coarse")
 ADJOINT = dv.GlobalAdjoint(tolerance=1e-12)
 
 
-def agrees(model: dv.Model, arguments: dict[str, Tensor], steps: Sequence[float] = (1e-4, 1e-5), **fixed: Any) -> None:
+def agrees(model: dv.Model, arguments: dict[str, Tensor], steps: Sequence[float] = (1e-4, 1e-5),
+           start: Tensor | None = None, **fixed: Any) -> None:  # fmt: skip
     """Compares the gradient of a loss of the rest state with differences; no gradient may be zero."""
     weights = numbers(model.num_vertices, 3, seed=3)
 
     def loss(**inputs: Any) -> Tensor:
-        x = inputs.pop("x", model.rest_points)
+        x = inputs.pop("x", model.rest_points if start is None else start)
         if "prescribed" in inputs:
             inputs["prescribed"] = torch.where(model.pinned[:, None], inputs["prescribed"], torch.nan)
         done = dv.equilibrium(model, x, SOLVER, tolerance=1e-13, adjoint=ADJOINT, **inputs, **fixed)
@@ -100,3 +103,13 @@ def test_colliders(kind: str) -> None:
     kappa = torch.tensor(1e4, dtype=torch.float64)
     agrees(model, {"colliders": model.collider_points, "pair_kappa": kappa}, (1e-4, 1e-5), young=2e4, poisson=0.3,
            gravity=(0.4, -9.0, -0.2))  # fmt: skip
+
+
+@pytest.mark.parametrize("gas", (False, slow(True)))
+def test_springs_tendons_and_pressure(gas: bool) -> None:
+    model = coupled(gas=gas, places=gas)
+    arguments = inputs_of(model)
+    del arguments["v"], arguments["x"]
+    start = dv.equilibrium(model, model.rest_points, SOLVER, **arguments).x  # near those of the differences
+    assert float((start - model.rest_points).abs().max()) > 5e-3
+    agrees(model, {"prescribed": model.rest_points, **arguments}, (1e-5, 1e-6), start=start)

@@ -131,6 +131,10 @@ def test_tets_that_end_inside_out_are_said() -> None:
         assert rest(model, prescribed=low, poisson=0.4).converged
 
 
+def test_it_is_printed_by_its_shape() -> None:
+    assert "x of shape [20, 3], residual=" in repr(rest(beam()))
+
+
 def test_progress_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "diffvbd"):
         done = rest(beam(), progress=True)
@@ -165,6 +169,7 @@ BAD = [
     ({}, {"colliders": torch.ones(3, 3, dtype=torch.float64)}, ValueError, "colliders: expected a Model with"),
     ({}, {"colliders_before": torch.ones(3, 3)}, ValueError, "colliders_before: expected none"),
     ({}, {"anchor_points": 1.0}, TypeError, "anchor_points: expected an input of this Model"),
+    ({}, {"young": 0.0}, ValueError, "young, mu or energies: expected stiffness at every free vertex"),
     (BELOW, {}, ValueError, "x: expected every unpinned vertex above the floor"),
     (PAIRS, {}, ValueError, "x: expected surfaces that do not touch"),
 ]  # fmt: skip

@@ -11,8 +11,8 @@ from helpers.marks import slow
 
 import diffvbd as dv
 from diffvbd.testing import tolerance
+from diffvbd.testing.soft_scenes import STILL, finger, icosphere, pressed_sphere
 
-STILL = (0.0, 0.0, 0.0)
 STATIC = dv.VBD(0.9, 200, relaxation=1.5, subspace="coarse")  # a long step: inertia hardly matters
 
 
@@ -82,14 +82,6 @@ def test_bodies_joined_by_a_spring_at_rest_fly_and_fall_as_one() -> None:
     assert (v - expected).abs().max() < tolerance("free_fall") / 0.01
 
 
-def finger(nodes: tuple[int, int, int], size: tuple[float, float, float], points: int, k: float) -> dv.Model:
-    """A beam along x with a tendon along its upper side."""
-    mesh = dv.mesh.beam(*nodes, size=size)
-    route = np.stack([np.linspace(0, size[0], points), np.full(points, size[1]), np.full(points, size[2] / 2)], 1)
-    tendon = dv.Tendons(dv.Embedding.of_points(mesh, route), [range(points)], k, size[0])
-    return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(dv.StableNeoHookean(), tendon))
-
-
 def tip(model: dv.Model, x: torch.Tensor) -> float:
     points = model.rest_points
     return float((x - points)[points[:, 0] > points[:, 0].max() - 1e-9, 1].mean())
@@ -129,30 +121,6 @@ def test_a_finger_bends_more_the_shorter_its_tendon_which_pulls_alike_everywhere
     assert (found.vertices + found.tendons * total).abs().max() < tolerance("formula")
 
 
-def icosphere(levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of a unit sphere."""
-    t = (1 + 5**0.5) / 2
-    signs = np.array([[-1, t], [1, t], [-1, -t], [1, -t]])
-    zero = np.zeros((4, 1))
-    points = np.concatenate([np.hstack([signs, zero]), np.hstack([zero, signs]), np.hstack([signs[:, 1:], zero,
-                                                                                          signs[:, :1]])])  # fmt: skip
-    distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    near = np.isclose(distance, 2.0)
-    triangles = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k]
-                 and near[i, k]]  # fmt: skip
-    faces = np.array(triangles)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    inward = np.einsum("ni,ni->n", np.cross(b - a, c - a), a) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    for _ in range(levels):
-        sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        edges, inverse = np.unique(sides, axis=0, return_inverse=True)
-        (a, b, c), (ab, bc, ca) = faces.T, len(points) + inverse.reshape(3, -1)
-        points = np.concatenate([points, points[edges].mean(1)])
-        faces = np.concatenate([np.stack(f, 1) for f in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-    return points / np.linalg.norm(points, axis=1, keepdims=True), faces
-
-
 @pytest.mark.parametrize(("levels", "thickness"), [(2, 0.05), pytest.param(3, 0.02, marks=pytest.mark.hours)])
 def test_a_sphere_under_pressure_grows_as_the_closed_form_says(levels: int, thickness: float) -> None:
     """Lame's thick sphere; where the wall is thin, also dr = p R^2 (1 - nu) / (2 E t)."""
@@ -162,9 +130,7 @@ def test_a_sphere_under_pressure_grows_as_the_closed_form_says(levels: int, thic
     solver = dv.VBD(0.9, 500 if levels == 2 else 1500, relaxation=1.6, subspace="coarse")
     x = rest(model, 2, solver, young=young, poisson=nu, gravity=STILL, pressure=p)
     growth = float((x.norm(dim=1) - model.rest_points.norm(dim=1)).mean())
-    a, b = 1 - thickness / 2, 1 + thickness / 2
-    thick = p * a**3 / (young * (b**3 - a**3)) * ((1 - 2 * nu) + (1 + nu) * b**3 / 2)
-    assert growth == pytest.approx(thick, rel=tolerance("pressed_sphere"))
+    assert growth == pytest.approx(pressed_sphere(young, nu, p, thickness), rel=tolerance("pressed_sphere"))
     if thickness <= 0.02:
         assert growth == pytest.approx(p * (1 - nu) / (2 * young * thickness), rel=tolerance("pressed_sphere"))
 

@@ -29,6 +29,8 @@ def model(energy: Any, mesh: dv.TetMesh = BOX) -> dv.Model:
         (lambda: dv.Springs(ONE, torch.zeros(1, 3).requires_grad_(), 1.0), "second: .*pass spring_points= to a step"),
         (lambda: dv.Springs(ONE, torch.full((1, 3), NAN), 1.0), "second: expected finite numbers, got nan"),
         (lambda: dv.Springs(TWO, TWO, -1.0), "stiffness: expected numbers >= 0 N/m, got -1.0"),
+        (lambda: dv.Springs(TWO, TWO, True), "stiffness: expected numbers, got True"),
+        (lambda: dv.Springs(TWO, TWO, torch.ones(2) > 0), "stiffness: expected numbers, got tensor"),
         (lambda: dv.Springs(TWO, TWO, NAN), "stiffness: expected finite numbers, got nan"),
         (lambda: dv.Springs(TWO, TWO, torch.ones(3)), r"stiffness: expected a number or shape \[2\], one for each"),
         (lambda: dv.Springs(TWO, TWO, 1.0, "long"), "rest_length: expected numbers"),
@@ -106,6 +108,12 @@ def test_what_a_bound_has_not_is_refused() -> None:
             call(SCENE, x, torch.zeros_like(x), SOLVER, mu=1e4, lam=1e4, adjoint=dv.GlobalAdjoint())
     with pytest.raises(NotImplementedError, match="errors: the error of a step with springs, tendons or pressure"):
         dv.rollout(SCENE, x, torch.zeros_like(x), SOLVER, steps=1, mu=1e4, lam=1e4, checks=dv.Checks(errors=True))
+
+
+def test_results_are_printed_by_their_shapes() -> None:
+    of = model(dv.Springs(TWO, TWO, 1.0))
+    found = repr(dv.coupling_forces(of, of.rest_points))
+    assert found == f"CouplingForces(springs of shape [2, 3], vertices of shape [{of.num_vertices}, 3])"
 
 
 def test_inputs_are_declared_and_models_are_copied() -> None:

@@ -4,7 +4,6 @@ implicit, in every scheme, and their gradients are exact."""
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from helpers.bad_input import INF, NAN, raises
@@ -16,9 +15,7 @@ from diffvbd.model.system import system_of
 from diffvbd.ops import SweepFields
 from diffvbd.step.arguments import given_of, prepare
 from diffvbd.step.damping import damped
-
-NO_GRAVITY = (0.0, 0.0, 0.0)
-MODULI = dict(zip(("mu", "lam"), dv.lame(1e6, 0.3), strict=True))
+from diffvbd.testing.soft_scenes import MODULI, STILL, Mode
 
 
 def randn(*shape: int, seed: int = 0) -> Tensor:
@@ -60,42 +57,9 @@ def test_viscous_force_of_a_small_strain() -> None:
     assert float(on[face, 1].sum()) == pytest.approx(0.04 * 200 * rate, rel=1e-5)
 
 
-class Mode:
-    """The lowest mode of a clamped beam and its motion from a small velocity."""
-
-    def __init__(self) -> None:
-        mesh = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
-        self.model = model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)
-        self.free = ~model.pinned
-        x = model.rest_points
-        rows = [forces(model, x, x + 1e-7 * unit, **MODULI) - forces(model, x, x - 1e-7 * unit, **MODULI)
-                for unit in torch.eye(x.numel(), dtype=torch.float64).reshape(-1, *x.shape)]  # fmt: skip
-        keep = self.free.repeat_interleave(3)
-        stiffness = (torch.stack(rows).reshape(x.numel(), -1) / 2e-7)[keep][:, keep].numpy()
-        root = np.sqrt(model.mass.repeat_interleave(3)[keep].numpy())
-        values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2 / np.outer(root, root))
-        self.frequency = float(np.sqrt(values[0]))
-        self.shape = torch.zeros_like(x)
-        self.shape[self.free] = torch.from_numpy(vectors[:, 0] / root).reshape(-1, 3)
-
-    def amplitudes(self, solver: dv.VBD, steps: int, **damping: Any) -> Tensor:
-        x = self.model.rest_points
-        motion = dv.rollout(
-            self.model, x, 1e-5 * self.shape, solver, steps=steps, gravity=NO_GRAVITY, **MODULI, **damping
-        )
-        weight = self.model.mass[:, None] * self.shape
-        return ((motion.x - x) * weight).sum((-2, -1)) * 1e5
-
-
 @pytest.fixture(scope="module")
 def mode() -> Mode:
     return Mode()
-
-
-def ring(t: Tensor, frequency: float, ratio: Any) -> Tensor:
-    """Displacement of a damped mode with unit velocity at t = 0."""
-    damped = frequency * (1 - ratio**2) ** 0.5
-    return torch.exp(-ratio * frequency * t) * torch.sin(damped * t) / damped
 
 
 @pytest.mark.parametrize("integrator", (dv.SDIRK2(), dv.BDF2()), ids=str)
@@ -103,13 +67,9 @@ def ring(t: Tensor, frequency: float, ratio: Any) -> Tensor:
 def test_ring_down_at_the_rate_of_theory(mode: Mode, kind: str, integrator: Any) -> None:
     w, ratio, per_period = mode.frequency, 0.05, 60 if isinstance(integrator, dv.SDIRK2) else 120
     steps = 2 * per_period
-    rate = 2 * ratio / w
-    damping = {"viscosity": rate * MODULI["mu"], "volume_viscosity": rate * MODULI["lam"]}
-    damping = damping if kind == "viscosity" else {"drag": 2 * ratio * w}
-    h = 2 * math.pi / w / per_period
-    solver = dv.VBD(h, sweeps=30, relaxation=1.5, subspace="coarse", integrator=integrator)
-    found = mode.amplitudes(solver, steps, **damping)
-    exact = ring(h * torch.arange(steps + 1, dtype=torch.float64), w, ratio)
+    damping = mode.viscosities(ratio) if kind == "viscosity" else {"drag": 2 * ratio * w}
+    solver = mode.solver(per_period, 30, integrator)
+    found, exact = mode.amplitudes(solver, steps, **damping), mode.ring(solver, steps, ratio)
     assert float((found - exact).abs().max()) < 0.01 * float(exact.abs().max())
     undamped = mode.amplitudes(solver, steps)
     assert float((undamped - exact).abs().max()) > 0.3 * float(exact.abs().max())
@@ -117,22 +77,7 @@ def test_ring_down_at_the_rate_of_theory(mode: Mode, kind: str, integrator: Any)
 
 def test_damping_ratio_recovered_from_a_noisy_motion(mode: Mode) -> None:
     """To 1 % with 1 % of noise, by the gradient of the rollout."""
-    w, steps, true = mode.frequency, 120, 0.04
-    h = 2 * math.pi / w / 40
-    solver = dv.VBD(h, sweeps=20, relaxation=1.5, subspace="coarse", integrator=dv.SDIRK2())
-    clean = ring(h * torch.arange(steps + 1, dtype=torch.float64), w, true)
-    seen = clean + 0.01 * clean.abs().max() * randn(steps + 1, seed=3)
-    ratio = torch.tensor(0.06, dtype=torch.float64, requires_grad=True)
-    for _ in range(3):  # Newton's method on a curve that is almost linear in log(ratio)
-        rate = 2 * ratio / w
-        found = mode.amplitudes(solver, steps, viscosity=rate * MODULI["mu"], volume_viscosity=rate * MODULI["lam"])
-        weight = ring(h * torch.arange(steps + 1, dtype=torch.float64), w, ratio.detach() * 1.02)
-        weight = weight - ring(h * torch.arange(steps + 1, dtype=torch.float64), w, ratio.detach() / 1.02)
-        miss = ((found - seen) * weight).sum()
-        (slope,) = torch.autograd.grad(miss, ratio)
-        assert float(slope) != 0
-        ratio = (ratio - miss.detach() / slope).detach().requires_grad_()
-    assert float(ratio.detach()) == pytest.approx(true, rel=0.01)
+    assert mode.recovered(0.04) == pytest.approx(0.04, rel=0.01)
 
 
 @pytest.mark.parametrize("steps", (1, 20))
@@ -153,7 +98,7 @@ def test_stable_where_an_explicit_force_is_not() -> None:
     model = dv.Model(dv.mesh.cube(3, size=0.1))
     x, v = model.rest_points, 0.5 * randn(model.mesh.num_vertices, 3)
     motion = dv.rollout(model, x, v, dv.VBD(0.02, sweeps=10), steps=30, viscosity=1e5, volume_viscosity=1e5, drag=100.0,
-                        gravity=NO_GRAVITY, **MODULI)  # fmt: skip
+                        gravity=STILL, **MODULI)  # fmt: skip
     assert float(motion.v[-1].abs().max()) < 1e-3
     assert float(motion.v[1:].norm(dim=(-2, -1)).diff().max()) < 1e-3
 
@@ -168,7 +113,7 @@ def test_spin_is_kept_and_momentum_is_not_made() -> None:
         weight, at = model.mass[:, None], motion.x[-1] - motion.x[-1].mean(0)
         return (weight * motion.v[-1]).sum(0), torch.linalg.cross(at, weight * motion.v[-1]).sum(0)
 
-    ends = [momenta(dv.rollout(model, x, v, dv.VBD(0.005, 20), steps=40, gravity=NO_GRAVITY, **MODULI, **damping))
+    ends = [momenta(dv.rollout(model, x, v, dv.VBD(0.005, 20), steps=40, gravity=STILL, **MODULI, **damping))
             for damping in ({}, {"viscosity": 3e3, "volume_viscosity": 3e3})]  # fmt: skip
     assert float((ends[0][0] - ends[1][0]).abs().max()) < 1e-12
     assert float((ends[0][1] - ends[1][1]).norm() / ends[0][1].norm()) < 2e-3
@@ -182,9 +127,7 @@ def test_strong_viscosity_neither_swells_nor_drives_a_turning_body(integrator: A
     spin = torch.tensor([0.0, 0.0, 5.5], dtype=torch.float64)
     v = torch.linalg.cross(spin.expand_as(x), x - x.mean(0))
     solver = dv.VBD(0.01, 30, subspace="coarse", integrator=integrator)
-    motion = dv.rollout(
-        model, x, v, solver, steps=50, viscosity=1e5, volume_viscosity=1e5, gravity=NO_GRAVITY, **MODULI
-    )
+    motion = dv.rollout(model, x, v, solver, steps=50, viscosity=1e5, volume_viscosity=1e5, gravity=STILL, **MODULI)
     energy = (model.mass[:, None] * motion.v.square()).sum((-2, -1))
     size = (motion.x - motion.x.mean(1, keepdim=True)).norm(dim=(-2, -1))
     assert float(energy.max() / energy[0]) < 1.002 and float(energy[-1] / energy[0]) > 0.85
@@ -264,6 +207,14 @@ def test_gradient_of_a_viscosity_of_zero_without_shear_modulus() -> None:
     assert float(slope) == pytest.approx(float((loss(at[1]) - loss(at[0])).detach()) / 1e-4, rel=1e-3)
 
 
+def test_stress_is_the_elastic_one_and_says_so() -> None:
+    model = dv.Model(dv.mesh.cube(2, size=0.2))
+    x = model.rest_points * 1.1
+    with pytest.warns(UserWarning, match="viscosity: the stress is the elastic one alone"):
+        damped = dv.stress(model, x, viscosity=1.0, **MODULI)
+    assert torch.equal(damped.cauchy, dv.stress(model, x, **MODULI).cauchy)
+
+
 def test_float32() -> None:
     model = dv.Model(dv.mesh.cube(3, size=0.2), dtype=torch.float32)
     twin = dv.Model(dv.mesh.cube(3, size=0.2))
@@ -287,6 +238,9 @@ def test_bad_input() -> None:
             raises(lambda name=name, value=value: step(**{name: value}), name, f"got {value:g}")
         raises(lambda name=name: step(**{name: torch.ones(5, dtype=torch.float64)}), name, r"shape \[5\]")
         raises(lambda name=name: step(**{name: torch.ones(6)}), name, "torch.float32")
+        batch = torch.tensor([1.0, -1.0], dtype=torch.float64)
+        raises(lambda name=name, batch=batch: torch.func.vmap(lambda b: dv.step(
+            model, x, v, dv.VBD(0.01, 2), **MODULI, **{name: b})[0])(batch), name, "got -1")  # fmt: skip
     raises(lambda: step(solver=dv.VBD.paper(0.01, 2), viscosity=1.0), "viscosity", 'block="paper"')
     with pytest.raises(NotImplementedError, match="damping with SDIRK2"):
         dv.step(model, x, v, dv.VBD(0.01, 2, integrator=dv.SDIRK2()), adjoint=dv.Unrolled(), drag=1.0, **MODULI)

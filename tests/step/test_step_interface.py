@@ -248,6 +248,8 @@ def test_step_forward_keeps_a_tape_for_wrt_only(device: str) -> None:
         dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("force",), **STEP)
     with pytest.raises((ValueError, TypeError), match="wrt.*x, v, mu.*stiffness"):
         dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("stiffness",), **STEP)
+    with pytest.raises(ValueError, match="wrt.*'viscosty', which is not given: is 'viscosity' meant"):
+        dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("viscosty",), **STEP)
 
 
 # --- check_gradients --------------------------------------------------------------------------------------------------

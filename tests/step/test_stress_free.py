@@ -9,6 +9,7 @@ from helpers.bad_input import raises
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.testing.soft_scenes import recovered_activation
 
 MATERIAL: dict[str, Any] = {"young": 1e5, "poisson": 0.3}
 NO_GRAVITY = (0.0, 0.0, 0.0)
@@ -64,37 +65,9 @@ def test_fibres_contract_at_constant_volume() -> None:
 
 
 def test_activation_recovered_from_a_motion() -> None:
-    """To 0.1 %, of four muscles at once, by Gauss-Newton's method on the frames of a motion."""
-    model = bar()
-    x, v = model.rest_points, torch.zeros_like(model.rest_points)
-    tets = model.mesh.tets
-    centers = torch.from_numpy(model.mesh.points[tets].mean(1))
-    muscle = (centers[:, 0] > 0.2).long() + 2 * (centers[:, 1] > centers[:, 1].mean()).long()
-    along = matrix((1.0, 0.0, 0.0)).expand(len(tets), 3)
-    solver = dv.VBD(0.01, sweeps=8)
-
-    def frames(activation: Tensor) -> Tensor:
-        g = dv.fibre_contraction(along, activation[muscle])
-        motion = dv.rollout(
-            model, x, v, solver, steps=12, stress_free=lambda k, x, v: g, gravity=NO_GRAVITY, **MATERIAL
-        )
-        return motion.x
-
+    """To 0.1 %, of four muscles at once, by the gradient of the frames of a motion."""
     true = torch.tensor([0.05, 0.15, 0.25, 0.1], dtype=torch.float64)
-    noise = 1e-5 * torch.randn(frames(true).shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    seen = frames(true) + noise
-    found = torch.full((4,), 0.1, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.LBFGS([found], max_iter=16, line_search_fn="strong_wolfe", tolerance_grad=1e-14,
-                                  tolerance_change=1e-16)  # fmt: skip
-
-    def loss() -> Tensor:
-        optimizer.zero_grad()
-        error = 1e4 * (frames(found) - seen).square().sum()
-        error.backward()
-        return error
-
-    optimizer.step(loss)
-    assert float((found.detach() / true - 1).abs().max()) < 1e-3
+    assert float((recovered_activation(true) / true - 1).abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("subspace", ("rigid", "coarse"))
