@@ -52,7 +52,16 @@ def hessian(model: dv.Model, mu: float, lam: float) -> Tensor:
     system, one = system_of(model, SOLVER), torch.ones(1, 1, dtype=torch.float64)
     x = model.rest_points[None]
     none = x.new_zeros((1, 0, 3))
-    given = Statics(torch.zeros_like(x), mu * one, lam * one, model.rest_scalars, x.new_zeros((1, 0)), none, one[0])
+    given = Statics(
+        torch.zeros_like(x),
+        mu * one,
+        lam * one,
+        model.rest_scalars,
+        x.new_zeros((1, 0)),
+        none,
+        one[0],
+        x.new_zeros((1, 0)),
+    )
     at = StaticPotential(system, x, given)
     columns = torch.eye(x.numel(), dtype=x.dtype).reshape(-1, 1, *x.shape[1:])
     return torch.stack([at.product(c).flatten() for c in columns], -1)
@@ -75,7 +84,8 @@ def test_the_hessian_is_the_derivative_of_the_forces_and_these_that_of_the_energ
     lam = model.patches.spread(model.patches.mean(lam, model.rest_scalars[..., 6]))
     x = model.rest_points[None] + numbers(1, model.num_vertices, 3, size=0.1)
     rest = model.rest_scalars
-    given = Statics(torch.zeros_like(x), mu, lam, rest, x.new_zeros((1, 0)), x.new_zeros((1, 0, 3)), x.new_ones(1))
+    given = Statics(torch.zeros_like(x), mu, lam, rest, x.new_zeros((1, 0)), x.new_zeros((1, 0, 3)), x.new_ones(1),
+                    x.new_zeros((1, 0)))  # fmt: skip
     at, w = StaticPotential(system, x, given), numbers(*x.shape, seed=1)
     leaf = x.clone().requires_grad_()
     (force,) = torch.autograd.grad(energy_of(model, leaf[0], mu[0], lam[0]), leaf, create_graph=True)
