@@ -73,6 +73,10 @@ template <class T>
 DIFFVBD_FN Lanes<T> operator/(const Lanes<T>& a, const Lanes<T>& b) {
   return Lanes<T>(a.v / b.v);
 }
+template <class T>
+DIFFVBD_FN const Lanes<T>& value_of(const Lanes<T>& a) {
+  return a;
+}
 // A comparison yields a vector of integers, all bits set where it holds.
 template <class I>
 struct Mask {
@@ -123,6 +127,27 @@ DIFFVBD_FN Lanes<T> natural_log(const Lanes<T>& a) {
     r.v[l] = std::log(a.v[l]);
   }
   return r;
+}
+template <class T, class F>
+DIFFVBD_FN Lanes<T> each_lane(const Lanes<T>& a, const F& f) {
+  Lanes<T> r;
+  for (int l = 0; l < kLanes; ++l) {
+    clear_upper_halves();
+    r.v[l] = f(a.v[l], l);
+  }
+  return r;
+}
+template <class T>
+DIFFVBD_FN Lanes<T> exponential(const Lanes<T>& a) {
+  return each_lane(a, [](T value, int) { return std::exp(value); });
+}
+template <class T>
+DIFFVBD_FN Lanes<T> power(const Lanes<T>& a, const Lanes<T>& p) {
+  return each_lane(a, [&](T value, int l) { return std::pow(value, p.v[l]); });
+}
+template <class T>
+DIFFVBD_FN Lanes<T> power_of_two(const Lanes<T>& a) {
+  return each_lane(a, [](T value, int) { return diffvbd::power_of_two(value); });
 }
 
 // --- rows of four scalars (x, y, z, unused) <-> lanes ----------------------------------------------------------------

@@ -286,8 +286,8 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
   check_vectors("x", in.x_prev, in.scenes, n);
   check_vectors("predictor (x, v, force, gravity, prescribed)", in.y, in.scenes, n);
   check_vectors("start (x, v, force, gravity, prescribed)", in.x_start, in.scenes, n);
-  if (in.energies & kExactBlock) check_material<StableNeoHookean<true>>(in, plan.num_tets);
-  if (in.energies & kPaperBlock) check_material<StableNeoHookean<false>>(in, plan.num_tets);
+  if (in.energies & kExactBlock) check_material<ElasticLaw<true>>(in, plan.num_tets);
+  if (in.energies & kPaperBlock) check_material<ElasticLaw<false>>(in, plan.num_tets);
   // Vertices that no sweep moves need no mass: an isolated vertex has none.
   for (int64_t b = 0; b < distinct_scenes(in.mass, in.scenes); ++b) {
     for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {

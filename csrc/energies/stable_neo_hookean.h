@@ -16,6 +16,7 @@ namespace diffvbd {
 
 template <bool Exact>
 struct StableNeoHookean {
+  static constexpr bool quadratic = true;  // in the position of one vertex
   // The material of a tet: mu, lam [Pa].
   template <class R>
   DIFFVBD_FN static const R& mu(const TetPair<R>& e) {

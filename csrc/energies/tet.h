@@ -3,9 +3,13 @@
 #pragma once
 
 #include "../core/views.h"
+#ifdef DIFFVBD_LAW_HEADER
+#include "own_layout.h"
+#endif
 
 namespace diffvbd {
 
+#ifndef DIFFVBD_LAW_HEADER
 // Material and rest shape of the law that scenes use (stable_neo_hookean.h).
 struct TetLayout {
   static constexpr int material = 2;   // of a tet: mu, lam [Pa]
@@ -16,12 +20,14 @@ struct TetLayout {
     return i == 3 ? 6 : weight_index(local, other_corner(local, i));
   }
   static constexpr int line_degree = 6;  // of the tet's energy along a line, a polynomial: StableNeoHookean::line()
+  static constexpr bool polynomial = true;
 
   template <class T>
   DIFFVBD_FN static T volume(const T* rest) {
     return 1 / (6 * rest[6]);
   }
 };
+#endif
 constexpr int kMaterialScalars = TetLayout::material;
 constexpr int kRestScalars = TetLayout::rest, kPairRest = TetLayout::pair_rest;
 
