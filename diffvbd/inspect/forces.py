@@ -18,7 +18,8 @@ from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..couplings import Pressure, Springs, Tendons
-from ..energies import StableNeoHookean
+from ..laws.tets import cauchy
+from ..model.arguments import ELASTIC_LAWS
 from ..model.material import deformed, shape_gradients
 from ..model.model import Model
 from ..model.solver import VBD
@@ -420,7 +421,7 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
         cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
 
     Args:
-        model: A scene with StableNeoHookean tets.
+        model: A scene with StableNeoHookean tets, or a law of your own.
         x: Positions [m], shape [..., V, 3].
         inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read.
 
@@ -435,11 +436,15 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     """
     check_state(model, x, x)
     lead = x.shape[:-2]
-    if not any(isinstance(energy, StableNeoHookean) for energy in model.energies):
+    if not any(isinstance(energy, ELASTIC_LAWS) for energy in model.energies):
         fail("model", "StableNeoHookean among its energies", "none")
     given_inputs = given_of(model, inputs)
     rest_points, stress_free = (given_inputs.material[name] for name in ("rest_points", "stress_free"))
-    given = widen(model, x, None, Given(given_inputs.material, {}, {}))
+    own = {} if model.law is None else given_inputs.parameters
+    given = widen(model, x, None, Given(given_inputs.material, own, {}))
+    if model.law is not None:
+        scalars = given.prepared.rest.expand(lead.numel(), -1, -1).unflatten(0, lead)
+        return _stress_of(cauchy(model.law.density, x.double()[..., given.model._topology[0], :], scalars), x)
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)
     rest = points.expand(x.shape)[..., tets, :]
@@ -456,7 +461,11 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     eye = torch.eye(3, dtype=f.dtype, device=f.device)
     left = (f[..., :, None, :] * f[..., None, :, :]).sum(-1)
     pressure = (shear + second) * (det - 1) - shear
-    cauchy = (shear / det)[..., None, None] * left + pressure[..., None, None] * eye
+    return _stress_of((shear / det)[..., None, None] * left + pressure[..., None, None] * eye, x)
+
+
+def _stress_of(cauchy: Tensor, x: Tensor) -> Stress:
+    eye = torch.eye(3, dtype=cauchy.dtype, device=cauchy.device)
     trace = cauchy.diagonal(dim1=-2, dim2=-1).sum(-1)
     square = 1.5 * (cauchy - (trace / 3)[..., None, None] * eye).square().sum((-2, -1))
     unloaded = square == 0  # a root has no derivative at zero
