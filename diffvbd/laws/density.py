@@ -9,6 +9,7 @@ import hashlib
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -108,7 +109,7 @@ class Density:
             lines += ["  template <class S, class R>",
                       f"  DIFFVBD_FN static {kind} {name}(const Invariants<S>& v, const R* p{argument}) {{"]  # fmt: skip
             statements, results = self._statements(expressions)
-            lines += [f"    {statement}" for statement in statements]
+            lines += [f"    const auto {symbol} = {text};" for symbol, text in statements]
             results = [f"S({r})" for r in results]
             if name == "by_parameters":
                 lines += [f"    out[{i}] = {r};" for i, r in enumerate(results)]
@@ -122,7 +123,8 @@ class Density:
     def digest(self) -> str:
         return hashlib.sha256(self.header.encode()).hexdigest()[:16]
 
-    def _statements(self, expressions: Sequence[Any]) -> tuple[list[str], list[str]]:
+    def _statements(self, expressions: Sequence[Any]) -> tuple[list[tuple[str, str]], list[str]]:
+        """Common subexpressions and results, as text that is C++ and Python alike."""
         import sympy
 
         names = dict(zip(self.invariants, ("v.i1", "v.i2", "v.j", "v.i4"), strict=True)) | {self.below: "v.below"}
@@ -130,19 +132,24 @@ class Density:
         shared, results = sympy.cse(list(expressions), symbols=sympy.numbered_symbols("t"))
         statements = []
         for symbol, expression in shared:
-            statements.append(f"const auto {symbol.name} = {_cpp(expression, names)};")
+            statements.append((symbol.name, _text(expression, names)))
             names[symbol] = symbol.name
-        return statements, [_cpp(r, names) for r in results]
+        return statements, [_text(r, names) for r in results]
 
     # --- as torch -----------------------------------------------------------------------------------------------------
 
+    def _function(self, expressions: Sequence[Any]) -> Callable[[Any, Sequence[Tensor]], list[Any]]:
+        statements, results = self._statements(expressions)
+        lines = [f"{symbol} = {text}" for symbol, text in statements]
+        code = "\n    ".join(["def evaluate(v, p):", *lines, f"return [{', '.join(results)}]"])
+        space: dict[str, Any] = {"R": float, "natural_log": torch.log, "exponential": torch.exp, "power": torch.pow,
+                                 "square_root": torch.sqrt, "stretch_sum": stretch_sum}  # fmt: skip
+        exec(code, space)
+        return space["evaluate"]
+
     def function(self, name: str) -> Callable[[Sequence[Tensor], Sequence[Tensor]], list[Tensor]]:
         """derived[name] as a function of (I1, I2, J, I4) and of the parameters in their order."""
-        import sympy
-
-        symbols = [sympy.Symbol(p, real=True) for p in self.parameters]
-        modules = [{STRETCHES: stretch_sum, "log": torch.log, "exp": torch.exp, "sqrt": torch.sqrt}, "torch"]
-        raw = sympy.lambdify([*self.invariants, self.below, *symbols], self.derived[name], modules, cse=True)
+        raw = self._function(self.derived[name])
 
         def evaluate(invariants: Sequence[Tensor], parameters: Sequence[Tensor]) -> list[Tensor]:
             i1, i2, j, i4 = invariants
@@ -150,7 +157,8 @@ class Density:
             if self.guarded:
                 small = j < LEAST_VOLUME
                 below, at = torch.where(small, j - LEAST_VOLUME, 0.0), torch.where(small, LEAST_VOLUME, j)
-            return [torch.as_tensor(r, dtype=j.dtype, device=j.device) for r in raw(i1, i2, at, i4, below, *parameters)]
+            v = SimpleNamespace(i1=i1, i2=i2, j=at, i4=i4, below=below)
+            return [torch.as_tensor(r, dtype=j.dtype, device=j.device) for r in raw(v, parameters)]
 
         return evaluate
 
@@ -180,9 +188,8 @@ class Density:
                         i2: squares[0] * squares[1] + squares[1] * squares[2] + squares[2] * squares[0]})  # fmt: skip
         rest = {s: 1 for s in stretches}
         own, other, stress = (e.subs(rest) for e in (psi.diff(a, 2), psi.diff(a, b), psi.diff(a)))
-        symbols = [sympy.Symbol(p, real=True) for p in self.parameters]
-        raw = sympy.lambdify(symbols, [_short((own - other + stress) / 2), _short(other - stress), stress], "torch")
-        return raw
+        raw = self._function([_short((own - other + stress) / 2), _short(other - stress), stress])
+        return lambda *parameters: tuple(raw(None, parameters))
 
 
 def _parsed(text: str) -> tuple[Any, dict[str, Any]]:
@@ -257,17 +264,17 @@ def _is_zero(expression: Any) -> bool:
     return expression == 0 or expression.expand() == 0
 
 
-def _cpp(e: Any, names: dict[Any, str]) -> str:
-    """An expression over numbers R and S of csrc/energies/own_law.h."""
+def _text(e: Any, names: dict[Any, str]) -> str:
+    """An expression over the numbers R and S of csrc/energies/own_law.h."""
     if e in names:
         return names[e]
-    if e.is_Number:
+    if e.is_number:
         return f"R({float(e)!r})"
     if e.is_Add or e.is_Mul:
-        joined = (" + " if e.is_Add else " * ").join(_cpp(a, names) for a in sorted(e.args, key=_constants_first))
+        joined = (" + " if e.is_Add else " * ").join(_text(a, names) for a in sorted(e.args, key=_constants_first))
         return f"({joined})"
     if e.is_Pow:
-        base, exponent = _cpp(e.base, names), e.exp
+        base, exponent = _text(e.base, names), e.exp
         if exponent.is_Integer and 1 < abs(exponent) <= 8:
             power = "(" + " * ".join([base] * abs(int(exponent))) + ")"
             return power if exponent > 0 else f"(R(1) / {power})"
@@ -277,9 +284,9 @@ def _cpp(e: Any, names: dict[Any, str]) -> str:
             return f"square_root({base})" if exponent > 0 else f"(R(1) / square_root({base}))"
         if exponent.is_number:
             return f"power({base}, R({float(exponent)!r}))"
-        return f"exponential({_cpp(exponent, names)} * natural_log({base}))"
+        return f"exponential({_text(exponent, names)} * natural_log({base}))"
     function = {"log": "natural_log", "exp": "exponential", STRETCHES: "stretch_sum"}[e.func.__name__]
-    return f"{function}({', '.join(_cpp(a, names) for a in e.args)})"
+    return f"{function}({', '.join(_text(a, names) for a in e.args)})"
 
 
 def _constants_first(e: Any) -> tuple[bool, str]:

@@ -170,7 +170,7 @@ def build_scene(
 
     own = next((e for e in getattr(model, "energies", ()) if getattr(e, "name", None) == "law"), None)
     if own is not None:  # its parameters may have the names of moduli
-        parameters = {**(parameters or {}), **{k: v for k, v in (("mu", mu), ("lam", lam)) if k in own.values}}
+        parameters = {**{k: v for k, v in (("mu", mu), ("lam", lam)) if k in own.values}, **(parameters or {})}
         mu, lam, _ = own.at_rest(law_values(own, parameters, per_tet))
     points = torch.as_tensor(model.rest_points if rest_points is None else rest_points, device=like.device)
     points = points.to(like).transpose(-1, -2)
