@@ -102,7 +102,7 @@ struct Scene {
     view.mass = mass.get();
     if (in.energies & kElastic) {
       material = Buffer<T>(size_t(plan.slots) * kMaterialScalars * kLanes);
-      for (int m = 0; m < kMaterialScalars; ++m) {
+      for (int m = 0; TetLayout::reads_material && m < kMaterialScalars; ++m) {
         for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
           const Batched<const T>& given = in.material[m];
           const int64_t tet = plan.pair[i] >> 2, slot = i / kLanes;
@@ -519,7 +519,11 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, const uint8_t*, \
                                const StepAdjoints<T>&);                                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);
+#ifdef DIFFVBD_SCALAR
+DIFFVBD_INSTANTIATE(DIFFVBD_SCALAR)
+#else
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
+#endif
 
 }  // namespace diffvbd

@@ -13,6 +13,12 @@
 #include "../core/safeguards.h"
 #include "tet.h"
 
+#ifdef __CUDACC__
+#define DIFFVBD_INLINED
+#else
+#define DIFFVBD_INLINED __attribute__((always_inline))
+#endif
+
 namespace diffvbd {
 
 template <class A, class B>
@@ -200,11 +206,11 @@ struct OwnLaw {
       h_diagonal = h_diagonal + of_volume * b;
     }
     const R scales[4] = {R(12) * c6(e), R(12) * c6(e), c6(e), R(2)};  // of grad I_k = scale a_k
-    each_below<4>([&](auto row) {
+    each_below<4>([&](auto row) DIFFVBD_INLINED {
       constexpr int i = decltype(row)::value;
       if constexpr (Density::couples(i)) {
         Vec3<R> sum = zero3<R>();
-        each_below<4>([&](auto column) {
+        each_below<4>([&](auto column) DIFFVBD_INLINED {
           constexpr int l = decltype(column)::value;
           if constexpr (Density::couples(i, l)) {
             // V scale_i scale_l, in which V c6 = 1 / 6
@@ -262,7 +268,7 @@ struct OwnLaw {
     const R* k = e.rest;
     const auto& s = v.s;
     const R twice = R(-2) * minus_h2, sixth = R(1) / R(6) * minus_h2;
-    const auto pulled = [&](const R& weight, const auto& edge) {
+    const auto pulled = [&](const R& weight, const auto& edge) DIFFVBD_INLINED {
       return (twice * weight) * extract(stressed(v.w, s.m, edge));
     };
     const Vec3<R> ij = pulled(k[0], s.d), ik = pulled(k[1], plus(s.ek, -s.d)), il = pulled(k[2], plus(s.el, -s.d));
@@ -272,7 +278,7 @@ struct OwnLaw {
     out.xk = ik + cross(s.el, u);
     out.xl = il + cross(u, s.ek);
     if constexpr (L::edges) {
-      const auto still = [&](const R& weight, const Vec3<R>& edge) {
+      const auto still = [&](const R& weight, const Vec3<R>& edge) DIFFVBD_INLINED {
         return (twice * weight) * extract(stressed(v.w, s.m, edge));
       };
       const Vec3<R> kl = still(k[5], s.el - s.ek);
@@ -298,7 +304,7 @@ struct OwnLaw {
     const auto& s = v.s;
     const R* p = e.rest + L::pair_parameters;
     const R of_volume = minus_h2 * volume(c6(e));
-    const auto squared = [&](const auto& edge) {
+    const auto squared = [&](const auto& edge) DIFFVBD_INLINED {
       return -(minus_h2 * extract(inner(edge, stressed(v.w, s.m, edge))));
     };
     rest_bar[0] = squared(s.d), rest_bar[1] = squared(plus(s.ek, -s.d)), rest_bar[2] = squared(plus(s.el, -s.d));

@@ -59,7 +59,7 @@ struct TetLayout {
     return parameters + i - pair_parameters;
   }
   static constexpr int line_degree = 8;  // changes of the tet's energy along a line: OwnLaw::line()
-  static constexpr bool polynomial = false;
+  static constexpr bool polynomial = false, reads_material = false;
 
   template <class T>
   DIFFVBD_FN static T volume(const T* rest) {

@@ -20,7 +20,7 @@ struct TetLayout {
     return i == 3 ? 6 : weight_index(local, other_corner(local, i));
   }
   static constexpr int line_degree = 6;  // of the tet's energy along a line, a polynomial: StableNeoHookean::line()
-  static constexpr bool polynomial = true;
+  static constexpr bool polynomial = true, reads_material = true;
 
   template <class T>
   DIFFVBD_FN static T volume(const T* rest) {

@@ -87,7 +87,7 @@ class Model:
         self.mesh = mesh
         self._derived: dict[str, Any] = {}
         self._set_energies(checked_energies(energies, mesh.num_vertices))
-        self.energy_mask = self._mask()
+        self.energy_mask = self._mask(dtype)
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -115,14 +115,14 @@ class Model:
         self._place(dtype, device)
         self._executed_by(DEFAULT)  # now, since compiled code can look it up and not build it
 
-    def _mask(self) -> int:
+    def _mask(self, dtype: torch.dtype) -> int:
         mask = 0
         for energy in (*self.energies, *self.vertex_energies):
             mask |= energy.bit
         if self.law is not None:
             self.law.check_mesh(self.mesh.num_tets)
             density = self.law.density
-            mask |= ops.bits_of_law(density.digest, density.header, density.quadratic)
+            mask |= ops.bits_of_law(density.digest, density.header, density.quadratic, dtype)
         return mask
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:
@@ -291,6 +291,7 @@ class Model:
             out._arrange(points, out.tets, device)
         out._measure(points)
         out._place(dtype, device)
+        out.energy_mask = out._mask(dtype)
         out._executed_by(DEFAULT)
         return out
 
@@ -321,7 +322,7 @@ class Model:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
         self.__dict__.update(lasting(state))
         self._derived = {}
-        self.energy_mask = self._mask()
+        self.energy_mask = self._mask(self.dtype)
         actual = checked_device(self._mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)

@@ -22,13 +22,12 @@ from .._common.constants import DECIDES, LAW_SHIFT
 from .autograd import Direct, direct
 from .load import extensions_folder, locked, sources
 
-# what reads the law, by how long it takes
-_SWEEPS = ("double", "float")
+# what reads the law; an object is of one scalar, DIFFVBD_SCALAR, which takes half the time
 _SOURCES = ("bind/body", "cpu/contact", "bind/sweep", "cpu/run", "cpu/coarse", "bind/mesh", "cpu/kernels")
-_FLAGS = ("-std=c++20", "-g0", "-fPIC", "-fno-math-errno", "-ffp-contract=off", "-fvisibility=hidden", "-w",
+_FLAGS = ("-std=c++20", "-g0", "-fPIC", "-fno-math-errno", "-fno-signed-zeros", "-ffp-contract=off", "-fvisibility=hidden", "-w",
           "-DDIFFVBD_NO_CLONES", "-DTORCH_TARGET_VERSION=0x020b000000000000")  # fmt: skip
 _libraries: list[Direct] = []
-_numbers: dict[str, int] = {}
+_numbers: dict[tuple[str, str], int] = {}
 
 
 def library_of(energies: int) -> Direct:
@@ -42,31 +41,28 @@ def own_bits(energies: int) -> int:
     return energies & (DECIDES - 1)
 
 
-def bits_of_law(name: str, header: str, quadratic: bool) -> int:
-    """What a law adds to a mask; compiles and loads it at its first use. name: a digest of the header.
+def bits_of_law(digest: str, header: str, quadratic: bool, dtype: torch.dtype) -> int:
+    """What a law adds to a mask; compiles and loads it at its first use. digest: of the header.
 
     Raises:
         RuntimeError: Without a compiler, or with the last lines of what it says.
     """
-    if name not in _numbers:
-        torch.ops.load_library(str(_object(name, header)))
-        _libraries.append(Direct(getattr(torch.ops, _namespace(name))))
-        _numbers[name] = len(_libraries)
-    return _numbers[name] << LAW_SHIFT | (0 if quadratic else DECIDES)
+    scalar = "double" if dtype == torch.float64 else "float"
+    if (digest, scalar) not in _numbers:
+        torch.ops.load_library(str(_object(f"{digest}_{scalar}", header, scalar)))
+        _libraries.append(Direct(getattr(torch.ops, f"diffvbd_law_{digest}_{scalar}")))
+        _numbers[digest, scalar] = len(_libraries)
+    return _numbers[digest, scalar] << LAW_SHIFT | (0 if quadratic else DECIDES)
 
 
-def _namespace(name: str) -> str:
-    return f"diffvbd_law_{name}"
-
-
-def _object(name: str, header: str) -> Path:
+def _object(name: str, header: str, scalar: str) -> Path:
     compiler = os.environ.get("CXX", "g++")
-    flags = [*_FLAGS, *_native()]
+    flags = [*_FLAGS, *_native(), "-O1" if os.environ.get("DIFFVBD_QUICK") else "-O2"]
     digest = hashlib.sha256(" ".join([compiler, *flags, torch.__version__]).encode())
     for path in sorted(p for p in sources().rglob("*") if p.suffix in (".h", ".cpp")):
         digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
     place = extensions_folder() / f"diffvbd-law-{name}-{digest.hexdigest()[:16]}"
-    return locked(place, "law.so", lambda folder: _compile(folder, name, header, compiler, flags))
+    return locked(place, "law.so", lambda folder: _compile(folder, name, header, scalar, compiler, flags))
 
 
 def _native() -> list[str]:
@@ -75,10 +71,10 @@ def _native() -> list[str]:
         return []
     known = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")), "")
     digest = hashlib.sha256(known.encode()).hexdigest()[:8]
-    return ["-march=native", f"-DDIFFVBD_PROCESSOR=0x{digest}u", *(["-DDIFFVBD_UPPER_HALVES"] if "avx" in known else [])]
+    return ["-march=native", f"-DDIFFVBD_PROCESSOR=0x{digest}u"]
 
 
-def _compile(folder: Path, name: str, header: str, compiler: str, flags: list[str]) -> Path:
+def _compile(folder: Path, name: str, header: str, scalar: str, compiler: str, flags: list[str]) -> Path:
     from torch.utils.cpp_extension import include_paths, library_paths
 
     if shutil.which(shlex.split(compiler)[0]) is None:
@@ -87,12 +83,12 @@ def _compile(folder: Path, name: str, header: str, compiler: str, flags: list[st
     print("diffvbd: compiling a law, once for this machine (half a minute)", file=sys.stderr, flush=True)
     (folder / "law.h").write_text(header, encoding="utf-8")
     root = sources()
-    given = {path: root / f"{path}.cpp" for path in _SOURCES}
-    for scalar in _SWEEPS:
-        given[scalar] = folder / f"{scalar}.cpp"
-        given[scalar].write_text(f'#include "{root / "cpu" / "sweep_kernels.h"}"\n'
-                                 f"template diffvbd::Kernels<{scalar}> diffvbd::baseline::sweep_kernels<{scalar}>();\n")  # fmt: skip
-    flags = [*flags, f"-Ddiffvbd={_namespace(name)}", f'-DDIFFVBD_LAW_HEADER="{folder / "law.h"}"']
+    sweeps = folder / "sweeps.cpp"  # first: they take longest
+    sweeps.write_text(f'#include "{root / "cpu" / "sweep_kernels.h"}"\n'
+                      f"template diffvbd::Kernels<{scalar}> diffvbd::baseline::sweep_kernels<{scalar}>();\n")  # fmt: skip
+    given = [sweeps, *(root / f"{path}.cpp" for path in _SOURCES)]
+    flags = [*flags, f"-Ddiffvbd=diffvbd_law_{name}", f"-DDIFFVBD_SCALAR={scalar}",
+             f'-DDIFFVBD_LAW_HEADER="{folder / "law.h"}"']  # fmt: skip
     flags += [f"-isystem{path}" for path in include_paths()]
 
     def run(command: list[str]) -> None:
@@ -102,14 +98,14 @@ def _compile(folder: Path, name: str, header: str, compiler: str, flags: list[st
             tail = "\n".join(done.stdout.splitlines()[-20:])
             raise RuntimeError(f"diffvbd: the law could not be compiled:\n{tail}")
 
-    def build(item: tuple[str, Path]) -> str:
-        target = str(folder / f"{item[0].replace('/', '_')}.o")
-        run([*flags, "-O3" if item[0] in _SWEEPS else "-O2", "-c", str(item[1]), "-o", target])
+    def build(source: Path) -> str:
+        target = str(folder / f"{source.parent.name}_{source.stem}.o")
+        run([*flags, "-c", str(source), "-o", target])
         return target
 
     jobs = int(os.environ.get("MAX_JOBS") or os.cpu_count() or 1)
     with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
-        objects = list(pool.map(build, sorted(given.items(), key=lambda item: item[0] not in _SWEEPS)))
+        objects = list(pool.map(build, given))
     out = folder / "law.so"
     run(["-shared", "-s", "-o", str(out), *objects, *(f"-L{path}" for path in library_paths()), "-ltorch_cpu", "-lc10"])
     return out
