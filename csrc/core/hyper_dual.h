@@ -127,13 +127,13 @@ DIFFVBD_FN Hyper<R> square_root(const Hyper<R>& a) {
   return chained(a, s, slope, R(-0.5) * slope / a.value);
 }
 template <class S>
-DIFFVBD_FN auto exponential(const S& a) -> decltype(extract(a), a) {
+DIFFVBD_FN auto exponential(const S& a) -> decltype(extract(a), S(a)) {
   const auto e = exponential(a.value);
   return chained(a, e, e, e);
 }
 // a^p for a constant p
 template <class S, class R>
-DIFFVBD_FN auto power(const S& a, const R& p) -> decltype(extract(a), a) {
+DIFFVBD_FN auto power(const S& a, const R& p) -> decltype(extract(a), S(a)) {
   const R f = power(a.value, p), inverse = R(1) / a.value, slope = p * f * inverse;
   return chained(a, f, slope, (p - R(1)) * slope * inverse);
 }

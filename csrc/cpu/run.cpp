@@ -505,7 +505,7 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
         const T* row = rest + int64_t{pair >> 2} * kRestScalars;
         const int local = pair & 3;
         for (int i = 0; i < kPairRest; ++i) {
-          out[i * kLanes] = padding ? T(0) : row[TetLayout::rest_index(local, i)];
+          out[i * kLanes] = padding && i < TetLayout::pair_shape ? T(0) : row[TetLayout::rest_index(local, i)];
         }
       }
     }

@@ -48,7 +48,7 @@ struct TetLayout {
   // as a vertex sees them: k_ij k_ik k_il (k_jk k_jl k_kl) c6 (b_j b_k b_l), then the parameters
   static constexpr int pair_c6 = edges ? 6 : 3, pair_fibre = pair_c6 + 1;
   static constexpr int pair_parameters = pair_fibre + (Density::fibre ? 3 : 0);
-  static constexpr int pair_rest = pair_parameters + Density::parameters;
+  static constexpr int pair_rest = pair_parameters + Density::parameters, pair_shape = pair_parameters;
 
   DIFFVBD_FN static constexpr int rest_index(int local, int i) {
     const int j = other_corner(local, 0), k = other_corner(local, 1), l = other_corner(local, 2);

@@ -15,6 +15,7 @@ struct TetLayout {
   static constexpr int material = 2;   // of a tet: mu, lam [Pa]
   static constexpr int rest = 7;       // of a tet: the stiffness weights k01 k02 k03 k12 k13 k23 [m], c6 [1/m^3]
   static constexpr int pair_rest = 4;  // of them, as corner `local` sees them: k_ij, k_ik, k_il, c6
+  static constexpr int pair_shape = pair_rest;  // the first of them, which are 0 in pairs that fill up a block
 
   DIFFVBD_FN static constexpr int rest_index(int local, int i) {
     return i == 3 ? 6 : weight_index(local, other_corner(local, i));

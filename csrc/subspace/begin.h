@@ -381,12 +381,12 @@ DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, c
       material[m] = in.material[m].data[b.scene * in.material[m].scene + in.material[m].item * tet[0]];
     }
     double increase[TetLayout::line_degree]{};
-    TetLaw::line(one, displacement, rest, material, increase);
     double bend = 0, inertia = 0;  // half of d . K d, K averaged over the path
-    for (int k = 1; k < TetLayout::line_degree; ++k) bend += increase[k];
-    if constexpr (!TetLayout::polynomial) {  // increase has parts of the whole change
-      const double slope = TetLaw::slope(one, displacement, rest);
-      bend += increase[0] - slope, increase[0] = slope;
+    if constexpr (TetLayout::polynomial) {
+      TetLaw::line(one, displacement, rest, material, increase);
+      for (int k = 1; k < TetLayout::line_degree; ++k) bend += increase[k];
+    } else {
+      TetLaw::path(one, displacement, rest, increase[0], bend);
     }
     for (int c = 0; c < 4; ++c) inertia += b.mass(tet[1 + c]) * dot(displacement[c], displacement[c]);
     to[0] += increase[0] + bend;

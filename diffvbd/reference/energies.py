@@ -138,9 +138,9 @@ class Law(StableNeoHookean):
         self.values = law_values(energy, scene.parameters, scene.per_tet)
         self.fibres = torch.zeros_like(scene.shape_gradients[..., 0, :, :])
         if energy.a0 is not None:
-            a0 = scene.tensor(scene.parameters.get("a0", energy.a0)).transpose(-1, -2)
-            a0 = a0 / a0.square().sum(-2, keepdim=True).sqrt()
-            self.fibres = scene.per_tet(a0 if a0.dim() > 1 else a0[:, None])
+            a0 = scene.tensor(scene.parameters.get("a0", energy.a0))
+            a0 = (a0 if a0.dim() > 1 else a0[None]).transpose(-1, -2)
+            self.fibres = scene.per_tet(a0 / a0.square().sum(-2, keepdim=True).sqrt())
 
     def _of(self, corners: Any, tets: Any = slice(None)) -> Tensor:
         """h^2 V psi of tets with these corners, four of [..., 3, P]."""
