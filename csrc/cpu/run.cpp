@@ -496,6 +496,8 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
     out << "rest_points: expected tets of positive volume, got " << volume << " m^3 at tet " << t;
     throw std::invalid_argument(out.text);
   }
+  int at[4][kPairRest];
+  for (int i = 0; i < 4 * kPairRest; ++i) at[i / kPairRest][i % kPairRest] = TetLayout::rest_index(i / kPairRest, i % kPairRest);
   for (int64_t block = 0; block < plan.blocks; ++block) {
     for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
       for (int l = 0; l < kLanes; ++l) {
@@ -505,7 +507,7 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
         const T* row = rest + int64_t{pair >> 2} * kRestScalars;
         const int local = pair & 3;
         for (int i = 0; i < kPairRest; ++i) {
-          out[i * kLanes] = padding && i < TetLayout::pair_shape ? T(0) : row[TetLayout::rest_index(local, i)];
+          out[i * kLanes] = padding && i < TetLayout::pair_shape ? T(0) : row[at[local][i]];
         }
       }
     }

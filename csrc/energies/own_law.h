@@ -410,17 +410,18 @@ struct OwnLaw {
       last = now;
     }
   }
-  // The derivative along p at x, and by how much more than that the energy changes up to x + p.
-  template <class R>
+  // The derivative along p at x, if it is asked for, and by how much more than that the energy changes up to x + p.
+  template <bool has_slope, class R>
   DIFFVBD_FN static void path(const Vec3<R> (&x)[4], const Vec3<R> (&p)[4], const R* rest, R& slope, R& bend) {
-    Vec3<Dual<R>> at[4];
     Vec3<R> end[4];
-    for (int a = 0; a < 4; ++a) {
-      at[a] = {{x[a].x, p[a].x}, {x[a].y, p[a].y}, {x[a].z, p[a].z}};
-      end[a] = x[a] + p[a];
+    for (int a = 0; a < 4; ++a) end[a] = x[a] + p[a];
+    slope = R(0);
+    if constexpr (has_slope) {
+      Vec3<Dual<R>> at[4];
+      for (int a = 0; a < 4; ++a) at[a] = {{x[a].x, p[a].x}, {x[a].y, p[a].y}, {x[a].z, p[a].z}};
+      slope = extract(energy(at, rest));
     }
-    const Dual<R> here = energy(at, rest);
-    slope = here.derivative, bend = energy(end, rest) - here.value - slope;
+    bend = energy(end, rest) - energy(x, rest) - slope;
   }
 
   // The change of a tet's energy as its vertex moves from x by `step`, and the sizes of the two energies.

@@ -31,7 +31,7 @@ DIFFVBD_FN constexpr int curvature_place(int i, int k) {
 }
 
 template <class S>
-S stretch_sum(const S& i1, const S& i2, const S& j);
+DIFFVBD_FN S stretch_sum(const S& i1, const S& i2, const S& j);
 
 }  // namespace diffvbd
 

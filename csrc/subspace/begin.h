@@ -353,7 +353,8 @@ struct Path {
   // Whether tets hardly turn vertices back within a step. d . M d of the whole body would hide a few that do.
   DIFFVBD_FN bool is_soft() const { return ratio < kSoft; }
 };
-template <class T, class Team>
+// The ratio only where it is asked for: a generated law has to find it apart.
+template <bool has_ratio = true, class T, class Team>
 DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, const Team& team) {
   const auto other = [&](int32_t v) { return wide_at(in.other + 3 * b.row(v)); };
   double vertices[1];
@@ -386,7 +387,7 @@ DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, c
       TetLaw::line(one, displacement, rest, material, increase);
       for (int k = 1; k < TetLayout::line_degree; ++k) bend += increase[k];
     } else {
-      TetLaw::path(one, displacement, rest, increase[0], bend);
+      TetLaw::template path<has_ratio>(one, displacement, rest, increase[0], bend);
     }
     for (int c = 0; c < 4; ++c) inertia += b.mass(tet[1 + c]) * dot(displacement[c], displacement[c]);
     to[0] += increase[0] + bend;

@@ -93,6 +93,7 @@ class LawTets:
     @cached_property
     def hessian(self) -> Tensor:
         """[B, T, 4, 4, 3, 3]: corners, then components."""
-        rows = [torch.autograd.grad(self._gradient[..., a, c].sum(), self.corners, retain_graph=True)[0]
-                for a in range(4) for c in range(3)]  # fmt: skip
+        with torch.inference_mode(False), torch.enable_grad():
+            rows = [torch.autograd.grad(self._gradient[..., a, c].sum(), self.corners, retain_graph=True)[0]
+                    for a in range(4) for c in range(3)]  # fmt: skip
         return torch.stack(rows, 2).unflatten(2, (4, 3)).transpose(3, 4)

@@ -87,7 +87,8 @@ class Model:
         self.mesh = mesh
         self._derived: dict[str, Any] = {}
         self._set_energies(checked_energies(energies, mesh.num_vertices))
-        self.energy_mask = self._mask(dtype)
+        device = checked_device(device)
+        self.energy_mask = self._mask(dtype, device)
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -108,18 +109,19 @@ class Model:
         self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.may_correct, self.floor is not None)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         self._check_friction()
-        device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
         warn_of(mesh, pinned, mask, self.energies)
         self._place(dtype, device)
         self._executed_by(DEFAULT)  # now, since compiled code can look it up and not build it
 
-    def _mask(self, dtype: torch.dtype) -> int:
+    def _mask(self, dtype: torch.dtype, device: torch.device) -> int:
         mask = 0
         for energy in (*self.energies, *self.vertex_energies):
             mask |= energy.bit
         if self.law is not None:
+            if device.type != "cpu":
+                fail("device", '"cpu" with a law of your own', repr(str(device)))
             self.law.check_mesh(self.mesh.num_tets)
             density = self.law.density
             mask |= ops.bits_of_law(density.digest, density.header, density.quadratic, dtype)
@@ -291,7 +293,7 @@ class Model:
             out._arrange(points, out.tets, device)
         out._measure(points)
         out._place(dtype, device)
-        out.energy_mask = out._mask(dtype)
+        out.energy_mask = out._mask(dtype, device)
         out._executed_by(DEFAULT)
         return out
 
@@ -322,7 +324,7 @@ class Model:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
         self.__dict__.update(lasting(state))
         self._derived = {}
-        self.energy_mask = self._mask(self.dtype)
+        self.energy_mask = self._mask(self.dtype, self.device)
         actual = checked_device(self._mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)

@@ -57,7 +57,7 @@ def bits_of_law(digest: str, header: str, quadratic: bool, dtype: torch.dtype) -
 
 def _object(name: str, header: str, scalar: str) -> Path:
     compiler = os.environ.get("CXX", "g++")
-    flags = [*_FLAGS, *_native(), "-O1" if os.environ.get("DIFFVBD_QUICK") else "-O2"]
+    flags = [*_FLAGS, *_native(), "-O1" if os.environ.get("DIFFVBD_QUICK") else "-O3"]
     digest = hashlib.sha256(" ".join([compiler, *flags, torch.__version__]).encode())
     for path in sorted(p for p in sources().rglob("*") if p.suffix in (".h", ".cpp")):
         digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
@@ -66,12 +66,15 @@ def _object(name: str, header: str, scalar: str) -> Path:
 
 
 def _native() -> list[str]:
-    """Flags for this processor, which are part of an object's name: a folder may be shared by several machines."""
+    """The newest of the instruction sets that the package itself is compiled for, and that this processor has."""
     if platform.machine() != "x86_64" or sys.platform != "linux":
         return []
-    known = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")), "")
-    digest = hashlib.sha256(known.encode()).hexdigest()[:8]
-    return ["-march=native", f"-DDIFFVBD_PROCESSOR=0x{digest}u"]
+    text = Path("/proc/cpuinfo").read_text()
+    known = set(next((line for line in text.splitlines() if line.startswith("flags")), "").split())
+    for level, wanted in {"v4": "avx512f avx512bw avx512cd avx512dq avx512vl", "v3": "avx2 bmi1 bmi2 f16c fma movbe"}.items():
+        if known.issuperset(wanted.split()):
+            return [f"-march=x86-64-{level}"]
+    return []
 
 
 def _compile(folder: Path, name: str, header: str, scalar: str, compiler: str, flags: list[str]) -> Path:

@@ -60,7 +60,7 @@ UNIAXIAL = {LOG: of_log, COROTATED: of_corotated, MOONEY_RIVLIN: of_mooney_rivli
 def make(text: str, **more: Any) -> Any:
     names = Density(text).parameters
     a0 = {"a0": (2.0, 0.0, 0.0)} if "I4" in text else {}
-    return dv.law(text, **{name: VALUES[name] for name in names}, **(a0 | more))
+    return dv.law(text, **({name: VALUES[name] for name in names} | a0 | more))
 
 
 def one_tet(text: str, f: Tensor, a0: Tensor | None = None) -> tuple[Any, Tensor, Tensor]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.marks import slow
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -76,8 +77,7 @@ def compare(model: dv.Model, solver: dv.VBD, inputs: dict[str, Any], bar: float 
         assert float(value.nan_to_num().abs().max()) > 0, name
 
 
-@pytest.mark.parametrize("sweeps", (1, 4))
-@pytest.mark.parametrize("jitter", (0.005, 0.06))
+@pytest.mark.parametrize(("sweeps", "jitter"), [(1, 0.005), (1, 0.06), slow(4, 0.06)])
 def test_gradients_are_those_of_the_executed_sweeps(sweeps: int, jitter: float) -> None:
     """Against autograd through the reference; the larger jitter turns tets inside out and shortens updates."""
     model = model_of()
