@@ -1,8 +1,8 @@
 """Laws of one's own: time of a step relative to the built-in law on one core, and time to compile.
 
-The clamped cube of `python -m bench cpu`, slightly off rest, at K = 20. "Stable Neo-Hookean" is the built-in law written
-as a law of one's own: the two compute the same. Times are processor time of the thread, the least of several rounds that
-visit all laws in turn; compile times are wall clock of all cores, into an empty folder.
+The clamped cube of `python -m bench cpu`, slightly off rest, at K = 20. "Stable Neo-Hookean" is the built-in law
+written as a law of one's own: the two compute the same. Times are processor time of the thread, the least of several
+rounds that visit all laws in turn; compile times are wall clock of all cores, into an empty folder.
 """
 
 from __future__ import annotations

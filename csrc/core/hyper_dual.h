@@ -71,36 +71,36 @@ DIFFVBD_FN Hyper<R> select(const M& condition, const Hyper<R>& a, const Hyper<R>
 
 // --- with plain scalars
 
-#define DIFFVBD_MIXED(Number)                                                                              \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator+(const Number<R>& a, const R& b) {                                         \
-    Number<R> out = a;                                                                                     \
-    out.value = a.value + b;                                                                               \
-    return out;                                                                                            \
-  }                                                                                                        \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator+(const R& a, const Number<R>& b) {                                         \
-    return b + a;                                                                                          \
-  }                                                                                                        \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator-(const Number<R>& a, const R& b) {                                         \
-    return a + (-b);                                                                                       \
-  }                                                                                                        \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator-(const R& a, const Number<R>& b) {                                         \
-    return -b + a;                                                                                         \
-  }                                                                                                        \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator*(const R& a, const Number<R>& b) {                                         \
-    return b * a;                                                                                          \
-  }                                                                                                        \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator/(const R& a, const Number<R>& b) {                                         \
-    return Number<R>(a) / b;                                                                               \
-  }                                                                                                        \
-  template <class R>                                                                                       \
-  DIFFVBD_FN Number<R> operator/(const Number<R>& a, const R& b) {                                         \
-    return a * (R(1) / b);                                                                                 \
+#define DIFFVBD_MIXED(Number)                                      \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator+(const Number<R>& a, const R& b) { \
+    Number<R> out = a;                                             \
+    out.value = a.value + b;                                       \
+    return out;                                                    \
+  }                                                                \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator+(const R& a, const Number<R>& b) { \
+    return b + a;                                                  \
+  }                                                                \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator-(const Number<R>& a, const R& b) { \
+    return a + (-b);                                               \
+  }                                                                \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator-(const R& a, const Number<R>& b) { \
+    return -b + a;                                                 \
+  }                                                                \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator*(const R& a, const Number<R>& b) { \
+    return b * a;                                                  \
+  }                                                                \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator/(const R& a, const Number<R>& b) { \
+    return Number<R>(a) / b;                                       \
+  }                                                                \
+  template <class R>                                               \
+  DIFFVBD_FN Number<R> operator/(const Number<R>& a, const R& b) { \
+    return a * (R(1) / b);                                         \
   }
 template <class R>
 DIFFVBD_FN Hyper<R> operator*(const Hyper<R>& a, const R& b) {

@@ -77,10 +77,10 @@ PairKernels<T> pair_kernels() {
   return kernels<T>().pairs;
 }
 
-#define DIFFVBD_INSTANTIATE(T)                        \
-  template SweepKernel<T> forward_kernel<T>(int);     \
-  template SweepKernel<T> reverse_kernel<T>(int);     \
-  template CoarseKernels<T> coarse_kernels<T>(int);   \
+#define DIFFVBD_INSTANTIATE(T)                      \
+  template SweepKernel<T> forward_kernel<T>(int);   \
+  template SweepKernel<T> reverse_kernel<T>(int);   \
+  template CoarseKernels<T> coarse_kernels<T>(int); \
   template PairKernels<T> pair_kernels<T>();
 #ifdef DIFFVBD_SCALAR
 DIFFVBD_INSTANTIATE(DIFFVBD_SCALAR)

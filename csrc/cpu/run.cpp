@@ -497,7 +497,8 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
     throw std::invalid_argument(out.text);
   }
   int at[4][kPairRest];
-  for (int i = 0; i < 4 * kPairRest; ++i) at[i / kPairRest][i % kPairRest] = TetLayout::rest_index(i / kPairRest, i % kPairRest);
+  for (int i = 0; i < 4 * kPairRest; ++i)
+    at[i / kPairRest][i % kPairRest] = TetLayout::rest_index(i / kPairRest, i % kPairRest);
   for (int64_t block = 0; block < plan.blocks; ++block) {
     for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
       for (int l = 0; l < kLanes; ++l) {

@@ -232,9 +232,9 @@ struct OwnLaw {
     return i < 2 ? R(12) : R(1);
   }
 
-  // --- the adjoint of p . (g + H d): phi is the derivative of V psi along p and the mixed one along p and d, so its own
-  // derivatives are those of V psi by corners, rest shape and parameters, in numbers that carry both directions. Where
-  // psi is quadratic in x_i, g + H d is g at x_i + d, and one direction will do.
+  // --- the adjoint of p . (g + H d): phi is the derivative of V psi along p and the mixed one along p and d, so its
+  // own derivatives are those of V psi by corners, rest shape and parameters, in numbers that carry both directions.
+  // Where psi is quadratic in x_i, g + H d is g at x_i + d, and one direction will do.
 
   template <class R>
   using Number = std::conditional_t<quadratic, Dual<R>, Hyper<R>>;
@@ -268,9 +268,8 @@ struct OwnLaw {
     const R* k = e.rest;
     const auto& s = v.s;
     const R twice = R(-2) * minus_h2, sixth = R(1) / R(6) * minus_h2;
-    const auto pulled = [&](const R& weight, const auto& edge) DIFFVBD_INLINED {
-      return (twice * weight) * extract(stressed(v.w, s.m, edge));
-    };
+    const auto pulled = [&](const R& weight, const auto& edge)
+                            DIFFVBD_INLINED { return (twice * weight) * extract(stressed(v.w, s.m, edge)); };
     const Vec3<R> ij = pulled(k[0], s.d), ik = pulled(k[1], plus(s.ek, -s.d)), il = pulled(k[2], plus(s.el, -s.d));
     const Vec3<R> u = sixth * extract(times(v.w.j, s.d));
     TetAdjoint<R> out;
@@ -278,9 +277,8 @@ struct OwnLaw {
     out.xk = ik + cross(s.el, u);
     out.xl = il + cross(u, s.ek);
     if constexpr (L::edges) {
-      const auto still = [&](const R& weight, const Vec3<R>& edge) DIFFVBD_INLINED {
-        return (twice * weight) * extract(stressed(v.w, s.m, edge));
-      };
+      const auto still = [&](const R& weight, const Vec3<R>& edge)
+                             DIFFVBD_INLINED { return (twice * weight) * extract(stressed(v.w, s.m, edge)); };
       const Vec3<R> kl = still(k[5], s.el - s.ek);
       out.xk += still(k[3], s.ek) - kl;
       out.xl += still(k[4], s.el) + kl;
@@ -304,9 +302,8 @@ struct OwnLaw {
     const auto& s = v.s;
     const R* p = e.rest + L::pair_parameters;
     const R of_volume = minus_h2 * volume(c6(e));
-    const auto squared = [&](const auto& edge) DIFFVBD_INLINED {
-      return -(minus_h2 * extract(inner(edge, stressed(v.w, s.m, edge))));
-    };
+    const auto squared = [&](const auto& edge)
+                             DIFFVBD_INLINED { return -(minus_h2 * extract(inner(edge, stressed(v.w, s.m, edge)))); };
     rest_bar[0] = squared(s.d), rest_bar[1] = squared(plus(s.ek, -s.d)), rest_bar[2] = squared(plus(s.el, -s.d));
     if constexpr (L::edges) {
       rest_bar[3] = squared_still(v, s.ek, minus_h2), rest_bar[4] = squared_still(v, s.el, minus_h2);

@@ -38,7 +38,8 @@ DIFFVBD_FN R descending_fraction(const Block<R>& b, const Star& star, const Step
       } else if (b.data_count[k] > 0) {
         VertexState<R> end = b.state;
         end.x += step;
-        const R before = E::value(b.state, b.data[k], b.data_count[k]), after = E::value(end, b.data[k], b.data_count[k]);
+        const R before = E::value(b.state, b.data[k], b.data_count[k]),
+                after = E::value(end, b.data[k], b.data_count[k]);
         increase = increase + (after - before), terms = terms + absolute(before) + absolute(after);
       }
     });
@@ -65,7 +66,8 @@ template <class R, class Star>
 DIFFVBD_FN R shift_of(const Sym3<R>& H, const R& least, const Star& star) {
   R shift = R(0);
   if (!star.any(R(0) < select(R(0) < least_minor(H, -least), R(0), R(1)))) return shift;
-  const R size = absolute(H.xx) + absolute(H.yy) + absolute(H.zz) + R(2) * (absolute(H.xy) + absolute(H.xz) + absolute(H.yz));
+  const R size =
+      absolute(H.xx) + absolute(H.yy) + absolute(H.zz) + R(2) * (absolute(H.xy) + absolute(H.xz) + absolute(H.yz));
   R trial = R(0.0625) * power_of_two(select(R(0) < size, size, least));
   for (int k = 0; k < kShifts; ++k) {
     shift = select(R(0) < least_minor(H, shift - least), shift, trial);
@@ -262,7 +264,8 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   const Vec3<R> z_axes = axes.to(z);
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool ill_conditioned = false;
-  if constexpr (!Set::contact && !Set::well_conditioned && Set::Elastic::quadratic) {  // what contact adds to a block is not on a full tape
+  if constexpr (!Set::contact && !Set::well_conditioned &&
+                Set::Elastic::quadratic) {  // what contact adds to a block is not on a full tape
     ill_conditioned = star.any(is_ill_conditioned<Set>(r.H, shared_entries<Set>(b, axes)));
     if constexpr (Set::filters)
       ill_conditioned = ill_conditioned || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));

@@ -106,8 +106,8 @@ class Density:
         kinds = {"value": "S", "by_scale": "S", "slopes": "Slopes<S>", "curvatures": "Curvatures<S>"}
         for name, expressions in self.derived.items():
             argument, kind = (", S* out", "void") if name == "by_parameters" else ("", kinds[name])
-            lines += ["  template <class S, class R>",
-                      f"  DIFFVBD_FN static {kind} {name}(const Invariants<S>& v, const R* p{argument}) {{"]  # fmt: skip
+            head = f"DIFFVBD_FN static {kind} {name}(const Invariants<S>& v, const R* p{argument}) {{"
+            lines += ["  template <class S, class R>", f"  {head}"]
             statements, results = self._statements(expressions)
             lines += [f"    const auto {symbol} = {text};" for symbol, text in statements]
             results = [f"S({r})" for r in results]

@@ -73,8 +73,8 @@ class Law:
         size = mu.abs() + lam.abs()
         stress = torch.maximum(stress.abs(), 2 * slopes[3].abs())
         if bool((stress > RESIDUAL * size).any()):
-            warn(f"law: {self.expression!r} has a stress of {float(stress.abs().max()):.4g} Pa at F = I, so the mesh is "
-                 "not its shape at rest")  # fmt: skip
+            most = float(stress.abs().max())
+            warn(f"law: {self.expression!r} has a stress of {most:.4g} Pa at F = I: the mesh is not its shape at rest")
 
     def _slopes_at_rest(self) -> list[Tensor]:
         given = [self.values[p] for p in self.density.parameters]

@@ -28,8 +28,8 @@ Vmap = Callable[..., tuple[Any, Any]]  # as torch.autograd.Function.vmap
 
 
 class Direct:
-    """Operators of a library, as torch.ops.diffvbd, without a pass through torch's autograd where nothing would be differentiated:
-    inside the forward of a Function and under no_grad. Half of what a call costs beside its work."""
+    """Operators of a library such as torch.ops.diffvbd, without a pass through torch's autograd where nothing would be
+    differentiated: inside the forward of a Function and under no_grad. Half of what a call costs beside its work."""
 
     def __init__(self, library: Any) -> None:
         self._library = library

@@ -24,8 +24,8 @@ from .load import extensions_folder, locked, sources
 
 # what reads the law; an object is of one scalar, DIFFVBD_SCALAR, which takes half the time
 _SOURCES = ("bind/body", "cpu/contact", "bind/sweep", "cpu/run", "cpu/coarse", "bind/mesh", "cpu/kernels")
-_FLAGS = ("-std=c++20", "-g0", "-fPIC", "-fno-math-errno", "-fno-signed-zeros", "-ffp-contract=off", "-fvisibility=hidden", "-w",
-          "-DDIFFVBD_NO_CLONES", "-DTORCH_TARGET_VERSION=0x020b000000000000")  # fmt: skip
+_FLAGS = ("-std=c++20", "-g0", "-fPIC", "-w", "-fno-math-errno", "-fno-signed-zeros", "-ffp-contract=off",
+          "-fvisibility=hidden", "-DDIFFVBD_NO_CLONES", "-DTORCH_TARGET_VERSION=0x020b000000000000")  # fmt: skip
 _libraries: list[Direct] = []
 _numbers: dict[tuple[str, str], int] = {}
 
@@ -71,7 +71,10 @@ def _native() -> list[str]:
         return []
     text = Path("/proc/cpuinfo").read_text()
     known = set(next((line for line in text.splitlines() if line.startswith("flags")), "").split())
-    for level, wanted in {"v4": "avx512f avx512bw avx512cd avx512dq avx512vl", "v3": "avx2 bmi1 bmi2 f16c fma movbe"}.items():
+    for level, wanted in {
+        "v4": "avx512f avx512bw avx512cd avx512dq avx512vl",
+        "v3": "avx2 bmi1 bmi2 f16c fma movbe",
+    }.items():
         if known.issuperset(wanted.split()):
             return [f"-march=x86-64-{level}"]
     return []
@@ -81,14 +84,14 @@ def _compile(folder: Path, name: str, header: str, scalar: str, compiler: str, f
     from torch.utils.cpp_extension import include_paths, library_paths
 
     if shutil.which(shlex.split(compiler)[0]) is None:
-        raise RuntimeError(f"diffvbd: a law of your own takes a C++ compiler, and there is no {compiler!r}: install one, "
-                           "or name it by the environment variable CXX")  # fmt: skip
+        raise RuntimeError(f"diffvbd: a law of your own takes a C++ compiler, and there is no {compiler!r}: install "
+                           "one, or name it by the environment variable CXX")  # fmt: skip
     print("diffvbd: compiling a law, once for this machine (half a minute)", file=sys.stderr, flush=True)
     (folder / "law.h").write_text(header, encoding="utf-8")
     root = sources()
     sweeps = folder / "sweeps.cpp"  # first: they take longest
-    sweeps.write_text(f'#include "{root / "cpu" / "sweep_kernels.h"}"\n'
-                      f"template diffvbd::Kernels<{scalar}> diffvbd::baseline::sweep_kernels<{scalar}>();\n")  # fmt: skip
+    instance = f"template diffvbd::Kernels<{scalar}> diffvbd::baseline::sweep_kernels<{scalar}>();"
+    sweeps.write_text(f'#include "{root / "cpu" / "sweep_kernels.h"}"\n{instance}\n', encoding="utf-8")
     given = [sweeps, *(root / f"{path}.cpp" for path in _SOURCES)]
     flags = [*flags, f"-Ddiffvbd=diffvbd_law_{name}", f"-DDIFFVBD_SCALAR={scalar}",
              f'-DDIFFVBD_LAW_HEADER="{folder / "law.h"}"']  # fmt: skip

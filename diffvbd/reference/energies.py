@@ -362,7 +362,12 @@ class Anchor:
         return each, torch.arange(x.shape[-1], device=x.device)
 
 
-ENERGIES: dict[str, type] = {"stable_neo_hookean": StableNeoHookean, "law": Law, "floor": FloorBarrier, "anchor": Anchor}
+ENERGIES: dict[str, type] = {
+    "stable_neo_hookean": StableNeoHookean,
+    "law": Law,
+    "floor": FloorBarrier,
+    "anchor": Anchor,
+}
 
 
 def build_energies(scene: Scene, elsewhere: tuple[str, ...] = ()) -> list[Any]:

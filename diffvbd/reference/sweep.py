@@ -388,7 +388,9 @@ def _update_color(
     gradient, hessian = system.split((3, 6), -2)
     law = next((e for e in energies if isinstance(e, Law) and not e.density.quadratic), None)
     if law is not None:
-        hessian = hessian + _shift(hessian, mass + model.regularization) * hessian.new_tensor([1, 0, 0, 1, 0, 1])[:, None]
+        hessian = (
+            hessian + _shift(hessian, mass + model.regularization) * hessian.new_tensor([1, 0, 0, 1, 0, 1])[:, None]
+        )
     update = raw = -solve6(hessian, gradient)
     if model.saturation is not None:
         update = update * _saturation(update, model.saturation).unsqueeze(-2)

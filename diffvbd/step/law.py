@@ -68,8 +68,8 @@ def _refuse_concave(model: System, values: list[Tensor]) -> None:
 
 
 def law_rest(model: System, inputs: LawInputs, metric: Tensor, corners: Tensor | None) -> Tensor:
-    """Scalars of the rest shape [1 | B, T, n]: metric [1 | B, T, 7], with fibres a0 . grad N of the four corners, and the
-    parameters. corners: of the tets at rest [B, T, 4, 3]; None: the Model's."""
+    """Scalars of the rest shape [1 | B, T, n]: metric [1 | B, T, 7], with fibres a0 . grad N of the four corners, and
+    the parameters. corners: of the tets at rest [B, T, 4, 3]; None: the Model's."""
     parts = [metric]
     if inputs.a0 is not None:
         if corners is None:

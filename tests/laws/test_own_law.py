@@ -137,7 +137,7 @@ def test_central_differences() -> None:
 
 
 def test_tapes_agree_and_updates_are_shortened() -> None:
-    """Bit for bit; at a violent state some vertex takes less than its Newton step, and no sweep raises the potential."""
+    """Tapes bit for bit; no sweep raises the potential, at a violent state where whole Newton steps would."""
     model = model_of()
     inputs = inputs_of(model, 0.08)
     weight = torch.linspace(0, 1, inputs["x"].numel(), dtype=F64).view_as(inputs["x"])
@@ -229,7 +229,7 @@ def test_inputs_and_refusals() -> None:
     for name, value in (("young", 1e5), ("viscosity", 10.0), ("poisson", 0.3)):
         with pytest.raises(TypeError, match=f"{name}: expected an input of this Model .*which has no StableNeoHookean"):
             dv.step(model, x, v, solver, **{name: value})
-    with pytest.raises(ValueError, match="block: expected \"exact\" with a law of your own"):
+    with pytest.raises(ValueError, match='block: expected "exact" with a law of your own'):
         dv.step(model, x, v, dv.VBD(0.01, 2, block="paper"))
     with pytest.raises(ValueError, match="k: expected finite values"):
         dv.step(model, x, v, solver, k=torch.tensor(float("nan"), dtype=F64))
