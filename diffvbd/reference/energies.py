@@ -187,7 +187,8 @@ class Law(StableNeoHookean):
         own = take(x, color.vertices)[..., color.owner]
         one, two = self._of_pairs(k, x, own), self._of_pairs(k, x, own + step[..., color.owner])
         both = torch.stack((two - one, one.abs() + two.abs()), -2)
-        return add_at(both.new_zeros(2, color.vertices.numel()), color.owner, both).unbind(-2)
+        summed = add_at(both.new_zeros(2, color.vertices.numel()), color.owner, both)
+        return summed[..., 0, :], summed[..., 1, :]
 
 
 class FloorBarrier:

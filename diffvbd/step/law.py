@@ -37,10 +37,10 @@ def law_inputs(model: System, given: dict[str, Any], scenes_first: ScenesFirst) 
     for name, value in zip(law.density.parameters, values, strict=True):
         if looks_at(value):
             name_value(name, "finite values", value.detach(), torch.isfinite(value), ("scene", "tet"))
-    a0 = None
-    if law.a0 is not None:
+    a0, fibres = None, law.a0
+    if fibres is not None:
         a0 = given.get(FIBRE)
-        a0 = model.derived("law_fibres", lambda: law.a0.to(model._mass)) if a0 is None else a0
+        a0 = model.derived("law_fibres", lambda: fibres.to(model._mass)) if a0 is None else a0
         a0 = scenes_first(FIBRE, a0, (model.num_tets, 3))
         if looks_at(a0):
             check_fibre(a0)

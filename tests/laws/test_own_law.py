@@ -210,14 +210,14 @@ def test_converged_routes_and_rest_states() -> None:
     assert grads[0].abs() > 0 and relative_error(grads[1], grads[0]) < 1e-6
 
     def sag(mu: Any) -> Tensor:
-        return dv.equilibrium(model, x, mu=mu).x[:, 1].sum()
+        return dv.equilibrium(model, x, dv.VBD(0.02, 1), mu=mu).x[:, 1].sum()
 
     mu = torch.tensor(4e4, dtype=F64, requires_grad=True)
     (grad,) = torch.autograd.grad(sag(mu), mu)
     with torch.no_grad():
         slope = (sag(mu + 10) - sag(mu - 10)) / 20
     assert grad.abs() > 0 and relative_error(grad, slope) < 1e-5
-    stress = dv.stress(model, dv.equilibrium(model, x).x)
+    stress = dv.stress(model, dv.equilibrium(model, x, dv.VBD(0.02, 1)).x)
     assert float(stress.von_mises.max()) > 0
 
 
