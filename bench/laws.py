@@ -2,8 +2,8 @@
 
 The clamped cube of `python -m bench cpu`, slightly off rest, at K = 20. "Stable Neo-Hookean" is the built-in law
 written as a law of one's own: the two compute the same. Times are processor time of the thread, the least of several
-rounds that visit all laws in turn; compile times are into an empty folder, wall clock and processor time of all cores, which on
-two idle cores is about twice the wall clock.
+rounds that visit all laws in turn. Compile times are into an empty folder: wall clock, and processor time of all cores,
+about twice the wall clock of two idle ones.
 """
 
 from __future__ import annotations

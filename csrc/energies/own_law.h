@@ -409,7 +409,8 @@ struct OwnLaw {
   }
   // The derivative along p at x, if it is asked for, and by how much more than that the energy changes up to x + p.
   template <bool has_slope, class R>
-  DIFFVBD_FN static void path(const Vec3<R> (&x)[4], const Vec3<R> (&p)[4], const R* rest, R& slope, R& bend) {
+  DIFFVBD_FN static void path(const Vec3<R> (&x)[4], const Vec3<R> (&p)[4], const R* rest, const R*, R& slope,
+                              R& bend) {
     Vec3<R> end[4];
     for (int a = 0; a < 4; ++a) end[a] = x[a] + p[a];
     slope = R(0);

@@ -194,6 +194,16 @@ struct StableNeoHookean {
     c[5] = c[5] + b * j3 * j3;
   }
 
+  // Its derivative along p at x, and by how much more than that it changes up to x + p.
+  template <bool, class R>
+  DIFFVBD_FN static void path(const Vec3<R> (&x)[4], const Vec3<R> (&p)[4], const R* rest, const R* material, R& slope,
+                              R& bend) {
+    R c[TetLayout::line_degree]{};
+    line(x, p, rest, material, c);
+    slope = c[0], bend = R(0);
+    for (int k = 1; k < TetLayout::line_degree; ++k) bend = bend + c[k];
+  }
+
   // The stiffness of two corners at rest, per volume [Pa/m^2], from the gradients of their shape functions [1/m]: three
   // rows of 2 mu eps : eps + lam tr(eps)^2. Positive semidefinite down to the least lam that a body can have.
   template <class R>

@@ -381,16 +381,10 @@ DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, c
     for (int m = 0; m < kMaterialScalars; ++m) {
       material[m] = in.material[m].data[b.scene * in.material[m].scene + in.material[m].item * tet[0]];
     }
-    double increase[TetLayout::line_degree]{};
-    double bend = 0, inertia = 0;  // half of d . K d, K averaged over the path
-    if constexpr (TetLayout::polynomial) {
-      TetLaw::line(one, displacement, rest, material, increase);
-      for (int k = 1; k < TetLayout::line_degree; ++k) bend += increase[k];
-    } else {
-      TetLaw::template path<has_ratio>(one, displacement, rest, increase[0], bend);
-    }
+    double slope, bend, inertia = 0;  // bend: half of d . K d, K averaged over the path
+    TetLaw::template path<has_ratio>(one, displacement, rest, material, slope, bend);
     for (int c = 0; c < 4; ++c) inertia += b.mass(tet[1 + c]) * dot(displacement[c], displacement[c]);
-    to[0] += increase[0] + bend;
+    to[0] += slope + bend;
     if (inertia > 0) to[1] += std::abs(bend), to[2] += bend * bend / inertia;
   });
   const double h2 = b.in.time_step * b.in.time_step;
