@@ -194,6 +194,7 @@ class IncrementalPotential:
         if wants[5]:
             out[5] = -(w * (self.x - self.y)).sum(-1)
         if self.own is not None:
+            out[3], out[4] = torch.zeros_like(self.mu), torch.zeros_like(self.lam)
             if wants[6]:
                 out[6] = self.own.of_rest(ops.tet_gather(w, *self.model._topology))
         elif wants[3] or wants[6]:

@@ -443,7 +443,8 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     own = {} if model.law is None else given_inputs.parameters
     given = widen(model, x, None, Given(given_inputs.material, own, {}))
     if model.law is not None:
-        scalars = given.prepared.rest.expand(lead.numel(), -1, -1).unflatten(0, lead)
+        scalars = given.prepared.rest.expand(lead.numel(), -1, -1)
+        scalars = scalars.reshape(*lead, *scalars.shape[1:])
         return _stress_of(cauchy(model.law.density, x.double()[..., given.model._topology[0], :], scalars), x)
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)

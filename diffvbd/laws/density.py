@@ -20,6 +20,7 @@ from .._common.checks import fail
 INVARIANTS = ("I1", "I2", "J", "I4")
 STRETCHES = "trU"  # the sum of the principal stretches, a function of the first three
 FUNCTIONS = ("log", "exp", "sqrt")
+ROOT = "root_of"
 LEAST_VOLUME = 0.1  # J below which psi is its Taylor polynomial of second order in J; twin of kLeastVolume in csrc
 PAIRS = [(i, k) for i in range(4) for k in range(i, 4)]
 
@@ -129,7 +130,7 @@ class Density:
 
         names = dict(zip(self.invariants, ("v.i1", "v.i2", "v.j", "v.i4"), strict=True)) | {self.below: "v.below"}
         names |= {sympy.Symbol(name, real=True): f"p[{i}]" for i, name in enumerate(self.parameters)}
-        shared, results = sympy.cse(list(expressions), symbols=sympy.numbered_symbols("t"))
+        shared, results = sympy.cse([_with_roots(e) for e in expressions], symbols=sympy.numbered_symbols("t"))
         statements = []
         for symbol, expression in shared:
             statements.append((symbol.name, _text(expression, names)))
@@ -260,6 +261,16 @@ def _short(expression: Any) -> Any:
     return expanded if expanded.count_ops() <= expression.count_ops() else expression
 
 
+def _with_roots(expression: Any) -> Any:
+    """Powers p/q as p-th powers of q-th roots, so that many of them share a root."""
+    import sympy
+
+    root = sympy.Function(ROOT)
+    return sympy.sympify(expression).replace(
+        lambda e: e.is_Pow and e.exp.is_Rational and 2 < e.exp.q < 10, lambda e: root(e.base, e.exp.q) ** e.exp.p
+    )
+
+
 def _is_zero(expression: Any) -> bool:
     return expression == 0 or expression.expand() == 0
 
@@ -275,7 +286,7 @@ def _text(e: Any, names: dict[Any, str]) -> str:
         return f"({joined})"
     if e.is_Pow:
         base, exponent = _text(e.base, names), e.exp
-        if exponent.is_Integer and 1 < abs(exponent) <= 8:
+        if exponent.is_Integer and 1 < abs(exponent) <= 16:
             power = "(" + " * ".join([base] * abs(int(exponent))) + ")"
             return power if exponent > 0 else f"(R(1) / {power})"
         if exponent == -1:
@@ -285,6 +296,8 @@ def _text(e: Any, names: dict[Any, str]) -> str:
         if exponent.is_number:
             return f"power({base}, R({float(exponent)!r}))"
         return f"exponential({_text(exponent, names)} * natural_log({base}))"
+    if e.func.__name__ == ROOT:
+        return f"power({_text(e.args[0], names)}, R({1 / int(e.args[1])!r}))"
     function = {"log": "natural_log", "exp": "exponential", STRETCHES: "stretch_sum"}[e.func.__name__]
     return f"{function}({', '.join(_text(a, names) for a in e.args)})"
 
