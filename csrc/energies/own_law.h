@@ -422,15 +422,20 @@ struct OwnLaw {
     bend = energy(end, rest) - energy(x, rest) - slope;
   }
 
-  // The change of a tet's energy as its vertex moves from x by `step`, and the sizes of the two energies.
+  // The change of a tet's energy as its vertex moves from x by `step`, and the sizes of the terms.
   template <class R>
   DIFFVBD_FN static void change(const TetPair<R>& e, const Vec3<R>& x, const Vec3<R>& step, R& sum, R& size) {
     const R* p = e.rest + L::pair_parameters;
     const R v = volume(c6(e));
     const Vec3<R> d = x - e.xj;
-    const R before = v * Density::value(shape(e, d).v, p), after = v * Density::value(shape(e, d + step).v, p);
+    const Invariants<R> here = shape(e, d).v;
+    const R before = v * Density::value(here, p), after = v * Density::value(shape(e, d + step).v, p);
+    const Slopes<R> w = Density::slopes(here, p);
     sum = sum + (after - before);
-    size = size + absolute(before) + absolute(after);
+    // psi may be small where its terms are not: what rounding of the invariants does to it
+    size =
+        size + absolute(before) + absolute(after) +
+        v * (absolute(w.i1 * here.i1) + absolute(w.i2 * here.i2) + absolute(w.j * here.j) + absolute(w.i4 * here.i4));
   }
 
   // --- for blocks that are solved in two passes (sweep/refine.h), which only quadratic laws have
