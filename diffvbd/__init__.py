@@ -17,6 +17,7 @@ from .inspect.diagnose import diagnose
 from .inspect.forces import coupling_forces, reactions, stress
 from .inspect.gradcheck import check_gradients
 from .inspect.record import record
+from .laws import law
 from .mesh import TetMesh
 from .model.coarse import CoarseSpace
 from .model.material import fibre_contraction, lame, young_poisson
@@ -64,6 +65,7 @@ __all__ = [
     "error_budget",
     "fibre_contraction",
     "lame",
+    "law",
     "memory",
     "mesh",
     "per_step",

@@ -10,7 +10,7 @@ from helpers.paths import CSRC, PACKAGE, needs_csrc
 
 # Lowest first. A file beside the folders is a part of one file; "" is the package's own __init__.
 PYTHON = (
-    "_version", "_common", "distributed", "energies", "mesh", "reference", "ops", "embedding", "couplings",
+    "_version", "_common", "distributed", "energies", "laws", "mesh", "reference", "ops", "embedding", "couplings",
     "_contact", "model", "adjoint",
     "step", "rollout", "inspect", "contact", "results", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
     "cli", "__main__",

@@ -29,7 +29,13 @@ template <class F>
 auto dispatch_float(const Tensor& t, F&& f) {
   require(t.scalar_type() == ScalarType::Double || t.scalar_type() == ScalarType::Float,
           "diffvbd: expected float64 or float32 tensors");
+#ifdef DIFFVBD_SCALAR  // of a generated law
+  require((t.scalar_type() == ScalarType::Double) == (sizeof(DIFFVBD_SCALAR) == sizeof(double)),
+          "diffvbd: expected tensors of the dtype that the law was compiled for");
+  return f(DIFFVBD_SCALAR{});
+#else
   return t.scalar_type() == ScalarType::Double ? f(double{}) : f(float{});
+#endif
 }
 
 template <class T>

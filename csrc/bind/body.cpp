@@ -7,6 +7,8 @@
 namespace diffvbd {
 namespace {
 
+#ifndef DIFFVBD_LAW_HEADER  // what reads no law
+
 // The rigid correction of each body that is listed, and the velocity (x - x_prev) / h. groups: how many bodies a
 // thread, a part of a warp, a block and the whole device work on (CUDA).
 DIFFVBD_OPERATOR(Out<2>, rigid, DIFFVBD_PARAMETERS(RIGID) Ints groups, Ints data_count, double time_step) {
@@ -39,6 +41,8 @@ DIFFVBD_OPERATOR(Out<6>, rigid_backward, DIFFVBD_PARAMETERS(RIGID) In x_bar, In 
     return Out<6>(bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own);
   });
 }
+
+#endif
 
 struct BeginSettings {
   Ints data_count;
@@ -146,6 +150,8 @@ DIFFVBD_OPERATOR(Out<4>, begin, DIFFVBD_PARAMETERS(BEGIN) Ints groups, Ints othe
   });
 }
 
+#ifndef DIFFVBD_LAW_HEADER
+
 // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes by
 // vertex [scenes, vertices, scalars of the planes].
 DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_bar, In y_bar, In from_predictor,
@@ -183,6 +189,8 @@ DIFFVBD_OPERATOR(Out<8>, begin_backward, DIFFVBD_PARAMETERS(BEGIN) In x_start_ba
     return Out<8>(x_out, v_out, acceleration_out, prescribed_out, mass_out, shared, own, planes);
   });
 }
+
+#endif
 
 // Increase of the potential of each body from x to `to`, and the sum of the sizes of its terms [scenes, bodies, 2],
 // float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by body; material [1 |

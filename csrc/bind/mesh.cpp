@@ -20,6 +20,8 @@ DIFFVBD_OPERATOR(Tensor, pack_rest, In rest, In plan, Ints sizes) {
   });
 }
 
+#ifndef DIFFVBD_LAW_HEADER  // what reads no law
+
 DIFFVBD_OPERATOR(Tensor, tet_gather, In values, In tets) {
   const Device device(values);
   require(values.dim() == 3 && values.is_contiguous() && is_beside(tets, values, ScalarType::Long) && tets.dim() == 2 &&
@@ -148,6 +150,7 @@ DIFFVBD_OPERATOR(Out<5>, build_plan, In points, In tets, In active, int64_t lane
   return {plan_out, color_ptr, members, star_ptr, star};
 }
 
+#endif
 #endif
 
 }  // namespace

@@ -62,6 +62,10 @@ inline std::string schema_of(const char* name, const std::string& parameters, si
 #define DIFFVBD_TEXT(...) DIFFVBD_TEXT_(__VA_ARGS__)
 #define DIFFVBD_TEXT_(...) #__VA_ARGS__
 
+// A generated law has objects of its own, in which diffvbd is another name, of namespace and library (diffvbd/laws).
+#define DIFFVBD_FRAGMENT(library, m) STABLE_TORCH_LIBRARY_FRAGMENT(library, m)
+#define DIFFVBD_IMPL(library, backend, m) STABLE_TORCH_LIBRARY_IMPL(library, backend, m)
+
 // The object of the CPU, which is always there, defines what the operators of all backends are.
 #ifdef USE_CUDA
 #define DIFFVBD_BACKEND CUDA
@@ -69,7 +73,7 @@ inline std::string schema_of(const char* name, const std::string& parameters, si
 #else
 #define DIFFVBD_BACKEND CPU
 #define DIFFVBD_SCHEMA(Returns, name, ...)                                                                           \
-  STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {                                                                        \
+  DIFFVBD_FRAGMENT(diffvbd, m) {                                                                                     \
     m.def(::diffvbd::schema_of(#name, DIFFVBD_TEXT(__VA_ARGS__), ::diffvbd::returns(static_cast<Returns*>(nullptr))) \
               .c_str());                                                                                             \
   }
@@ -82,4 +86,4 @@ inline std::string schema_of(const char* name, const std::string& parameters, si
   static Returns name##_operator(__VA_ARGS__)
 #define DIFFVBD_IMPLEMENTATION(backend, name) DIFFVBD_IMPLEMENTATION_(backend, name)
 #define DIFFVBD_IMPLEMENTATION_(backend, name) \
-  STABLE_TORCH_LIBRARY_IMPL(diffvbd, backend, m) { m.impl(#name, TORCH_BOX(&name##_operator)); }
+  DIFFVBD_IMPL(diffvbd, backend, m) { m.impl(#name, TORCH_BOX(&name##_operator)); }

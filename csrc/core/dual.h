@@ -19,6 +19,7 @@ struct Dual {
 };
 
 DIFFVBD_FN double value_of(double a) { return a; }
+DIFFVBD_FN float value_of(float a) { return a; }
 template <class R>
 DIFFVBD_FN R value_of(const Dual<R>& a) {
   return a.value;

@@ -30,6 +30,13 @@ DIFFVBD_FN double square_root(double a) { return std::sqrt(a); }
 DIFFVBD_FN float square_root(float a) { return std::sqrt(a); }
 DIFFVBD_FN double natural_log(double a) { return std::log(a); }
 DIFFVBD_FN float natural_log(float a) { return std::log(a); }
+DIFFVBD_FN double exponential(double a) { return std::exp(a); }
+DIFFVBD_FN float exponential(float a) { return std::exp(a); }
+DIFFVBD_FN double power(double a, double p) { return std::pow(a, p); }
+DIFFVBD_FN float power(float a, float p) { return std::pow(a, p); }
+// the largest power of two that is not above a > 0
+DIFFVBD_FN double power_of_two(double a) { return std::exp2(std::floor(std::log2(a))); }
+DIFFVBD_FN float power_of_two(float a) { return std::exp2(std::floor(std::log2(a))); }
 
 template <class R>
 DIFFVBD_FN R absolute(const R& a) {

@@ -258,7 +258,11 @@ void CoarseScene<T>::finish(Team::Member& member) {
   });
 }
 
+#ifdef DIFFVBD_SCALAR
+template class CoarseScene<DIFFVBD_SCALAR>;
+#else
 template class CoarseScene<float>;
 template class CoarseScene<double>;
+#endif
 
 }  // namespace diffvbd

@@ -244,7 +244,11 @@ void ContactScene<T>::finish(T* collider_bar) const {
   }
 }
 
+#ifdef DIFFVBD_SCALAR
+template class ContactScene<DIFFVBD_SCALAR>;
+#else
 template class ContactScene<float>;
 template class ContactScene<double>;
+#endif
 
 }  // namespace diffvbd

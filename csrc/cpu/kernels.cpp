@@ -76,15 +76,18 @@ template <class T>
 PairKernels<T> pair_kernels() {
   return kernels<T>().pairs;
 }
-OverlapKernel overlap_kernel() { return kernels<float>().meet; }
 
-template SweepKernel<float> forward_kernel<float>(int);
-template SweepKernel<double> forward_kernel<double>(int);
-template SweepKernel<float> reverse_kernel<float>(int);
-template SweepKernel<double> reverse_kernel<double>(int);
-template CoarseKernels<float> coarse_kernels<float>(int);
-template CoarseKernels<double> coarse_kernels<double>(int);
-template PairKernels<float> pair_kernels<float>();
-template PairKernels<double> pair_kernels<double>();
+#define DIFFVBD_INSTANTIATE(T)                      \
+  template SweepKernel<T> forward_kernel<T>(int);   \
+  template SweepKernel<T> reverse_kernel<T>(int);   \
+  template CoarseKernels<T> coarse_kernels<T>(int); \
+  template PairKernels<T> pair_kernels<T>();
+#ifdef DIFFVBD_SCALAR
+DIFFVBD_INSTANTIATE(DIFFVBD_SCALAR)
+#else
+OverlapKernel overlap_kernel() { return kernels<float>().meet; }
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#endif
 
 }  // namespace diffvbd

@@ -73,6 +73,10 @@ template <class T>
 DIFFVBD_FN Lanes<T> operator/(const Lanes<T>& a, const Lanes<T>& b) {
   return Lanes<T>(a.v / b.v);
 }
+template <class T>
+DIFFVBD_FN const Lanes<T>& value_of(const Lanes<T>& a) {
+  return a;
+}
 // A comparison yields a vector of integers, all bits set where it holds.
 template <class I>
 struct Mask {
@@ -115,6 +119,7 @@ DIFFVBD_FN void clear_upper_halves() {
   __builtin_ia32_vzeroupper();
 #endif
 }
+#ifndef DIFFVBD_LAW_HEADER
 template <class T>
 DIFFVBD_FN Lanes<T> natural_log(const Lanes<T>& a) {
   Lanes<T> r;
@@ -124,6 +129,32 @@ DIFFVBD_FN Lanes<T> natural_log(const Lanes<T>& a) {
   }
   return r;
 }
+#else
+// Generated laws have many functions: out of line and in memory, so that no register is in use across a call.
+template <class T, class F>
+DIFFVBD_FN Lanes<T> each_lane(const Lanes<T>& a, const F& f) {
+  T values[kLanes];
+  a.store(values);
+  for (int l = 0; l < kLanes; ++l) values[l] = f(values[l], l);
+  return Lanes<T>::load(values);
+}
+template <class T>
+DIFFVBD_APART Lanes<T> natural_log(const Lanes<T>& a) {
+  return each_lane(a, [](T value, int) { return std::log(value); });
+}
+template <class T>
+DIFFVBD_APART Lanes<T> exponential(const Lanes<T>& a) {
+  return each_lane(a, [](T value, int) { return std::exp(value); });
+}
+template <class T>
+DIFFVBD_APART Lanes<T> power(const Lanes<T>& a, const Lanes<T>& p) {
+  return each_lane(a, [&](T value, int l) { return std::pow(value, p.v[l]); });
+}
+template <class T>
+DIFFVBD_APART Lanes<T> power_of_two(const Lanes<T>& a) {
+  return each_lane(a, [](T value, int) { return diffvbd::power_of_two(value); });
+}
+#endif
 
 // --- rows of four scalars (x, y, z, unused) <-> lanes ----------------------------------------------------------------
 // A row is one load; a network of shuffles then turns kLanes rows into three packs, where single scalars would be

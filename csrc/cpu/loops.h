@@ -70,7 +70,7 @@ void begin(const start::Inputs<T>& in, const StartChoice<T>& of_corrected, const
   if (of_others.two) {
     for_bodies(of_others.two->bodies, [&](const rigid::Body<T>& body, const Threads& team) {
       of_others.taken[body.scene * in.others + body.body] =
-          start::path_between(*of_others.two, body, team).increase <= 0;
+          start::path_between<false>(*of_others.two, body, team).increase <= 0;
     });
     for_vertices(in.bodies, [&](int64_t scene, int32_t i) { choose_vertex(in, x_start, of_others.second, scene, i); });
   }

@@ -102,7 +102,7 @@ struct Scene {
     view.mass = mass.get();
     if (in.energies & kElastic) {
       material = Buffer<T>(size_t(plan.slots) * kMaterialScalars * kLanes);
-      for (int m = 0; m < kMaterialScalars; ++m) {
+      for (int m = 0; TetLayout::reads_material && m < kMaterialScalars; ++m) {
         for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
           const Batched<const T>& given = in.material[m];
           const int64_t tet = plan.pair[i] >> 2, slot = i / kLanes;
@@ -286,8 +286,8 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
   check_vectors("x", in.x_prev, in.scenes, n);
   check_vectors("predictor (x, v, force, gravity, prescribed)", in.y, in.scenes, n);
   check_vectors("start (x, v, force, gravity, prescribed)", in.x_start, in.scenes, n);
-  if (in.energies & kExactBlock) check_material<StableNeoHookean<true>>(in, plan.num_tets);
-  if (in.energies & kPaperBlock) check_material<StableNeoHookean<false>>(in, plan.num_tets);
+  if (in.energies & kExactBlock) check_material<ElasticLaw<true>>(in, plan.num_tets);
+  if (in.energies & kPaperBlock) check_material<ElasticLaw<false>>(in, plan.num_tets);
   // Vertices that no sweep moves need no mass: an isolated vertex has none.
   for (int64_t b = 0; b < distinct_scenes(in.mass, in.scenes); ++b) {
     for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
@@ -496,6 +496,9 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
     out << "rest_points: expected tets of positive volume, got " << volume << " m^3 at tet " << t;
     throw std::invalid_argument(out.text);
   }
+  int at[4][kPairRest];
+  for (int i = 0; i < 4 * kPairRest; ++i)
+    at[i / kPairRest][i % kPairRest] = TetLayout::rest_index(i / kPairRest, i % kPairRest);
   for (int64_t block = 0; block < plan.blocks; ++block) {
     for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
       for (int l = 0; l < kLanes; ++l) {
@@ -505,7 +508,7 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
         const T* row = rest + int64_t{pair >> 2} * kRestScalars;
         const int local = pair & 3;
         for (int i = 0; i < kPairRest; ++i) {
-          out[i * kLanes] = padding ? T(0) : row[TetLayout::rest_index(local, i)];
+          out[i * kLanes] = padding && i < TetLayout::pair_shape ? T(0) : row[at[local][i]];
         }
       }
     }
@@ -519,7 +522,11 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, const uint8_t*, \
                                const StepAdjoints<T>&);                                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);
+#ifdef DIFFVBD_SCALAR
+DIFFVBD_INSTANTIATE(DIFFVBD_SCALAR)
+#else
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
+#endif
 
 }  // namespace diffvbd

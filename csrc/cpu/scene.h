@@ -132,8 +132,10 @@ struct LaneStar {
     out.xl = gather3(s.x, j + 2 * kLanes);
     each_below<kPairRest>([&](auto i)
                               DIFFVBD_INLINE { out.rest[decltype(i)::value] = Lanes<T>::load(r + i * kLanes); });
-    each_below<kMaterialScalars>(
-        [&](auto i) DIFFVBD_INLINE { out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes); });
+    if constexpr (TetLayout::reads_material) {
+      each_below<kMaterialScalars>(
+          [&](auto i) DIFFVBD_INLINE { out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes); });
+    }
     return out;
   }
 

@@ -19,8 +19,9 @@ __attribute__((flatten)) void forward_color(const Plan& plan, const SceneView<T>
   for (int64_t block = begin; block < end; ++block) {
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
-    const NewtonStep<R> newton = newton_step<Set>(b, LaneStar<T>(plan, s, block), q);
-    const Update<R> u = update_of<Set>(b, newton, q);
+    const LaneStar<T> star(plan, s, block);
+    const NewtonStep<R> newton = newton_step<Set>(b, star, q);
+    const Update<R> u = update_of<Set>(b, star, newton, q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
     if (tape == kNoTape) continue;
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];

@@ -44,6 +44,8 @@ __global__ void pack_rest_kernel(GroupPlan plan, int64_t scenes, const T* rest, 
     const T* row = rest + (scene * plan.num_tets + (entry >> 2)) * kRestScalars;
     const int own = entry & 3;
     for (int a = 0; a < kPairRest; ++a) values[a] = row[TetLayout::rest_index(own, a)];
+  } else {  // whose parameters are those of some tet
+    for (int a = TetLayout::pair_shape; a < kPairRest; ++a) values[a] = rest[TetLayout::rest_index(0, a)];
   }
   T* to = packed + scene * pairs * kRestRow;
 #pragma unroll

@@ -32,7 +32,7 @@ struct Choose {
   uint8_t* decreases;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    const double increase = start::path_between(two, body, team).increase;
+    const double increase = start::path_between<false>(two, body, team).increase;
     if (team.leads()) decreases[body.scene * two.bodies.bodies + body.body] = increase <= 0;
   }
 };

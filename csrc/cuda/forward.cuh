@@ -51,7 +51,7 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   if constexpr (Set::well_conditioned) {
     if (needs_refinement<Set>(b, star, newton.H)) return false;
   }
-  const Update<T> u = update_of<Set>(b, newton, q);
+  const Update<T> u = update_of<Set>(b, star, newton, q);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   path = {b.state.x, moved<Set>(b.state.x, u)};
   if (!Set::contact && at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, path.to);

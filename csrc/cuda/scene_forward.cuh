@@ -23,7 +23,7 @@ __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs
   if constexpr (Set::well_conditioned) {
     if (needs_refinement<Set>(b, star, newton.H)) return false;
   }
-  const Update<T> u = update_of<Set>(b, newton, q);
+  const Update<T> u = update_of<Set>(b, star, newton, q);
   set_column3(x, vertex, moved<Set>(b.state.x, u));
   if (in.tape_policy == kNoTape) return true;
   const int rows = tape_rows(in.tape_policy, Set::kept_scalars);

@@ -12,7 +12,11 @@
 #include "../core/views.h"
 #include "anchor.h"
 #include "floor_barrier.h"
+#ifdef DIFFVBD_LAW_HEADER
+#include "own_law.h"
+#else
 #include "stable_neo_hookean.h"
+#endif
 
 namespace diffvbd {
 
@@ -28,7 +32,14 @@ constexpr int kVertexEnergies = VertexEnergies::size;
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
 constexpr int kElastic = kExactBlock | kPaperBlock;
 constexpr int kContact = 4;
-using TetLaw = StableNeoHookean<true>;  // for what both blocks share: the potential and the stiffness at rest
+#ifdef DIFFVBD_LAW_HEADER
+template <bool>
+using ElasticLaw = OwnLaw;
+#else
+template <bool exact>
+using ElasticLaw = StableNeoHookean<exact>;
+#endif
+using TetLaw = ElasticLaw<true>;  // for what both blocks share: the potential and the stiffness at rest
 constexpr int kFirstVertexBit = 3;
 
 // The compiled variants are numbered (elastic, the bits above): mask of the n-th, and back; and of those without
@@ -46,8 +57,11 @@ constexpr int free_mask(int n) { return 1 + n % kElasticVariants + (n / kElastic
 constexpr int elastic_index(int mask) { return (mask & kPaperBlock) != 0 ? 1 : 0; }
 constexpr int energy_index(int mask) { return elastic_index(mask) + mask / kContact * kElasticVariants; }
 constexpr int free_index(int mask) { return elastic_index(mask) + (mask >> kFirstVertexBit) * kElasticVariants; }
-// A quick build, for work on an energy (docs/guides/extend.md), leaves out the paper's block.
-#ifdef DIFFVBD_QUICK
+// A quick build, for work on an energy (docs/guides/extend.md), leaves out the paper's block; a generated law has no
+// such block, and no contact.
+#ifdef DIFFVBD_LAW_HEADER
+constexpr bool is_compiled(int mask) { return (mask & (kPaperBlock | kContact)) == 0; }
+#elif defined(DIFFVBD_QUICK)
 constexpr bool is_compiled(int mask) { return (mask & kPaperBlock) == 0; }
 #else
 constexpr bool is_compiled(int) { return true; }
@@ -93,11 +107,14 @@ constexpr bool any_filter(int mask, EnergyList<E...>) {
   int k = kFirstVertexBit;
   return ((((mask >> k++) & 1) && E::has_filter) || ...);
 }
+// Whether updates take fractions of their steps (sweep/vertex.h): with a step filter, or where a vertex's own potential
+// is not quadratic.
+constexpr bool takes_fractions(int mask) { return !TetLaw::quadratic || any_filter(mask, VertexEnergies{}); }
 // Whether a vertex must come back to its old position exactly in the reverse: gaps depend on it to the bit, and an undo
 // by subtraction is an ulp off at times.
-constexpr bool keeps_positions(int mask) { return (mask & kContact) != 0 || any_filter(mask, VertexEnergies{}); }
-// What a tape keeps for that: the old position and, with a step filter, the fraction of the update (sweep/vertex.h).
-constexpr int kept_scalars(int mask) { return any_filter(mask, VertexEnergies{}) ? 4 : keeps_positions(mask) ? 3 : 0; }
+constexpr bool keeps_positions(int mask) { return (mask & kContact) != 0 || takes_fractions(mask); }
+// What a tape keeps for that: the old position and, where they are decided, the fraction of the update.
+constexpr int kept_scalars(int mask) { return takes_fractions(mask) ? 4 : keeps_positions(mask) ? 3 : 0; }
 constexpr bool has_vertex_energy(int mask) { return (mask >> kFirstVertexBit) != 0; }
 template <class... E>
 constexpr bool any_x_prev(int mask, EnergyList<E...>) {
@@ -110,7 +127,7 @@ struct EnergySet {
   static constexpr bool well_conditioned = false;
   static constexpr bool contact = (mask & kContact) != 0;
   static constexpr bool of_vertices = has_vertex_energy(mask);
-  using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
+  using Elastic = ElasticLaw<(mask & kExactBlock) != 0>;
 
   // calls f(energy, its position in the list) for each energy of one vertex that is present
   template <class F>
@@ -118,6 +135,7 @@ struct EnergySet {
     visit<0>(f, VertexEnergies{});
   }
   static constexpr bool filters = any_filter(mask, VertexEnergies{});
+  static constexpr bool takes_fractions = diffvbd::takes_fractions(mask);
   static constexpr bool keeps_positions = diffvbd::keeps_positions(mask);
   static constexpr int kept_scalars = diffvbd::kept_scalars(mask);
   static constexpr bool reads_x_prev = any_x_prev(mask, VertexEnergies{});

@@ -16,6 +16,7 @@ namespace diffvbd {
 
 template <bool Exact>
 struct StableNeoHookean {
+  static constexpr bool quadratic = true;  // in the position of one vertex
   // The material of a tet: mu, lam [Pa].
   template <class R>
   DIFFVBD_FN static const R& mu(const TetPair<R>& e) {
@@ -191,6 +192,16 @@ struct StableNeoHookean {
     c[3] = c[3] + b * (R(2) * j1 * j3 + j2 * j2);
     c[4] = c[4] + R(2) * b * j2 * j3;
     c[5] = c[5] + b * j3 * j3;
+  }
+
+  // Its derivative along p at x, and by how much more than that it changes up to x + p.
+  template <bool, class R>
+  DIFFVBD_FN static void path(const Vec3<R> (&x)[4], const Vec3<R> (&p)[4], const R* rest, const R* material, R& slope,
+                              R& bend) {
+    R c[TetLayout::line_degree]{};
+    line(x, p, rest, material, c);
+    slope = c[0], bend = R(0);
+    for (int k = 1; k < TetLayout::line_degree; ++k) bend = bend + c[k];
   }
 
   // The stiffness of two corners at rest, per volume [Pa/m^2], from the gradients of their shape functions [1/m]: three

@@ -3,25 +3,32 @@
 #pragma once
 
 #include "../core/views.h"
+#ifdef DIFFVBD_LAW_HEADER
+#include "own_layout.h"
+#endif
 
 namespace diffvbd {
 
+#ifndef DIFFVBD_LAW_HEADER
 // Material and rest shape of the law that scenes use (stable_neo_hookean.h).
 struct TetLayout {
   static constexpr int material = 2;   // of a tet: mu, lam [Pa]
   static constexpr int rest = 7;       // of a tet: the stiffness weights k01 k02 k03 k12 k13 k23 [m], c6 [1/m^3]
   static constexpr int pair_rest = 4;  // of them, as corner `local` sees them: k_ij, k_ik, k_il, c6
+  static constexpr int pair_shape = pair_rest;  // the first of them, which are 0 in pairs that fill up a block
 
   DIFFVBD_FN static constexpr int rest_index(int local, int i) {
     return i == 3 ? 6 : weight_index(local, other_corner(local, i));
   }
   static constexpr int line_degree = 6;  // of the tet's energy along a line, a polynomial: StableNeoHookean::line()
+  static constexpr bool polynomial = true, reads_material = true;
 
   template <class T>
   DIFFVBD_FN static T volume(const T* rest) {
     return 1 / (6 * rest[6]);
   }
 };
+#endif
 constexpr int kMaterialScalars = TetLayout::material;
 constexpr int kRestScalars = TetLayout::rest, kPairRest = TetLayout::pair_rest;
 

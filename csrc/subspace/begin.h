@@ -353,7 +353,8 @@ struct Path {
   // Whether tets hardly turn vertices back within a step. d . M d of the whole body would hide a few that do.
   DIFFVBD_FN bool is_soft() const { return ratio < kSoft; }
 };
-template <class T, class Team>
+// The ratio only where it is asked for: a generated law has to find it apart.
+template <bool has_ratio = true, class T, class Team>
 DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, const Team& team) {
   const auto other = [&](int32_t v) { return wide_at(in.other + 3 * b.row(v)); };
   double vertices[1];
@@ -380,12 +381,10 @@ DIFFVBD_FN Path path_between(const Candidates<T>& in, const rigid::Body<T>& b, c
     for (int m = 0; m < kMaterialScalars; ++m) {
       material[m] = in.material[m].data[b.scene * in.material[m].scene + in.material[m].item * tet[0]];
     }
-    double increase[TetLayout::line_degree]{};
-    TetLaw::line(one, displacement, rest, material, increase);
-    double bend = 0, inertia = 0;  // half of d . K d, K averaged over the path
-    for (int k = 1; k < TetLayout::line_degree; ++k) bend += increase[k];
+    double slope, bend, inertia = 0;  // bend: half of d . K d, K averaged over the path
+    TetLaw::template path<has_ratio>(one, displacement, rest, material, slope, bend);
     for (int c = 0; c < 4; ++c) inertia += b.mass(tet[1 + c]) * dot(displacement[c], displacement[c]);
-    to[0] += increase[0] + bend;
+    to[0] += slope + bend;
     if (inertia > 0) to[1] += std::abs(bend), to[2] += bend * bend / inertia;
   });
   const double h2 = b.in.time_step * b.in.time_step;

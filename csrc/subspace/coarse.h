@@ -125,16 +125,28 @@ constexpr int kDegree = TetLayout::line_degree;
 constexpr double kDecrease = 1e-4;  // of the decrease that the slope promises
 constexpr int kFailures = 2;        // lengths of 0 after which a body's corrections are over
 
-// The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes.
+// The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes. Of a law
+// that is no polynomial: c are changes between trial fractions (OwnLaw::line()), and inertia stands apart.
 struct Change {
   double c[kDegree];
+  double slope, bend;
 
   DIFFVBD_FN double at(double s) const {
+    if constexpr (!TetLayout::polynomial) {
+      double sum = (slope + bend * s) * s;
+      for (int i = kDegree - 1; i >= 0 && fraction_of(i) <= s; --i) sum += c[i];
+      return sum;
+    }
     double sum = 0;
     for (int i = kDegree - 1; i >= 0; --i) sum = (sum + c[i]) * s;
     return sum;
   }
   DIFFVBD_FN double size(double s) const {
+    if constexpr (!TetLayout::polynomial) {
+      double sum = (std::abs(slope) + bend * s) * s;
+      for (int i = kDegree - 1; i >= 0 && fraction_of(i) <= s; --i) sum += std::abs(c[i]);
+      return sum;
+    }
     double sum = 0;
     for (int i = kDegree - 1; i >= 0; --i) sum = (sum + std::abs(c[i])) * s;
     return sum;
@@ -265,15 +277,15 @@ DIFFVBD_FN double decide(const Line<T, In>& line, const T* a, const T* restricte
                              });
   const double h2 = double(line.in.parameters.time_step) * double(line.in.parameters.time_step);
   for (double& c : change.c) c *= h2;
-  change.c[1] += 0.5 * inertial[0];
-  bool others = false;
+  (TetLayout::polynomial ? change.c[1] : change.bend) += 0.5 * inertial[0];
+  bool others = !TetLayout::polynomial;
   for (int k = 0; k < kVertexEnergies; ++k) others = others || line.in.data_count[k] > 0;
   if (!others) {
     change.c[0] = slope[0];
     return length<T>(change, slope[0], [](double, double&) { return 0.0; });
   }
   team.template sum<1>(line.size(), inertia, [&](int32_t i, double* out) { out[0] += line.inertia(i); });
-  change.c[0] += inertia[0];
+  (TetLayout::polynomial ? change.c[0] : change.slope) += inertia[0];
   return length<T>(change, slope[0], [&](double s, double& size) {
     double sums[2];
     team.template sum<2>(line.size(), sums, [&](int32_t i, double* out) { out[0] += line.energies(i, s, out[1]); });

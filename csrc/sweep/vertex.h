@@ -16,6 +16,66 @@ DIFFVBD_FN R square_in(const Factor<R>& H, const Vec3<R>& d) {
   return first * first / H.inv1 + second * second / H.inv2 + d.z * d.z / H.inv3;
 }
 
+// The same for a law that is not quadratic in one vertex: the change of the vertex's whole potential, tet by tet.
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN R descending_fraction(const Block<R>& b, const Star& star, const StepParameters<T>& q, const Update<R>& u) {
+  const Vec3<R> whole = u.alpha * u.step;
+  const R h2 = R(q.time_step) * R(q.time_step);
+  R out = R(0);
+  for (int trial = 0; trial < kFractions && star.any(out < R(fraction_of(kFractions))); ++trial) {
+    const R s = R(fraction_of(trial));
+    const Vec3<R> step = s * whole;
+    R of_tets = R(0), size = R(0);
+    star.rewind();
+    for (int e = 0; e < star.size(); ++e) Set::Elastic::change(star.pair(e), b.state.x, step, of_tets, size);
+    star.total(of_tets, size);
+    const R slope = b.mass * dot(step, b.state.x - b.y), bend = R(0.5) * b.mass * dot(step, step);
+    R increase = h2 * of_tets + (slope + bend), terms = h2 * size + absolute(slope) + bend;
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) {
+        increase = increase + E::change(b.state, step, b.data[k], b.data_count[k], terms);
+      } else if (b.data_count[k] > 0) {
+        VertexState<R> end = b.state;
+        end.x += step;
+        const R before = E::value(b.state, b.data[k], b.data_count[k]),
+                after = E::value(end, b.data[k], b.data_count[k]);
+        increase = increase + (after - before), terms = terms + absolute(before) + absolute(after);
+      }
+    });
+    const R rounding = R(kRounding * std::numeric_limits<T>::epsilon()) * terms;
+    const R admitted = select(rounding < increase, R(0), s);
+    out = select(R(0) < out, out, select(terms < R(std::numeric_limits<T>::max()), admitted, R(0)));
+  }
+  return out;
+}
+
+// A block of such a law may have negative curvature. It is then shifted by the least of some powers of two [kg] that
+// makes it positive definite: decided, and constant in the reverse, as the factored block is that of the shifted one.
+constexpr double kLeastCurvature = 1.0 / 64;  // of the vertex's own mass
+constexpr int kShifts = 8;
+template <class R>
+DIFFVBD_FN R least_minor(const Sym3<R>& a, const R& shift) {  // above 0 where it is positive definite
+  const R xx = a.xx + shift, yy = a.yy + shift, zz = a.zz + shift;
+  const R two = xx * yy - a.xy * a.xy;
+  const R all = xx * (yy * zz - a.yz * a.yz) - a.xy * (a.xy * zz - a.yz * a.xz) + a.xz * (a.xy * a.yz - yy * a.xz);
+  const R least = select(two < all, two, all);
+  return select(xx < least, xx, least);
+}
+template <class R, class Star>
+DIFFVBD_FN R shift_of(const Sym3<R>& H, const R& least, const Star& star) {
+  R shift = R(0);
+  if (!star.any(R(0) < select(R(0) < least_minor(H, -least), R(0), R(1)))) return shift;
+  const R size =
+      absolute(H.xx) + absolute(H.yy) + absolute(H.zz) + R(2) * (absolute(H.xy) + absolute(H.xz) + absolute(H.yz));
+  R trial = R(0.0625) * power_of_two(select(R(0) < size, size, least));
+  for (int k = 0; k < kShifts; ++k) {
+    shift = select(R(0) < least_minor(H, shift - least), shift, trial);
+    trial = trial + trial;
+  }
+  return shift;
+}
+
 // The largest of 1, 1/2, ... for which the vertex's own potential does not increase along the update, beyond rounding;
 // or 0. The update is t d with H d = -g. Apart from the barriers the potential is quadratic in one vertex: it changes
 // by -(t - t^2 / 2) d . H d, and by the deviation of the barriers from their part of g and H. d is in the axes of H. 1
@@ -70,9 +130,15 @@ struct NewtonStep {
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const System<Set, R> system = assemble<Set>(b, star, q);
-  const Factor<R> H = factor<T>(system.H, system.least);
+  Sym3<R> block = system.H;
+  R least = system.least;
+  if constexpr (!Set::Elastic::quadratic) {
+    least = R(kLeastCurvature) * least;
+    add_diagonal(block, shift_of(block, least, star));
+  }
+  const Factor<R> H = factor<T>(block, least);
   Vec3<R> d = -solve(H, system.g);
-  if constexpr (!Set::well_conditioned) {
+  if constexpr (!Set::well_conditioned && Set::Elastic::quadratic) {
     if (star.any(is_ill_conditioned<Set>(H, shared_entries<Set>(b, system.axes))))
       d = refine_step<Set>(b, star, q, system.axes, H, d);
   }
@@ -82,7 +148,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
 // Whether a block needs refinement: all threads that share a star must know.
 template <class Set, class R, class Star>
 DIFFVBD_FN bool needs_refinement(const Block<R>& b, const Star& star, const Factor<R>& H) {
-  return star.any(is_ill_conditioned<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
+  return Set::Elastic::quadratic && star.any(is_ill_conditioned<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
 }
 
 // Saturated, then relaxed.
@@ -105,16 +171,21 @@ DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const 
   return out;
 }
 
-template <class Set, class R, class T>
-DIFFVBD_FN Update<R> update_of(const Block<R>& b, const NewtonStep<R>& newton, const StepParameters<T>& q) {
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN Update<R> update_of(const Block<R>& b, const Star& star, const NewtonStep<R>& newton,
+                               const StepParameters<T>& q) {
   Update<R> out = safeguarded<Set>(b, newton.d_raw, q);
-  out.fraction = descending_fraction<Set>(b, q, newton.H, newton.d, out);
+  if constexpr (Set::Elastic::quadratic) {
+    out.fraction = descending_fraction<Set>(b, q, newton.H, newton.d, out);
+  } else {
+    out.fraction = descending_fraction<Set>(b, star, q, out);
+  }
   return out;
 }
 
 template <class Set, class R>
 DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
-  if constexpr (Set::filters) return x + (u.fraction * u.alpha) * u.step;
+  if constexpr (Set::takes_fractions) return x + (u.fraction * u.alpha) * u.step;
   return x + u.step;
 }
 
@@ -134,7 +205,7 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
     if (Set::keeps_positions) r.d = step.d;
   }
   if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, axes_of<T, Set>(b).from(r.d), q);
-  if constexpr (Set::filters) u.fraction = r.fraction;
+  if constexpr (Set::takes_fractions) u.fraction = r.fraction;
   return u;
 }
 
@@ -145,7 +216,7 @@ DIFFVBD_FN Recalled<R> recall(bool full, Get&& get) {
   if (Set::keeps_positions) r.x_old = {get(), get(), get()};
   if (full || !Set::keeps_positions) r.d = {get(), get(), get()};
   if (full) r.H = {get(), get(), get(), get(), get(), get()};
-  if (Set::filters) r.fraction = get();
+  if (Set::takes_fractions) r.fraction = get();
   return r;
 }
 template <class Set, class R, class Put>
@@ -155,7 +226,7 @@ DIFFVBD_FN void record(bool full, const Block<R>& before, const NewtonStep<R>& s
   if (Set::keeps_positions) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
   if (full || !Set::keeps_positions) put(d.x), put(d.y), put(d.z);
   if (full) put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
-  if (Set::filters) put(u.fraction);
+  if (Set::takes_fractions) put(u.fraction);
 }
 
 // Adjoints of what one update read, except those of its star, which go through star.add().
@@ -176,8 +247,8 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   BlockAdjoint<R> out{x_bar, zero3<R>(), zero3<R>(), R(0), zero3<R>()};
   Vec3<R> step_bar = x_bar;
   R alpha_bar = R(0);
+  if constexpr (Set::takes_fractions) step_bar = u.fraction * x_bar;
   if constexpr (Set::filters) {
-    step_bar = u.fraction * x_bar;
     alpha_bar = dot(u.step, step_bar);
     step_bar = u.alpha * step_bar;
     Set::for_each([&](auto energy, int k) {
@@ -193,12 +264,13 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   const Vec3<R> z_axes = axes.to(z);
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool ill_conditioned = false;
-  if constexpr (!Set::contact && !Set::well_conditioned) {  // what contact adds to a block is not on a full tape
+  if constexpr (!Set::contact && !Set::well_conditioned &&
+                Set::Elastic::quadratic) {  // what contact adds to a block is not on a full tape
     ill_conditioned = star.any(is_ill_conditioned<Set>(r.H, shared_entries<Set>(b, axes)));
     if constexpr (Set::filters)
       ill_conditioned = ill_conditioned || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));
   }
-  if constexpr (!Set::well_conditioned) {
+  if constexpr (!Set::well_conditioned && Set::Elastic::quadratic) {
     if (ill_conditioned) out.x += reverse_refined<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
   }
   const Vec3<R> p = axes.from(p_axes);

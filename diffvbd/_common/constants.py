@@ -8,8 +8,12 @@ ELASTIC = EXACT_BLOCK | PAPER_BLOCK
 CONTACT = 4
 FIRST_VERTEX_BIT = 3  # shift of the first energy of energies.VERTEX_ENERGIES
 FILTERS = 1 << FIRST_VERTEX_BIT  # the one energy with a step filter, FloorBarrier
-KEEPS_POSITIONS = CONTACT | FILTERS  # gaps must come back to the bit
-VERTEX_ENERGIES = -1 << FIRST_VERTEX_BIT
+# Bits that only Python reads: of a law that is not quadratic in one vertex, whose updates take fractions of their
+# steps; and above the number of a generated law (ops/laws.py).
+DECIDES, LAW_SHIFT = 1 << 15, 16
+TAKES_FRACTIONS = FILTERS | DECIDES
+KEEPS_POSITIONS = CONTACT | TAKES_FRACTIONS  # what is decided must come back to the bit
+VERTEX_ENERGIES = DECIDES - (1 << FIRST_VERTEX_BIT)
 
 
 # --- constants of the safeguards --------------------------------------------------------------------------------------

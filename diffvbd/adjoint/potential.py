@@ -21,6 +21,7 @@ from torch import Tensor
 from .. import ops
 from .._common.constants import ELASTIC
 from .._common.context import replaced
+from ..laws.tets import LawTets
 from ..model.moving import MovingBodies, moving_bodies
 from ..model.patches import Averaged
 from ..model.system import System
@@ -82,6 +83,9 @@ class IncrementalPotential:
             shift = model.patches.spread(self.patches.ratio) - own.c6 * det
             self._pressure = self._pressure + (h2 / 6) * own.lam * shift
             self._bulk = self._bulk - (h2 / 6) * own.lam * own.c6
+        self.own = None  # a law of one's own, which only J above serves
+        if model.law is not None:
+            self.own = LawTets(model.law.density, ops.tet_gather(x, *model._topology), self.rest, time_step)
 
     def _edges_of(self, x: Tensor) -> Tensor:
         corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1).contiguous()
@@ -99,6 +103,8 @@ class IncrementalPotential:
 
     def elastic(self) -> Tensor:
         """The part of forces() that is that of the tets [kg m], [B, V, 3]."""
+        if self.own is not None:
+            return ops.star_sum(self.own.gradient(), *self.model._topology)
         return self._summed(self._sheared(self.edges) + self._pressure * self.normals)
 
     def forces(self) -> Tensor:
@@ -120,6 +126,8 @@ class IncrementalPotential:
 
     def elastic_product(self, w: Tensor) -> Tensor:
         """The part of product() that is that of the tets."""
+        if self.own is not None:
+            return ops.star_sum(self.own.product(ops.tet_gather(w, *self.model._topology)), *self.model._topology)
         f = self._edges_of(w)
         turned = _cross(_rolled(f, 1), self._last) + _cross(self._next, _rolled(f, 2))
         stretched = self._bulk * (self.normals * f).sum(0).sum(0)
@@ -144,12 +152,17 @@ class IncrementalPotential:
         return self._blocks
 
     def diagonal(self) -> Tensor:
-        """The 3x3 blocks on the diagonal, [B, V, 3, 3]: positive definite wherever mu >= 0 and mu + lam >= 0."""
-        shear = torch.cat([self._shear.sum(0).sum(0)[None], self._shear.diagonal().movedim(-1, 0)])  # [4, 1 | B, T]
-        normals = self._corner_normals()
-        eye = torch.eye(3, dtype=shear.dtype, device=shear.device)
-        blocks = self._bulk * normals[:, :, None] * normals[:, None] + shear[:, None, None] * eye[..., None, None]
-        total = ops.star_sum(blocks.permute(3, 4, 0, 1, 2).flatten(-2), *self.model._topology).unflatten(-1, (3, 3))
+        """The 3x3 blocks on the diagonal, [B, V, 3, 3]: positive definite wherever mu >= 0 and mu + lam >= 0
+        with StableNeoHookean."""
+        eye = torch.eye(3, dtype=self.x.dtype, device=self.x.device)
+        if self.own is not None:
+            blocks = self.own.hessian.diagonal(dim1=2, dim2=3).movedim(-1, 2)
+        else:
+            shear = torch.cat([self._shear.sum(0).sum(0)[None], self._shear.diagonal().movedim(-1, 0)])  # [4, 1 | B, T]
+            normals = self._corner_normals()
+            blocks = self._bulk * normals[:, :, None] * normals[:, None] + shear[:, None, None] * eye[..., None, None]
+            blocks = blocks.permute(3, 4, 0, 1, 2)
+        total = ops.star_sum(blocks.flatten(-2), *self.model._topology).unflatten(-1, (3, 3))
         total = total + self.mass[..., None] * eye
         own = self.vertex_blocks()
         total = total if own is None else total + own
@@ -162,6 +175,9 @@ class IncrementalPotential:
     def edge_blocks(self) -> Tensor:
         """Blocks off the diagonal of the tets' Hessians, without what couples the tets of patches: of the corners
         (a, b) of PAIRS, then of (b, a), [B, T, 12, 9]."""
+        if self.own is not None:
+            one, two = torch.tensor(PAIRS, device=self.x.device).T
+            return torch.cat([self.own.hessian[:, :, one, two], self.own.hessian[:, :, two, one]], 2).flatten(-2)
         corners = torch.cat([torch.zeros_like(self.edges[:1]), self.edges])
         normals = self._corner_normals()
         a, b, c, d = _OF_PAIRS.to(self.x.device)
@@ -193,7 +209,11 @@ class IncrementalPotential:
             out[2] = self.mass * w
         if wants[5]:
             out[5] = -(w * (self.x - self.y)).sum(-1)
-        if wants[3] or wants[6]:
+        if self.own is not None:
+            out[3], out[4] = torch.zeros_like(self.mu), torch.zeros_like(self.lam)
+            if wants[6]:
+                out[6] = self.own.of_rest(ops.tet_gather(w, *self.model._topology))
+        elif wants[3] or wants[6]:
             corners = [torch.cat([torch.zeros_like(a[:1]), a]) for a in (self.edges, f)]
             stretch = [((corners[0][a] - corners[0][b]) * (corners[1][a] - corners[1][b])).sum(0) for a, b in PAIRS]
             k = self.rest[..., :6].unbind(-1)
@@ -205,7 +225,7 @@ class IncrementalPotential:
                 of_c6 = -h2 * (self.mu + lam) * (self.ratio / self.c6) * bent
                 columns = [h2 * self.mu * s for s in stretch] + [of_c6]
                 out[6] = torch.stack([c.expand(shape) for c in columns], -1)
-        if wants[4]:
+        if wants[4] and self.own is None:
             out[4] = -h2 * (self.ratio - 1) * bent
         if self.patches is not None and (wants[4] or wants[6]):
             out[4], of_c6 = self.patches.dependence(bent)
@@ -350,9 +370,10 @@ def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
     model, moving, f = inputs.model, inputs.bodies, inputs.fields
     origin = x.new_empty((0,)) if f.origin is None else f.origin
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
-    out = ops.direct.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
-                                        inputs.material, inputs.rest, *index, list(model._data_count),
-                                        inputs.time_step)  # fmt: skip
+    operators = ops.library_of(model.energy_mask)
+    out = operators.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
+                                         inputs.material, inputs.rest, *index, list(model._data_count),
+                                         inputs.time_step)  # fmt: skip
     return out if inputs.averaged is None else out + _increase_of_patches(inputs, inputs.averaged, x, to)
 
 

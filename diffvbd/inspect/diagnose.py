@@ -30,6 +30,7 @@ from ..step.arguments import (
     refuse_non_finite,
 )
 from ..step.damping import damped
+from ..step.law import in_scenes
 from ..step.predict import begin
 from ..step.residual import (
     UNBALANCED,
@@ -159,7 +160,11 @@ def diagnose(
     system = system_of(model, VBD(1.0, 0) if solver is None else solver)
     given = given_of(model, inputs)
     mu, lam, young, poisson = (given.material[name] for name in MODULI)
-    mu, lam = moduli_of(model, lead, mu, lam, young, poisson) if model.energy_mask & ELASTIC else (0.0, 0.0)
+    if model.law is not None:  # its moduli at rest
+        prepared = prepare(system, lead, given, time_step=1.0, sweeps=0)
+        mu, lam = (in_scenes(m, lead) for m in (prepared.mu, prepared.lam))
+    else:
+        mu, lam = moduli_of(model, lead, mu, lam, young, poisson) if model.energy_mask & ELASTIC else (0.0, 0.0)
     for name, value in (("mu", mu), ("lam", lam)):
         value = check_broadcast(name, check_tensor(name, value, model._mass), (*lead, model.num_tets), len(lead))
         name_value(name, "finite values", value, torch.isfinite(value))
@@ -185,7 +190,7 @@ def diagnose(
     norm = f.square().sum((-2, -1)).sqrt()
     det = (cross(f[..., 0, :], f[..., 1, :]) * f[..., 2, :]).sum(-1)
     green = 0.5 * ((f[..., :, :, None] * f[..., :, None, :]).sum(-3) - torch.eye(3, dtype=f.dtype, device=f.device))
-    critical = collapse_stretch(mu, lam)
+    critical = collapse_stretch(mu, lam) if model.law is None else torch.zeros_like(mu)  # a well of StableNeoHookean
     margin = norm / (3**0.5 * critical)
     edge = _edge_lengths(points, model.tets)
     courant = stiffness = None

@@ -19,7 +19,8 @@ from .._contact.pair_forces import NearPairs
 from ..adjoint.contact import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..couplings import Pressure, Springs, Tendons, load_of
-from ..energies import StableNeoHookean
+from ..laws.tets import cauchy
+from ..model.arguments import ELASTIC_LAWS
 from ..model.material import deformed, shape_gradients
 from ..model.model import Model
 from ..model.solver import VBD
@@ -428,7 +429,7 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     With patches lam times the strain J_P - 1 of the patch stands for lam (J - 1).
 
     Args:
-        model: A scene with StableNeoHookean tets.
+        model: A scene with StableNeoHookean tets, or a law of your own.
         x: Positions [m], shape [..., V, 3].
         inputs: As in :func:`diffvbd.step`; moduli, rest_points and stress_free are read. A viscosity is warned of.
 
@@ -443,14 +444,20 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
     """
     check_state(model, x, x)
     lead = x.shape[:-2]
-    if not any(isinstance(energy, StableNeoHookean) for energy in model.energies):
+    if not any(isinstance(energy, ELASTIC_LAWS) for energy in model.energies):
         fail("model", "StableNeoHookean among its energies", "none")
     given_inputs = given_of(model, inputs)
     rest_points, stress_free = (given_inputs.material[name] for name in ("rest_points", "stress_free"))
     for name in VISCOSITIES:
         if given_inputs.material[name] is not None:
             warn(f"{name}: the stress is the elastic one alone; that of viscosity needs a motion and is not in it")
-    given = widen(model, x, None, Given(given_inputs.material, {}, {}))
+    own = {} if model.law is None else given_inputs.parameters
+    given = widen(model, x, None, Given(given_inputs.material, own, {}))
+    if model.law is not None:
+        assert given.prepared.rest is not None
+        scalars = given.prepared.rest.expand(lead.numel(), -1, -1)
+        scalars = scalars.reshape(*lead, *scalars.shape[1:])
+        return _stress_of(cauchy(model.law.density, x.double()[..., given.model._topology[0], :], scalars), x)
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)
     rest = points.expand(x.shape)[..., tets, :]
@@ -471,7 +478,11 @@ def stress(model: Model, x: Tensor, **inputs: Any) -> Stress:
         assert given.prepared.averaged is not None
         mean = patches.mean(det.reshape(-1, det.shape[-1]), given.prepared.averaged.c6)
         pressure = pressure + second * (patches.spread(mean).reshape(det.shape) - det)
-    cauchy = (shear / det)[..., None, None] * left + pressure[..., None, None] * eye
+    return _stress_of((shear / det)[..., None, None] * left + pressure[..., None, None] * eye, x)
+
+
+def _stress_of(cauchy: Tensor, x: Tensor) -> Stress:
+    eye = torch.eye(3, dtype=cauchy.dtype, device=cauchy.device)
     trace = cauchy.diagonal(dim1=-2, dim2=-1).sum(-1)
     square = 1.5 * (cauchy - (trace / 3)[..., None, None] * eye).square().sum((-2, -1))
     unloaded = square == 0  # a root has no derivative at zero

@@ -14,10 +14,12 @@ from .._common.messages import warn
 from .._contact.barrier import Friction, PairBarrier
 from ..couplings import COUPLINGS, Coupling
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
+from ..laws import Law
 from ..mesh import TetMesh
 
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
-Energy = StableNeoHookean | VertexEnergy | Coupling | PairBarrier | Friction
+ELASTIC_LAWS = (StableNeoHookean, Law)
+Energy = StableNeoHookean | Law | VertexEnergy | Coupling | PairBarrier | Friction
 
 
 def checked_device(device: torch.device | str) -> torch.device:
@@ -37,7 +39,7 @@ def checked_device(device: torch.device | str) -> torch.device:
 
 def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
     """At most one energy of each kind, with detached tensors that fit the mesh."""
-    kinds = (StableNeoHookean, *VERTEX_ENERGIES, *COUPLINGS, PairBarrier, Friction)
+    kinds = (*ELASTIC_LAWS, *VERTEX_ENERGIES, *COUPLINGS, PairBarrier, Friction)
     if isinstance(energies, kinds):
         energies = (energies,)
     out: list[Energy] = []
@@ -53,6 +55,11 @@ def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
             energy.check(num_vertices)
             energy = energy.detached()
         out.append(energy)
+    if any(isinstance(e, Law) for e in out):
+        for energy in out:
+            if isinstance(energy, StableNeoHookean | PairBarrier | Friction):
+                fail("energies", "no StableNeoHookean, PairBarrier or Friction with a law of your own",
+                     type(energy).__name__)  # fmt: skip
     return tuple(out)
 
 
@@ -102,7 +109,7 @@ def warn_of(mesh: TetMesh, given: Any, pinned: Tensor, energies: tuple[Energy, .
         warn(f"pinned: none of {mesh.num_vertices} vertices is pinned, so all are free, as with pinned=None")
     if mesh.num_vertices and bool(pinned.all()):
         warn(f"pinned: all {mesh.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
-    if not any(isinstance(e, StableNeoHookean) for e in energies) and mesh.num_tets:
+    if not any(isinstance(e, ELASTIC_LAWS) for e in energies) and mesh.num_tets:
         warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
 
 

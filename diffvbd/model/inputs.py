@@ -51,7 +51,12 @@ def inputs_of(model: Any) -> Inputs:
         Input("density", "[..., T]", "kg/m^3", "model.density", "Model"),
         Input("drag", "[..., V]", "1/s", "0", "Model"),
     ]
-    if model.energy_mask & ELASTIC:
+    if model.law is not None:
+        rows += [Input(name, "[..., T]", "", f"{float(value):g}" if value.numel() == 1 else f"law({name}=)", "law")
+                 for name, value in model.law.values.items()]  # fmt: skip
+        rows += [] if model.law.a0 is None else [Input("a0", "[..., T, 3]", "-", "law(a0=)", "law")]
+        rows += [Input("stress_free", "[..., T, 3, 3]", "-", "identity", "law")]
+    elif model.energy_mask & ELASTIC:
         pairs = (("mu", "Pa"), ("lam", "Pa"), ("young", "Pa"), ("poisson", "-"))
         defaults = ("or young, poisson", "or young, poisson", "or mu, lam", "or mu, lam")
         rows += [Input(name, "[..., T]", unit, given, "StableNeoHookean")

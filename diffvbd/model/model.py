@@ -18,8 +18,9 @@ from .._contact.colliders import Collider
 from .._contact.surface import ContactSurface, build_surface, check_colliders
 from ..couplings import Coupling
 from ..energies import VERTEX_ENERGIES, Anchor, FloorBarrier, StableNeoHookean, VertexEnergy
+from ..laws import Law
 from ..mesh import TetMesh
-from .arguments import Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
+from .arguments import ELASTIC_LAWS, Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
 from .bodies import find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
 from .material import lumped_mass, rest_metric
@@ -87,9 +88,8 @@ class Model:
         self.mesh = mesh
         self._derived: dict[str, Any] = {}
         self._set_energies(checked_energies(energies, mesh.num_vertices))
-        self.energy_mask = 0
-        for energy in (*self.energies, *self.vertex_energies):
-            self.energy_mask |= energy.bit
+        device = checked_device(device)
+        self.energy_mask = self._mask(dtype, device)
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -112,12 +112,23 @@ class Model:
         self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.may_correct, self.floor is not None)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         self._check_friction()
-        device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
         warn_of(mesh, pinned, mask, self.energies)
         self._place(dtype, device)
         self._executed_by(DEFAULT)  # now, since compiled code can look it up and not build it
+
+    def _mask(self, dtype: torch.dtype, device: torch.device) -> int:
+        mask = 0
+        for energy in (*self.energies, *self.vertex_energies):
+            mask |= energy.bit
+        if self.law is not None:
+            if device.type != "cpu":
+                fail("device", '"cpu" with a law of your own', repr(str(device)))
+            self.law.check_mesh(self.mesh.num_tets)
+            density = self.law.density
+            mask |= ops.bits_of_law(density.digest, density.header, density.quadratic, dtype)
+        return mask
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:
         self.energies = energies
@@ -128,6 +139,7 @@ class Model:
             # their record, where a step reads it
             present.append(Anchor(0.0).placed(self.mesh.num_vertices, getattr(self, "device", torch.device("cpu"))))
         self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
+        self.law = next((e for e in energies if isinstance(e, Law)), None)
         self.floor = next((e for e in energies if isinstance(e, FloorBarrier)), None)
         self.contact = next((e for e in energies if isinstance(e, PairBarrier)), None)
         self.friction = next((e for e in energies if isinstance(e, Friction)), None)
@@ -156,7 +168,7 @@ class Model:
     def may_correct(self) -> bool:
         """Whether bodies can have a rigid correction of their own. Pairs and friction have another one, and tets
         without stiffness are no body."""
-        return not self.touches and any(isinstance(e, StableNeoHookean) for e in self.energies)
+        return not self.touches and any(isinstance(e, ELASTIC_LAWS) for e in self.energies)
 
     @property
     def inputs(self) -> Inputs:
@@ -293,6 +305,7 @@ class Model:
             out._arrange(points, out.tets, device)
         out._measure(points)
         out._place(dtype, device)
+        out.energy_mask = out._mask(dtype, device)
         out._executed_by(DEFAULT)
         return out
 
@@ -323,6 +336,7 @@ class Model:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
         self.__dict__.update(lasting(state))
         self._derived = {}
+        self.energy_mask = self._mask(self.dtype, self.device)
         actual = checked_device(self._mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)

@@ -63,6 +63,8 @@ class System(Model):
                 check_positive(name, getattr(self, name), unit, self.dtype)
         if self.start == "inertia" and self.contact is not None:
             fail("start", '"auto" or "predictor" with a PairBarrier, whose steps approach y in substeps', '"inertia"')
+        if self.law is not None and self.block == "paper":
+            fail("block", '"exact" with a law of your own', '"paper"')
         if self.coarse is None:
             return
         if not self.energy_mask & ELASTIC:

@@ -27,12 +27,15 @@ Reverse = Callable[[Bars, Sequence[Any], tuple, Sequence[bool]], Bars]
 Vmap = Callable[..., tuple[Any, Any]]  # as torch.autograd.Function.vmap
 
 
-class _Direct:
-    """Operators of torch.ops.diffvbd without a pass through torch's autograd where nothing would be differentiated:
-    inside the forward of a Function and under no_grad. Half of what a call costs beside its work."""
+class Direct:
+    """Operators of a library such as torch.ops.diffvbd, without a pass through torch's autograd where nothing would be
+    differentiated: inside the forward of a Function and under no_grad. Half of what a call costs beside its work."""
+
+    def __init__(self, library: Any) -> None:
+        self._library = library
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        operator = getattr(raw, name).default
+        operator = getattr(self._library, name).default
 
         def call(*args: Any) -> Any:
             if torch.is_grad_enabled() or torch.compiler.is_compiling() or transformed():
@@ -44,7 +47,7 @@ class _Direct:
         return call
 
 
-direct = _Direct()
+direct = Direct(raw)
 
 
 def no_second_derivative() -> NoReturn:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from .._common.constants import FILTERS, KEEPS_POSITIONS
+from .._common.constants import KEEPS_POSITIONS, TAKES_FRACTIONS
 from .load import raw
 
 _C: dict[str, Any] = {a.name: a.default_value for a in raw.constants.default._schema.arguments}
@@ -247,7 +247,7 @@ def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
 
 def tape_rows(policy: int, energies: int) -> int:
     """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/core/views.h."""
-    kept = 4 if energies & FILTERS else 3 if energies & KEEPS_POSITIONS else 0
+    kept = 4 if energies & TAKES_FRACTIONS else 3 if energies & KEEPS_POSITIONS else 0
     return {NO_TAPE: 0, COMPACT_TAPE: kept or 3, FULL_TAPE: 9 + kept}[policy]
 
 

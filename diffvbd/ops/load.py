@@ -9,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -71,16 +72,21 @@ def require_cuda() -> None:
 def jit_build() -> Path:
     """The CUDA object of these sources, torch, CUDA and architectures from the cache; compiled if it is not there.
 
-    Several processes may ask at once: one compiles, the others wait for it. A process that is killed, at any moment,
-    leaves nothing that the next one would wait for or take for an object.
-
     Raises:
         RuntimeError: If it does not compile; the message ends with the compiler's last lines.
     """
+    return locked(_jit_folder(), "_C_cuda.so", _compile)
+
+
+def locked(place: Path, name: str, build: Callable[[Path], Path]) -> Path:
+    """A file of a folder, built if it is not there: build(an empty folder) returns the path to take it from.
+
+    Several processes may ask at once: one builds, the others wait for it. A process that is killed, at any moment,
+    leaves nothing that the next one would wait for or take for the file.
+    """
     import fcntl  # not on Windows
 
-    place = _jit_folder()
-    target = place / "_C_cuda.so"
+    target = place / name
     if target.exists():
         return target
     place.mkdir(parents=True, exist_ok=True)
@@ -91,12 +97,12 @@ def jit_build() -> Path:
             for left_behind in place.glob("build-*"):
                 shutil.rmtree(left_behind, ignore_errors=True)
             with tempfile.TemporaryDirectory(prefix="build-", dir=place) as folder:
-                os.replace(_compile(Path(folder)), target)
+                os.replace(build(Path(folder)), target)
     return target
 
 
 def _compile(folder: Path) -> Path:
-    shutil.copytree(_sources(), folder / "csrc")
+    shutil.copytree(sources(), folder / "csrc")
     shutil.copy(_FOLDER / "ops" / "build_cuda.py", folder)
     print("diffvbd: compiling the CUDA object, once for this machine (minutes)", file=sys.stderr, flush=True)
     # torch finds ninja through PATH alone, and the environment's own need not be there
@@ -118,20 +124,25 @@ def _compile(folder: Path) -> Path:
 
 
 def _jit_folder() -> Path:
-    from torch.utils.cpp_extension import get_default_build_root
-
     from .._version import __version__
     from .build_cuda import architectures
 
-    root = _sources()
+    root = sources()
     digest = hashlib.sha256(architectures().encode())
     for path in [_FOLDER / "ops" / "build_cuda.py", *sorted(p for p in root.rglob("*") if p.is_file())]:
         digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
     name = f"diffvbd-{__version__}-torch{torch.__version__}-cuda{torch.version.cuda}-{digest.hexdigest()[:16]}"
-    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root()) / name
+    return extensions_folder() / name
 
 
-def _sources() -> Path:
+def extensions_folder() -> Path:
+    """Where torch keeps what it compiles."""
+    from torch.utils.cpp_extension import get_default_build_root
+
+    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root())
+
+
+def sources() -> Path:
     """csrc: inside an installed package, beside the package in a checkout."""
     for path in (_FOLDER / "csrc", _FOLDER.parent / "csrc"):
         if (path / "bind").exists():

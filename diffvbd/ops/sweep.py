@@ -12,7 +12,6 @@ from torch import Tensor
 
 from .._common.context import replaced
 from .autograd import Differentiable, distinct, fold_scenes, folded, no_transforms, sum_to
-from .autograd import direct as raw
 from .fields import (
     FULL_TAPE,
     NO_TAPE,
@@ -25,6 +24,7 @@ from .fields import (
     as_list,
     tape_rows,
 )
+from .laws import library_of, plain
 from .regimes import BLOCK, FEW_LANES, THREAD
 
 
@@ -34,15 +34,15 @@ def plan_order(plan: Tensor, lanes: int) -> Tensor:
     return plan.narrow(0, PLAN_HEADER + colors + 1 + 4 * (blocks + 1), blocks * lanes).cpu()
 
 
-def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
+def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...], energies: int = 0) -> Tensor:
     """Rest scalars of the tets [B, T, 7] -> as their vertices see them [B, slots, 4, lanes]. Not differentiable."""
-    return raw.pack_rest(rest.contiguous(), plan, sizes)
+    return library_of(energies).pack_rest(rest.contiguous(), plan, sizes)
 
 
 def listed(fields: SweepFields | StepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings
            ) -> list[Tensor]:  # fmt: skip
     """Fields as the operators take them, with the rest shape packed."""
-    rest = packed_rest if fields.rest is None else pack_rest(fields.rest, plan, settings.sizes)
+    rest = packed_rest if fields.rest is None else pack_rest(fields.rest, plan, settings.sizes, settings.energies)
     return as_list(replaced(fields, rest=rest), fields.mass)
 
 
@@ -103,21 +103,21 @@ def run_sweep(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """
     packed_rest, plan, settings, *options = args[_FIELDS:]
     given = listed(SweepFields(*args[:_FIELDS]), packed_rest, plan, settings)
-    return raw.sweep(*given, plan, *settings, *options)
+    return library_of(settings.energies).sweep(*given, plan, *plain(settings), *options)
 
 
 def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, limits: Tensor, fields: SweepFields,
                    packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int, wants: dict[str, bool]
                    ) -> dict[str, Tensor]:  # fmt: skip
     """Adjoints of the fields by name; an empty tape: the sweeps run again. ``wants``: of SWEEP_ADJOINTS."""
-    given = listed(fields, packed_rest, plan, settings)
+    given, raw = listed(fields, packed_rest, plan, settings), library_of(settings.energies)
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
-        x, tape, limits, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
+        x, tape, limits, corrections = raw.sweep(*given, plan, *plain(settings), tape_policy, -1, False)
     material = wants["mu"] or wants["lam"]
     flags = [material, wants["mass"], wants["rest"], wants["energy_data"], wants["coarse_factor"]]
     bars = raw.sweep_backward(
-        *given, x_bar.contiguous(), x, tape, corrections, limits, plan, *settings, tape_policy, flags
+        *given, x_bar.contiguous(), x, tape, corrections, limits, plan, *plain(settings), tape_policy, flags
     )
     return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
 
@@ -227,7 +227,7 @@ def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: Swee
 def _run_fused(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
     packed_rest, plan, settings, tape_policy = args[_STEP_FIELDS:]
     given = listed(StepFields(*args[:_STEP_FIELDS]), packed_rest, plan, settings)
-    return raw.fused_step(*given, plan, *settings, tape_policy)
+    return library_of(settings.energies).fused_step(*given, plan, *plain(settings), tape_policy)
 
 
 def _reverse_fused(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
@@ -239,12 +239,12 @@ def _reverse_fused(bars: Sequence[Tensor | None], saved: Sequence[Any], rest: tu
     flags = [wants[name] for name in ("x", "v", "acceleration", "prescribed")]
     flags += [wants["mu"] or wants["lam"], wants["mass"], wants["rest"]]
     with backward_memory(fields.x, settings, tape_policy):
-        given = listed(fields, packed_rest, plan, settings)
+        given, raw = listed(fields, packed_rest, plan, settings), library_of(settings.energies)
         if tape_policy == NO_TAPE:
             tape_policy = FULL_TAPE
-            x, _, tape = raw.fused_step(*given, plan, *settings, tape_policy)
+            x, _, tape = raw.fused_step(*given, plan, *plain(settings), tape_policy)
         states = [fields.x.new_empty((0,)) if bar is None else bar.contiguous() for bar in bars]
-        out = raw.fused_step_backward(*given, *states, x, tape, plan, *settings, tape_policy, flags)
+        out = raw.fused_step_backward(*given, *states, x, tape, plan, *plain(settings), tape_policy, flags)
     by_name = dict(zip(STEP_ADJOINTS, out, strict=True))
     return [by_name[name] for name in fields._fields]
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from .distance import log_barrier
-from .scene import Color, Scene, add_at, cross, dot, outer6, patch_means, shape_functions, take
+from .scene import Color, Scene, add_at, cross, dot, law_values, outer6, patch_means, shape_functions, take
 
 ETA = 0.9  # a filtered step closes at most this fraction of a gap
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
@@ -142,6 +142,68 @@ def _combine(vectors: Any, weights: Any) -> Tensor:
 def _columns(edges: Any, rows: Any) -> list[Tensor]:
     """Columns of F = Ds Dm^-1 from the columns of Ds and the rows of Dm^-1."""
     return [_combine(edges, [row[c] for row in rows]) for c in range(3)]
+
+
+class Law(StableNeoHookean):
+    """A law from its energy density, by autograd: gradient and block of a vertex are derivatives of the energy of its
+    tets by its own position, and what is differentiated then is these."""
+
+    def __init__(self, energy: Any, scene: Scene) -> None:
+        self.scene, self.density, self.exact = scene, energy.density, True
+        self.values = law_values(energy, scene.parameters, scene.per_tet)
+        self.fibres = torch.zeros_like(scene.shape_gradients[..., 0, :, :])
+        if energy.a0 is not None:
+            a0 = scene.tensor(scene.parameters.get("a0", energy.a0))
+            a0 = (a0 if a0.dim() > 1 else a0[None]).transpose(-1, -2)
+            self.fibres = scene.per_tet(a0 / a0.square().sum(-2, keepdim=True).sqrt())
+
+    def _of(self, corners: Any, tets: Any = slice(None)) -> Tensor:
+        """h^2 V psi of tets with these corners, four of [..., 3, P]."""
+        s = self.scene
+        a, b, c, d = corners
+        rows = [g[..., tets].split(1, -2) for g in s.shape_gradients.unbind(-3)[1:]]
+        f = _columns((b - a, c - a, d - a), rows)
+        cof = cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])
+        along = _combine(f, self.fibres[..., tets].split(1, -2))
+        norms = [sum(dot(v, v) for v in vectors) for vectors in (f, cof)]
+        invariants = [norms[0], norms[1], dot(f[0], cof[0]), dot(along, along)]
+        psi = self.density.value(invariants, [v[..., tets] for v in self.values])[0]
+        return s.time_step**2 * (s.volume[..., tets] * psi)
+
+    def _of_pairs(self, k: int, x: Tensor, own: Tensor) -> Tensor:
+        """The same of the pairs of color k, whose vertices are at own [..., 3, P]."""
+        color = self.scene.layout.colors[k]
+        corners = take(x, color.corners).unflatten(-1, (4, -1)).unbind(-2)
+        return self._of([torch.where(color.local == a, own, corner) for a, corner in enumerate(corners)], color.tet)
+
+    def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
+        color, differentiated = self.scene.layout.colors[k], torch.is_grad_enabled()
+        with torch.enable_grad():
+            own = take(x, color.vertices)[..., color.owner]
+            own = own if own.requires_grad else own.detach().requires_grad_()
+            total = self._of_pairs(k, x, own).sum()
+            (gradient,) = torch.autograd.grad(total, own, create_graph=True)
+            columns = [torch.autograd.grad(gradient[..., c, :].sum(), own, create_graph=True)[0] for c in range(3)]
+            pairs = torch.cat((gradient, *(columns[i][..., i:, :] for i in range(3))), -2)
+        pairs = pairs if differentiated else pairs.detach()
+        none = pairs.new_zeros(9, color.vertices.numel())
+        return add_at(none, color.owner, pairs)
+
+    def of_tets(self, x: Tensor) -> Tensor:
+        return self._of([x[..., corner] for corner in self.scene.layout.tets])
+
+    def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        return self.of_tets(x), self.scene.layout.tets[0]
+
+    def change(self, k: int, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """By how much the energy of the tets of each vertex of color k changes along a step [..., 3, n], and the sizes
+        of what is compared."""
+        color = self.scene.layout.colors[k]
+        own = take(x, color.vertices)[..., color.owner]
+        one, two = self._of_pairs(k, x, own), self._of_pairs(k, x, own + step[..., color.owner])
+        both = torch.stack((two - one, one.abs() + two.abs()), -2)
+        summed = add_at(both.new_zeros(2, color.vertices.numel()), color.owner, both)
+        return summed[..., 0, :], summed[..., 1, :]
 
 
 class FloorBarrier:
@@ -316,7 +378,12 @@ class Anchor:
         return each, torch.arange(x.shape[-1], device=x.device)
 
 
-ENERGIES: dict[str, type] = {"stable_neo_hookean": StableNeoHookean, "floor": FloorBarrier, "anchor": Anchor}
+ENERGIES: dict[str, type] = {
+    "stable_neo_hookean": StableNeoHookean,
+    "law": Law,
+    "floor": FloorBarrier,
+    "anchor": Anchor,
+}
 
 
 def build_energies(scene: Scene, elsewhere: tuple[str, ...] = ()) -> list[Any]:

@@ -4,6 +4,7 @@ Inside the reference, arrays are component-major ([..., 3, V]: one contiguous ro
 torch runs fastest: every operation of a color is then elementwise on rows as long as its list of (vertex, tet) pairs.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,6 +124,10 @@ class Scene:
     patches: Tensor | None = None  # [T] patch of each tet, whose volumes lam averages
     slowing: Tensor | None = None  # [..., V, 1] of velocities and accelerations by drag [-]; the mass is larger by it
 
+    def per_tet(self, value: Any) -> Tensor:
+        """[..., T] of a value that broadcasts to it, in the layout's order."""
+        return of_tets(value, self.layout, self.like)
+
     def parameter(self, energy: Any, key: str) -> Tensor:
         """An energy parameter as a tensor: the caller's if one is given, else the energy's own constant."""
         name = energy.name if key in ("coefficient", energy.name) else f"{energy.name}_{key}"
@@ -130,6 +135,21 @@ class Scene:
 
     def tensor(self, value: Any) -> Tensor:
         return torch.as_tensor(value, dtype=self.like.dtype, device=self.like.device)
+
+
+def of_tets(value: Any, layout: Layout, like: Tensor) -> Tensor:
+    value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    value = value.expand(*value.shape[:-1], layout.tets.shape[1])
+    return value if layout.order is None else value[..., layout.order]
+
+
+def _is_default(value: Any) -> bool:
+    return isinstance(value, float) and value == 0.0
+
+
+def law_values(law: Any, parameters: dict[str, Any], per_tet: Callable[[Any], Tensor]) -> list[Tensor]:
+    """Parameters of a law in their order, [..., T]: those given, else its own."""
+    return [per_tet(parameters.get(name, law.values[name])) for name in law.density.parameters]
 
 
 def build_scene(
@@ -151,10 +171,13 @@ def build_scene(
     """Resolve the inputs of a run (shapes as in `step`) for the dtype and device of `like`."""
 
     def per_tet(value: Any) -> Tensor:
-        value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-        value = value.expand(*value.shape[:-1], layout.tets.shape[1])
-        return value if layout.order is None else value[..., layout.order]
+        return of_tets(value, layout, like)
 
+    own = next((e for e in getattr(model, "energies", ()) if getattr(e, "name", None) == "law"), None)
+    if own is not None:  # its parameters may have the names of moduli, which are 0.0 where not given
+        moduli = {k: v for k, v in (("mu", mu), ("lam", lam)) if k in own.values and not _is_default(v)}
+        parameters = {**moduli, **(parameters or {})}
+        mu, lam, _ = own.at_rest(law_values(own, parameters, per_tet))
     points = torch.as_tensor(model.rest_points if rest_points is None else rest_points, device=like.device)
     points = points.to(like).transpose(-1, -2)
     gradients, volume = shape_functions(points, layout.tets)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
 from .couplings import Bounds, energies_of_sweeps
-from .energies import StableNeoHookean, Viscosity, build_energies, floor_friction, rates
+from .energies import Law, StableNeoHookean, Viscosity, build_energies, floor_friction, rates
 from .rigid import Correction
 from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
 
@@ -386,6 +386,11 @@ def _update_color(
     for energy in energies:
         system = system + energy.block(k, state, x_prev)
     gradient, hessian = system.split((3, 6), -2)
+    law = next((e for e in energies if isinstance(e, Law) and not e.density.quadratic), None)
+    if law is not None:
+        hessian = (
+            hessian + _shift(hessian, mass + model.regularization) * hessian.new_tensor([1, 0, 0, 1, 0, 1])[:, None]
+        )
     update = raw = -solve6(hessian, gradient)
     if model.saturation is not None:
         update = update * _saturation(update, model.saturation).unsqueeze(-2)
@@ -393,7 +398,9 @@ def _update_color(
     if factor != 1.0:
         update = factor * update
     update = filtered(energies, x, update)
-    if all(getattr(e, "exact", True) for e in energies) and any(hasattr(e, "limit") for e in energies):
+    if law is not None:
+        update = _lowering(energies, law, k, mass, y, state, x_prev, update).unsqueeze(-2) * update
+    elif all(getattr(e, "exact", True) for e in energies) and any(hasattr(e, "limit") for e in energies):
         fraction = _descending(energies, hessian, raw, update, x, take(x_prev, vertices), model.regularization)
         update = fraction.unsqueeze(-2) * update
     if limit is not None:
@@ -421,6 +428,55 @@ def _descending(energies: list[Any], hessian: Tensor, raw: Tensor, update: Tenso
         found = found | ~(increase > ROUNDING * torch.finfo(x.dtype).eps * size)
         fraction = torch.where(found, fraction, fraction / 2)
     return torch.where(near, torch.where(found, fraction, 0.0), 1.0)
+
+
+@torch.no_grad()
+def _lowering(energies: list[Any], law: Law, k: int, mass: Tensor, y: Tensor, state: Tensor, x_prev: Tensor,
+              update: Tensor) -> Tensor:  # fmt: skip
+    """The same for a law that is not quadratic in one vertex, from the whole potential of each vertex of color k."""
+    vertices = law.scene.layout.colors[k].vertices
+    x = take(state, vertices)
+
+    def of_vertices(at: Tensor) -> list[Tensor]:
+        parts = [e.terms(at, x_prev) for e in energies if not isinstance(e, StableNeoHookean)]
+        return [at.new_zeros(*at.shape[:-2], at.shape[-1]).index_add(-1, vertex, terms)[..., vertices]
+                for terms, vertex in parts]  # fmt: skip
+
+    before, found = of_vertices(state), torch.zeros_like(x[..., 0, :], dtype=torch.bool)
+    fraction = torch.ones_like(x[..., 0, :])
+    for _ in range(HALVINGS):
+        step = fraction.unsqueeze(-2) * update
+        slope, bend = mass[..., 0, :] * dot(step, x - y), mass[..., 0, :] / 2 * dot(step, step)
+        of_tets, size = law.change(k, state, step)
+        increase, size = of_tets + slope + bend, size + slope.abs() + bend
+        for one, two in zip(before, of_vertices(put(state, vertices, x + step)), strict=True):
+            increase, size = increase + two - one, size + one.abs() + two.abs()
+        found = found | (increase <= ROUNDING * torch.finfo(x.dtype).eps * size) & torch.isfinite(size)
+        fraction = torch.where(found, fraction, fraction / 2)
+    return torch.where(found, fraction, 0.0)
+
+
+LEAST_CURVATURE, SHIFTS = 1 / 64, 8  # of the mass; twins in csrc/sweep/vertex.h
+
+
+@torch.no_grad()
+def _shift(hessian: Tensor, mass: Tensor) -> Tensor:
+    """The least of some powers of two [kg] that makes each block positive definite, [..., 1, n]; mostly 0."""
+    xx, xy, xz, yy, yz, zz = hessian.split(1, -2)
+    least = LEAST_CURVATURE * mass
+
+    def is_definite(shift: Tensor) -> Tensor:
+        a, b, c = xx + shift, yy + shift, zz + shift
+        whole = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+        return (a > 0) & (a * b - xy * xy > 0) & (whole > 0)
+
+    size = (xx.abs() + yy.abs() + zz.abs()) + 2 * (xy.abs() + xz.abs() + yz.abs())
+    shift, trial = torch.zeros_like(xx), 0.0625 * torch.exp2(torch.floor(torch.log2(size)))
+    if bool(is_definite(-least).all()):
+        return shift
+    for n in range(SHIFTS):
+        shift = torch.where(is_definite(shift - least), shift, trial * 2**n)
+    return shift
 
 
 def _square(hessian: Tensor, d: Tensor) -> Tensor:

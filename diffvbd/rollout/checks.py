@@ -15,6 +15,7 @@ from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
 from .._common.context import is_captured, is_silent, looks_at, may_copy, replaced
 from .._common.messages import page, percent, warn
+from ..laws.tets import energy
 from ..model.material import rest_metric
 from ..model.model import Model
 from ..model.solver import Integrator
@@ -386,6 +387,10 @@ def mechanical_energy(model: System, prepared: Prepared, x: Tensor, v: Tensor, e
         others = edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]  # from 1 and 2 to 2 and 3
         shear = -(rest[:6] * torch.cat([edges, others], 1).square_().sum(0)).sum(0)
         c6 = rest[6]
+        if model.law is not None:
+            of_tets = energy(model.law.density, corners.permute(2, 3, 1, 0), rest.movedim(0, -1))
+            total = total + of_tets.sum(-1)
+            continue
         change = c6 * (edges[:, 0] * torch.linalg.cross(edges[:, 1], edges[:, 2], dim=0)).sum(0) - 1
         volume = 1 / (6 * c6)
         stiffness = mu + lam if model.patches is None else mu

@@ -40,6 +40,7 @@ from ..model.patches import Averaged, uniform
 from ..model.solver import SDIRK2, Integrator
 from ..model.system import System
 from .coarse import CoarseParts, coarse_parts
+from .law import law_inputs, law_rest
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 MODULI = ("mu", "lam", "young", "poisson")
@@ -134,11 +135,15 @@ def given_of(model: Model, inputs: dict[str, Any]) -> Given:
     material: dict[str, Any] = dict.fromkeys(MATERIAL)
     parameters: dict[str, Any] = {}
     elastic = bool(model.energy_mask & ELASTIC)
+    own = () if model.law is None else model.law.inputs
     known: dict[str, Any] | None = None
     for name, value in inputs.items():
         if name in loads:
             loads[name] = GRAVITY if name == "gravity" and value is None else value
-        elif name in material and (elastic or name not in OF_ELASTIC):
+        elif name in own:
+            if value is not None:
+                parameters[name] = value
+        elif name in material and (name not in OF_ELASTIC or (elastic and not own) or name == "stress_free" and own):
             material[name] = value
         else:
             known = parameters_of(model) if known is None else known
@@ -158,7 +163,8 @@ def _meant(model: Any, name: str) -> str:
         for key in kind.parameters
     }
     if name in OF_ELASTIC:
-        return ", which has no elastic law among its energies"
+        law = "StableNeoHookean" if model.law is not None else "elastic law"
+        return f", which has no {law} among its energies"
     if name in kinds:
         return f", which has no {kinds[name].__name__} among its energies"
     return where_it_is(name, (*inputs_of(model), *kinds))
@@ -195,7 +201,13 @@ def prepare(
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
-    if not model.energy_mask & ELASTIC:
+    law, of_law = None, {}
+    if model.law is not None:
+        of_law = {name: parameters[name] for name in model.law.inputs if name in parameters}
+        parameters = {name: value for name, value in parameters.items() if name not in of_law}
+        law = law_inputs(model, of_law, lambda name, value, shape: _scenes_first(name, value, like, lead, shape))
+        mu = lam = 0.0
+    elif not model.energy_mask & ELASTIC:
         mu = lam = 0.0
     elif mu is None or lam is None or young is not None or poisson is not None:
         mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
@@ -228,6 +240,9 @@ def prepare(
             name_value("density", "finite numbers > 0 kg/m^3", density, density > 0, SCENE_TET)
             name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
             raise
+    if law is not None:
+        metric = model.rest_scalars if rest is None else rest
+        rest = law_rest(model, law, metric, corners)
     given: dict[str, Tensor] = {}
     known = parameters_of(model) if parameters else {}
     for name, value in parameters.items():
@@ -242,7 +257,10 @@ def prepare(
             least = energy.least(key)
             wanted = f"finite numbers >= {least:g}" if least > -math.inf else "finite numbers"
             name_value(name, wanted, given[name], given[name] >= least)
-    materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
+    if law is not None:
+        materials = [law.mu, law.lam]
+    else:
+        materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
     if model.renews and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
@@ -257,7 +275,8 @@ def prepare(
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
-        unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, parameters, layout,
+        both = parameters if law is None else {**parameters, **of_law}
+        unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, both, layout,
                            material)  # fmt: skip
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
@@ -267,8 +286,8 @@ def prepare(
     if viscosity is not None or bulk is not None or drag is not None:
         damping = _damping(model, like, lead, material, corners)
     return Prepared(
-        mu=materials[0],
-        lam=materials[1],
+        mu=materials[0] if law is None else materials[0].detach(),
+        lam=materials[1] if law is None else materials[1].detach(),
         mass=mass,
         rest=rest,
         parameters=given,

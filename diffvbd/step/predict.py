@@ -144,7 +144,7 @@ def begin(
     begins = partial(
         start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, *moduli[:2],
         rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
-        start=model.starts_from, filters=filters, parts=parts,
+        start=model.starts_from, filters=filters, parts=parts, energies=model.energy_mask,
     )  # fmt: skip
     x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
@@ -160,8 +160,8 @@ _START_FIELDS = len(ops.BeginFields._fields)
 
 
 def _run_start(*args: Any) -> tuple[Tensor, ...]:
-    groups, other_groups, options = args[_START_FIELDS:]
-    return ops.direct.begin(
+    groups, other_groups, (*options, energies) = args[_START_FIELDS:]
+    return ops.library_of(energies).begin(
         *ops.as_list(ops.BeginFields(*args[:_START_FIELDS]), args[0]), groups, other_groups, *options
     )
 
@@ -177,7 +177,7 @@ def _reverse_start(
     x_start_bar, y_bar = (torch.zeros_like(fields.x) if bar is None else bar for bar in bars)
     wants = (needs[2], needs[3], needs[5])
     *out, shared, own, planes = ops.direct.begin_backward(
-        *ops.as_list(fields, fields.x), x_start_bar, y_bar, from_predictor, alone, groups, *options[:-1], wants
+        *ops.as_list(fields, fields.x), x_start_bar, y_bar, from_predictor, alone, groups, *options[:-2], wants
     )
     data_out = None
     if needs[5]:
@@ -202,7 +202,7 @@ def _saved(inputs: tuple, made: tuple) -> tuple:
     return *read, *made[2:]
 
 
-# Fields; groups, other_groups, (data_count, time_step, filter_eta, lookback, start, filters, parts).
+# Fields; groups, other_groups, (data_count, time_step, filter_eta, lookback, start, filters, parts, energies).
 _begin = ops.Differentiable(
     _run_start, _reverse_start, arguments=_START_FIELDS + 3, inputs=_START_TENSORS, outputs=2, saved=_saved,
     rest=lambda inputs: (inputs[_START_FIELDS], inputs[-1]), vmap=_vmap_start, batched=True,
@@ -213,7 +213,7 @@ def start_of(
     x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
     origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
     others: OtherBodies, data_count: tuple[int, ...], time_step: float, lookback: float, *, start: str, filters: bool,
-    parts: bool,
+    parts: bool, energies: int = 0,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Start of the sweeps and predictor [m], both [B, V, 3]; differentiable in the first six tensors.
 
@@ -225,7 +225,7 @@ def start_of(
         lookback: Distance back along h v at which a vertex counts as having been, over h v: 1 where v = (x - x_prev) /
         h. start: "auto", "predictor" or "inertia", of the bodies that are not corrected. filters: Whether the planes of
         a floor hold back a start. parts: Whether bodies that are held back may start vertex by vertex, for which there
-        must be filters.
+        must be filters. energies: The scene's mask.
     """
     # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
     looked_at = mu.detach(), lam.detach(), rest if rest is None else rest.detach()
@@ -233,7 +233,8 @@ def start_of(
     *listed, groups = bodies
     *listed_others, other_groups = others
     options = (data_count, time_step, FILTER_ETA, lookback, STARTS[start], filters)
-    x_start, y, *_ = _begin(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
+    x_start, y, *_ = _begin(*tensors, pinned, *listed, *listed_others, groups, other_groups,
+                           (*options, parts, energies))  # fmt: skip
     return x_start, y
 
 

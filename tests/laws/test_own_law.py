@@ -1,0 +1,255 @@
+"""Claim: a compiled law of one's own has what a built-in one has: the exact adjoint of the executed sweeps for every
+input, forward equal to the reference, descent, corrections, integrators, other routes, physics.
+
+One law with every invariant and function is compiled for all quick tests, once a session, in a temporary folder.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from helpers.marks import slow
+from helpers.paths import needs_csrc
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.testing import evaluate, relative_error
+
+pytestmark = needs_csrc
+F64 = torch.float64
+# stress-free at rest, with every invariant; not quadratic in one vertex
+TEXT = ("mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2 + c*(I2*J**(-4/3) - 3) + m*(trU - 3)**2"
+        " + k/(2*s)*(exp(s*(I4 - 1)**2) - 1)")  # fmt: skip
+VALUES = {"mu": 4e4, "lam": 9e4, "c": 8e3, "m": 1e4, "k": 3e4, "s": 1.5}
+STABLE = "mu/2*(I1 - 3) - mu*(J - 1) + (mu + lam)/2*(J - 1)**2"
+MESH = dv.mesh.beam(3, 2, 2, size=(0.3, 0.2, 0.2))
+PINNED = MESH.points[:, 0] == 0.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path_factory.mktemp("laws")))
+        yield
+
+
+def law_of(text: str = TEXT) -> Any:
+    law = dv.law(text, **VALUES, a0=(1.0, 0.3, -0.2)) if text == TEXT else dv.law(text, mu=4e4, lam=9e4)
+    return law
+
+
+def model_of(*energies: Any, pinned: Any = PINNED, text: str = TEXT) -> dv.Model:
+    return dv.Model(MESH, pinned=pinned, energies=(law_of(text), *energies))
+
+
+def inputs_of(model: dv.Model, jitter: float = 0.01, lead: tuple[int, ...] = ()) -> dict[str, Any]:
+    """Every differentiable input, each tet with values of its own."""
+    rng = torch.Generator().manual_seed(1)
+
+    def noise(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=rng, dtype=F64)
+
+    tets, full = model.num_tets, (*lead, *model.rest_points.shape)
+    out: dict[str, Any] = {"x": model.rest_points + jitter * noise(*full), "v": 0.3 * noise(*full)}
+    out |= {name: value * (1 + 0.2 * torch.rand(tets, generator=rng, dtype=F64))
+            for name, value in model.law.values.items()}  # fmt: skip
+    if model.law.a0 is not None:
+        out["a0"] = model.law.a0 + 0.3 * noise(tets, 3)
+    held = model.rest_points + 0.005 * noise(*model.rest_points.shape)
+    held = torch.where(model.pinned[:, None], held, torch.nan) if model.pinned.any() else None
+    out |= {"density": 800 + 400 * torch.rand(tets, generator=rng, dtype=F64), "force": 0.3 * noise(*full),
+            "rest_points": model.rest_points + 0.002 * noise(*model.rest_points.shape), "prescribed": held,
+            "stress_free": torch.eye(3, dtype=F64) + 0.05 * noise(tets, 3, 3)}  # fmt: skip
+    return {name: value for name, value in out.items() if value is not None}
+
+
+def compare(model: dv.Model, solver: dv.VBD, inputs: dict[str, Any], bar: float = 1e-11) -> None:
+    def run(adjoint: Any, **given: Any) -> tuple[Tensor, Tensor]:
+        return dv.step(model, given.pop("x"), given.pop("v"), solver, adjoint=adjoint, **given)
+
+    result = evaluate(lambda **given: run(dv.ReverseSweep(), **given), inputs, solver.time_step)
+    expected = evaluate(lambda **given: run(dv.Unrolled(), **given), inputs, solver.time_step)
+    for name, value in expected.items():
+        assert relative_error(result[name], value) <= bar, name
+        assert float(value.nan_to_num().abs().max()) > 0, name
+
+
+@pytest.mark.parametrize(("sweeps", "jitter"), [(1, 0.005), (1, 0.06), slow(4, 0.06)])
+def test_gradients_are_those_of_the_executed_sweeps(sweeps: int, jitter: float) -> None:
+    """Against autograd through the reference; the larger jitter turns tets inside out and shortens updates."""
+    model = model_of()
+    compare(model, dv.VBD(0.01, sweeps, relaxation=1.3, saturation=0.5, regularization=0.01), inputs_of(model, jitter))
+
+
+def test_batches_floors_anchors() -> None:
+    model = model_of(dv.FloorBarrier(height=-0.03, kappa=500.0, dhat=0.05, damping=5.0), dv.Anchor(40.0), pinned=None)
+    inputs = {k: v for k, v in inputs_of(model, 0.004, (2,)).items() if k != "stress_free"}
+    compare(model, dv.VBD(0.005, 2), inputs | {"anchor_stiffness": torch.tensor(40.0, dtype=F64)}, 1e-10)
+
+
+def test_coarse_corrections() -> None:
+    model = model_of()
+    inputs = {k: v for k, v in inputs_of(model, 0.003).items() if k not in ("stress_free", "rest_points")}
+    with dv.record("subspace") as lengths:
+        compare(model, dv.VBD(0.01, 4, subspace="coarse"), inputs, 1e-10)
+    assert any(float(length.max()) > 0 for length in lengths)
+
+
+@pytest.mark.parametrize("integrator", [dv.SDIRK2(), dv.BDF2()], ids=repr)
+def test_integrators(integrator: Any) -> None:
+    """Gradients of a short rollout against central differences of it."""
+    model = model_of()
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    solver = dv.VBD(0.01, 3, integrator=integrator)
+
+    def height(mu: Tensor) -> Tensor:
+        return dv.rollout(model, x, v, solver, steps=3, mu=mu).x[-1, :, 1].sum()
+
+    mu = torch.tensor(4e4, dtype=F64, requires_grad=True)
+    (grad,) = torch.autograd.grad(height(mu), mu)
+    with torch.no_grad():
+        slope = (height(mu + 1.0) - height(mu - 1.0)) / 2.0
+    assert grad.abs() > 0 and relative_error(grad, slope) < 1e-6
+
+
+def test_central_differences() -> None:
+    """Of one sweep, along a random direction of each input."""
+    model, solver = model_of(), dv.VBD(0.01, 1)
+    inputs = inputs_of(model, 0.004)
+    rng = torch.Generator().manual_seed(3)
+    weight = torch.randn(inputs["x"].shape, generator=rng, dtype=F64)
+
+    def loss(**given: Any) -> Tensor:
+        return (weight * dv.step(model, given.pop("x"), given.pop("v"), solver, **given)[0]).sum()
+
+    leaves = {name: value.clone().requires_grad_() for name, value in inputs.items()}
+    gradients = dict(zip(leaves, torch.autograd.grad(loss(**leaves), list(leaves.values())), strict=True))
+    for name, value in inputs.items():
+        way = torch.randn(value.shape, generator=rng, dtype=F64) * value.nan_to_num().abs().mean()
+        eps = 1e-5 if name in ("x", "v", "rest_points", "prescribed", "stress_free") else 1e-4
+        with torch.no_grad():
+            ends = [loss(**{**inputs, name: value + sign * eps * way}) for sign in (1, -1)]
+        slope, found = (ends[0] - ends[1]) / (2 * eps), (gradients[name].nan_to_num() * way).sum()
+        assert found.abs() > 0 and relative_error(found, slope) < 2e-6, name
+
+
+def test_tapes_agree_and_updates_are_shortened() -> None:
+    """Tapes bit for bit; no sweep raises the potential, at a violent state where whole Newton steps would."""
+    model = model_of()
+    inputs = inputs_of(model, 0.08)
+    weight = torch.linspace(0, 1, inputs["x"].numel(), dtype=F64).view_as(inputs["x"])
+    found = []
+    for tape in ("full", "compact", "recompute"):
+        leaves = {name: inputs[name].clone().requires_grad_() for name in ("x", "mu", "a0")}
+        end, _ = dv.step(model, leaves["x"], inputs["v"], dv.VBD(0.01, 3, tape=tape), mu=leaves["mu"], a0=leaves["a0"])
+        found.append(torch.autograd.grad((weight * end).sum(), list(leaves.values())))
+    for other in found[1:]:
+        for one, two in zip(found[0], other, strict=True):
+            assert torch.equal(one, two)
+    x, v = inputs["x"], inputs["v"]
+    y = x + 0.01 * v + 1e-4 * torch.tensor([0, -9.81, 0], dtype=F64)
+    y = torch.where(model.pinned[:, None], x, y)
+
+    def potential(at: Tensor) -> Tensor:
+        return reference.incremental_potential(model, at, y, 0.0, 0.0, 0.01, parameters=model.law.values)
+
+    values = [potential(y)]
+    for sweeps in range(1, 6):
+        values.append(potential(dv.step(model, x, v, dv.VBD(0.01, sweeps, start="predictor"))[0]))
+    assert bool((torch.stack(values).diff() <= 1e-12 * values[0].abs()).all())
+    assert values[-1] < 0.9 * values[0]
+
+
+def closed_form(a: float, b: float) -> tuple[float, float]:
+    """First Piola-Kirchhoff stress of F = diag(a, b, b) with fibres along x."""
+    g, j, i2 = VALUES, a * b * b, 2 * a * a * b * b + b**4
+
+    def along(own: float, of_i2: float) -> float:
+        log = g["mu"] * own + (g["lam"] * math.log(j) - g["mu"]) / own
+        second = g["c"] * j ** (-4 / 3) * (of_i2 - 4 / 3 * i2 / own)
+        return log + second + 2 * g["m"] * (a + 2 * b - 3)
+
+    e = a * a - 1
+    return along(a, 4 * a * b * b) + 2 * a * g["k"] * e * math.exp(g["s"] * e * e), along(b, 2 * b * (a * a + b * b))
+
+
+def test_uniaxial_stretch_stays_under_its_closed_form_load() -> None:
+    """A free block, stretched evenly and loaded on its faces by the stress of the closed form, does not move; with
+    another load it does."""
+    a, b = 1.15, 0.94
+    model = model_of(pinned=None)
+    x = model.rest_points * torch.tensor([a, b, b], dtype=F64)
+    stress = torch.diag(torch.tensor([*closed_form(a, b), closed_form(a, b)[1]], dtype=F64))
+    corners = model.rest_points[model.surface]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    load = torch.zeros_like(x)
+    for corner in range(3):
+        load.index_add_(0, model.surface[:, corner], area @ stress / 3)
+
+    def moved(scale: float) -> float:
+        end, _ = dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 20), force=scale * load,
+                         gravity=(0.0, 0.0, 0.0), a0=torch.tensor([1.0, 0.0, 0.0], dtype=F64))  # fmt: skip
+        return float((end - x).abs().max())
+
+    assert moved(1.0) < 1e-12 and moved(1.02) > 1e-5
+
+
+def test_converged_routes_and_rest_states() -> None:
+    """GlobalAdjoint agrees with the reverse sweep where the sweeps have converged; `equilibrium` finds the state in
+    which steps come to rest, and its gradient is that of the state found again."""
+    model = model_of()
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    grads = []
+    for adjoint in (dv.ReverseSweep(), dv.GlobalAdjoint()):
+        mu = torch.tensor(4e4, dtype=F64, requires_grad=True)
+        end, _ = dv.step(model, x, v, dv.VBD(0.02, 400), mu=mu, adjoint=adjoint)
+        grads.append(torch.autograd.grad(end[:, 1].sum(), mu)[0])
+    assert grads[0].abs() > 0 and relative_error(grads[1], grads[0]) < 1e-7
+
+    def sag(mu: Any) -> Tensor:
+        return dv.equilibrium(model, x, dv.VBD(0.02, 1), mu=mu).x[:, 1].sum()
+
+    mu = torch.tensor(4e4, dtype=F64, requires_grad=True)
+    (grad,) = torch.autograd.grad(sag(mu), mu)
+    with torch.no_grad():
+        slope = (sag(mu + 10) - sag(mu - 10)) / 20
+    assert grad.abs() > 0 and relative_error(grad, slope) < 1e-5
+    stress = dv.stress(model, dv.equilibrium(model, x, dv.VBD(0.02, 1)).x)
+    assert float(stress.von_mises.max()) > 0
+
+
+def test_inputs_and_refusals() -> None:
+    model = model_of()
+    x, v, solver = model.rest_points, torch.zeros_like(model.rest_points), dv.VBD(0.01, 2)
+    assert {"mu", "lam", "c", "m", "k", "s", "a0", "stress_free"} <= set(model.inputs)
+    assert not {"young", "viscosity"} & set(model.inputs)
+    for name, value in (("young", 1e5), ("viscosity", 10.0), ("poisson", 0.3)):
+        with pytest.raises(TypeError, match=f"{name}: expected an input of this Model .*which has no StableNeoHookean"):
+            dv.step(model, x, v, solver, **{name: value})
+    with pytest.raises(ValueError, match='block: expected "exact" with a law of your own'):
+        dv.step(model, x, v, dv.VBD(0.01, 2, block="paper"))
+    with pytest.raises(ValueError, match="k: expected finite values"):
+        dv.step(model, x, v, solver, k=torch.tensor(float("nan"), dtype=F64))
+    with pytest.raises(ValueError, match="a0: expected directions of finite length > 0"):
+        dv.step(model, x, v, solver, a0=torch.zeros(3, dtype=F64))
+    assert "law(" in repr(model) and bool(dv.diagnose(model, x, solver).smallest_volume_ratio > 0.9)
+
+
+@pytest.mark.slow
+def test_the_built_in_law_as_a_law_of_ones_own() -> None:
+    """A law that is quadratic in one vertex: values and gradients of StableNeoHookean, in float32 too; parameters that
+    make it concave are refused."""
+    own, built_in, solver = model_of(text=STABLE), dv.Model(MESH, pinned=PINNED), dv.VBD(0.01, 5)
+    inputs = inputs_of(own, 0.03)
+    results = [evaluate(lambda model=model, **given: dv.step(model, given.pop("x"), given.pop("v"), solver, **given),
+                        inputs, 0.01) for model in (own, built_in)]  # fmt: skip
+    for name, value in results[1].items():
+        assert relative_error(results[0][name], value) < 1e-12, name
+    single = [dv.step(model.to(dtype=torch.float32), inputs["x"].float(), inputs["v"].float(), solver, mu=4e4, lam=9e4)
+              for model in (own, built_in)]  # fmt: skip
+    assert relative_error(single[0][0], single[1][0]) < 1e-5
+    with pytest.raises(ValueError, match="law: expected parameters that make the second derivative of .* by J >= 0"):
+        dv.step(own, inputs["x"], inputs["v"], solver, lam=-5e4)
