@@ -167,8 +167,9 @@ class Law(StableNeoHookean):
         along = _combine(f, self.fibres[..., tets].split(1, -2))
         norms = [sum(dot(v, v) for v in vectors) for vectors in (f, cof)]
         invariants = [norms[0], norms[1], dot(f[0], cof[0]), dot(along, along)]
-        psi = self.density.value(invariants, [v[..., tets] for v in self.values])[0]
-        return s.time_step**2 * (s.volume[..., tets] * psi)
+        values, scale = [v[..., tets] for v in self.values], s.time_step**2 * s.volume[..., tets]
+        self.sizes = invariants, values, scale  # of the latest call
+        return scale * self.density.value(invariants, values)[0]
 
     def _of_pairs(self, k: int, x: Tensor, own: Tensor) -> Tensor:
         """The same of the pairs of color k, whose vertices are at own [..., 3, P]."""
@@ -200,8 +201,12 @@ class Law(StableNeoHookean):
         of what is compared."""
         color = self.scene.layout.colors[k]
         own = take(x, color.vertices)[..., color.owner]
-        one, two = self._of_pairs(k, x, own), self._of_pairs(k, x, own + step[..., color.owner])
-        both = torch.stack((two - one, one.abs() + two.abs()), -2)
+        one = self._of_pairs(k, x, own)
+        invariants, values, scale = self.sizes
+        slopes = self.density.slopes(invariants, values)
+        rounded = scale * sum((w * i).abs() for w, i in zip(slopes, invariants, strict=True))
+        two = self._of_pairs(k, x, own + step[..., color.owner])
+        both = torch.stack((two - one, one.abs() + two.abs() + rounded), -2)
         summed = add_at(both.new_zeros(2, color.vertices.numel()), color.owner, both)
         return summed[..., 0, :], summed[..., 1, :]
 
