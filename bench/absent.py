@@ -6,6 +6,7 @@ their own, in turns, and the least time of each counts: what slows a machine dow
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
@@ -18,7 +19,7 @@ from typing import Any
 import torch
 
 import diffvbd as dv
-from bench.measure import calls_of, kept_bytes, least, timed
+from bench.measure import calls_of, kept_bytes, timed
 from bench.tables import Table
 
 STEPS, SWEEPS = 5, 10
@@ -58,9 +59,13 @@ def measured(rounds: int) -> dict[str, dict[str, float]]:
     out = {}
     for name, run in scenes().items():
         run().backward()
+        gc.collect()
+        gc.disable()
+        forward = [timed(run, time.process_time) for _ in range(rounds)]
+        both = [timed(lambda run=run: run().backward(), time.process_time) for _ in range(rounds)]
+        gc.enable()
         out[name] = {
-            "forward": least(lambda run=run: timed(run, time.process_time), rounds),
-            "both": least(lambda run=run: timed(lambda: run().backward(), time.process_time), rounds),
+            "forward": min(forward), "both": min(both),
             "bytes": kept_bytes(run), "calls": calls_of(run)[0],
         }  # fmt: skip
     return out
@@ -72,7 +77,7 @@ def run(quick: bool) -> dict[str, Any]:
     found: dict[str, list[dict[str, dict[str, float]]]] = {name: [] for name in trees}
     for _ in range(1 if quick else 5):
         for name, tree in trees.items():
-            command = [sys.executable, str(Path(__file__)), "2" if quick else "20"]
+            command = [sys.executable, str(Path(__file__)), "2" if quick else "40"]
             done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(tree)}, capture_output=True, text=True,
                                   check=True)  # fmt: skip
             found[name].append(json.loads(done.stdout))
