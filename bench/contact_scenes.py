@@ -228,12 +228,14 @@ def slope_error(number: int, steps: int, device: str) -> float | None:
 def pair_energy(model: dv.Model, x: Tensor) -> Tensor:
     """Energy of the barriers of pairs [B] [J]. x: [B, V, 3] [m]."""
     from diffvbd._contact.pair_forces import corner_points, near_pairs
+    from diffvbd.reference.distance import log_barrier
 
     barrier, surface = model.contact, model.surface_of_contact
     assert barrier is not None and surface is not None
     colliders = model.collider_points.expand(len(x), -1, 3)
     found = near_pairs(x, None, colliders, colliders, surface, barrier)
-    value = found.terms(corner_points(x, None, colliders), x.new_full((1,), barrier.kappa)).value
+    gap, _, mollifier, _ = found.measures(corner_points(x, None, colliders))
+    value = mollifier * log_barrier(gap, torch.full_like(gap, barrier.kappa), found.dhat)[0]
     return torch.zeros_like(x[:, 0, 0]).index_add(0, found.scene, value)
 
 
@@ -259,16 +261,6 @@ def flown(number: int, device: str) -> tuple[int, int, float, bool]:
 
 
 PARTS = ("start", "first rigid correction", "sweeps", "coarse correction", "corrections after the sweeps")
-
-
-def listed_energy(of: Any, found: Any, x: Tensor) -> float:
-    """Energy of the pairs that a detection of diffvbd.step.contact has listed. x: [B, V, 3] [m]."""
-    from diffvbd._contact.pair_forces import NearPairs
-
-    count = int(found.counts[0])
-    rows, numbers = found.listed.pairs[:count].long(), found.listed.constants[:count]
-    listed = NearPairs(rows[:, :4], rows[:, 4], rows[:, 5], *numbers[:, :3].unbind(1))
-    return float(listed.terms(torch.cat([x, of.before], 1), x.new_full((1,), of.barrier.kappa)).value.sum())
 
 
 def friction_energy(of: Any, x: Tensor) -> float:
@@ -303,7 +295,7 @@ def risen(number: int, device: str) -> dict[str, float]:
 
     def potential(x: Tensor) -> float:
         total = reference.incremental_potential(body, x, now["y"], **material, time_step=h).sum()
-        return float(total + h * h * listed_energy(now["step"], now["found"], x)) + friction_energy(now["step"], x)
+        return float(total + h * h * pair_energy(model, x).sum()) + friction_energy(now["step"], x)
 
     def note(part: str, x: Tensor, to: Tensor) -> None:
         before, after = potential(x.detach()), potential(to.detach())
@@ -323,8 +315,8 @@ def risen(number: int, device: str) -> dict[str, float]:
     detect, start = step._detect, contact.start_between
 
     def detected(of: Any, *given: Any) -> Any:
-        now.update(step=of, found=detect(of, *given))
-        return now["found"]
+        now["step"] = of
+        return detect(of, *given)
 
     def started(x: Tensor, move: Tensor, was: Tensor, at: Tensor, floor: Any, origin: Tensor, detection: Any,
                 *rest: Any) -> Any:  # fmt: skip

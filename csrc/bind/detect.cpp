@@ -52,20 +52,17 @@ void require_capacity(int64_t capacity) {
 // Results as in contact/detection.h. mesh_bodies: body labels from there on are colliders; radii [scenes, mesh_bodies +
 // 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
 // many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
-DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius, In faces,
-                 In weight, In edges, In sharpness, In wings, In points, In planes, In body, In pinned, In trust_radius,
+DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,
+                 In triangles, In edges, In points, In planes, In body, In pinned, In trust_radius,
                  In deformation_radius, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
                  int64_t capacity, bool trim) {
   const Device device(x);
   require_capacity(capacity);
   return dispatch_float(x, [&]<class T>(T) {
-    auto in = surfaces_of<T>(x, origin, collider, collider_next, rest, radius, faces, edges, points, planes, body,
+    auto in = surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body,
                              pinned, mesh_bodies, self_contact, between_bodies);
     require(std::isfinite(dhat), "contact: expected a finite dhat");
     const Reader<T> read(x);
-    in.weight = read.index("weight", weight, in.num_triangles);
-    in.sharpness = read.index("sharpness", sharpness, in.num_edges);
-    in.wings = read.index("wings", wings, int64_t{2} * in.num_edges);
     in.trust_radius = read.like("trust_radius", trust_radius, read.b * (in.mesh_bodies + int64_t{1}));
     in.deformation_radius = read.like("deformation_radius", deformation_radius, read.b * (in.mesh_bodies + int64_t{1}));
     in.dhat = static_cast<T>(dhat);

@@ -161,7 +161,6 @@ DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t e
 constexpr double kRestFraction = 0.9, kSamePlace = 1e-9;
 // Squared sine below which edges are mollified (Li et al. 2020), with the lengths at rest.
 constexpr double kMollified = 1e-3;
-constexpr double kAcross = 0.25;  // sine of the angle from the faces of a sharp edge to what lies across it
 
 // Surfaces of all scenes and what is known of their corner points: `vertices` of the mesh, then those of colliders.
 template <class T>
@@ -169,11 +168,7 @@ struct Surfaces {
   const T *x, *origin;                // [B, V, 3]; origin may be null
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
-  // Triangles; for pairs of different bodies edges (a, b, b) and vertices (a, a, a), too, with what each face counts;
-  // and of edges the sharpness and the other corners of two of their triangles [E, 2], -1 where there is none
-  // (diffvbd/_contact/surface.py). The last three are null where nothing pushes.
   const int32_t *triangles, *edges, *points, *planes, *body;
-  const int32_t *weight, *sharpness, *wings;
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -207,7 +202,7 @@ template <class T>
 struct Detected {
   int64_t capacity;
   int32_t* pairs;         // [capacity, 6]  corner points, kind, scene
-  T* constants;           // [capacity, 8]  as of Constants; what limit.h takes as hints, the pair's gap last
+  T* constants;           // [capacity, 8]  dhat, offset, threshold; what limit.h takes as hints, the pair's gap last
   int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
   int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
   T* near_values;         // [B, N, 8]  weights, normal, gap
@@ -352,9 +347,6 @@ DIFFVBD_FN Candidate candidate_of_key(const Surfaces<T>& in, uint64_t key) {
                    static_cast<int32_t>(key % m));
 }
 
-// Whether corner k of a pair is the same point as the one before it, as in edges and vertices that count as faces.
-DIFFVBD_FN bool is_repeated(const int32_t* pair, int k) { return k > 1 && pair[k] == pair[k - 1]; }
-
 // Whether the rules admit the pair, but for the distance at rest of two sides of one body.
 template <class T>
 DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
@@ -368,8 +360,6 @@ DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
     }
     for (int k = 1; k < 4; ++k) pinned = pinned && in.pinned[c.v[k]];
   }
-  // a face of fewer dimensions counts for other bodies
-  if (c.kind == kPointTriangle && is_repeated(c.v, 3) && in.body[c.v[0]] == in.body[c.v[1]]) return false;
   return !pinned && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
 }
 
@@ -408,9 +398,8 @@ DIFFVBD_APART T height(const Corners<T>& c) {
 
 template <class T>
 struct Constants {
-  T dhat, offset;  // reach of the barrier, 0 where it has none, and sum of the radii [m]
-  T threshold;     // of two edges: of the mollifier [m^4]; else: what the pair counts
-  bool admitted;   // false for two sides of one body that are one place of the material
+  T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier [m^4]
+  bool admitted;              // false for two sides of one body that are one place of the material
 };
 
 template <class T>
@@ -418,37 +407,11 @@ DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
   return in.radius[c.v[0]] + in.radius[c.v[c.second()]];
 }
 
-// Whether two edges of different bodies push each other: both are sharp, or one is, and the other lies across it rather
-// than along one of its faces.
-template <class T>
-DIFFVBD_APART bool are_sharp(const Surfaces<T>& in, const Candidate& c) {
-  const int32_t sharpness[2] = {in.sharpness[c.a], in.sharpness[c.b]}, both = sharpness[0] + sharpness[1];
-  if (both != 1) return both > 1;
-  const bool first = sharpness[0] == 1;
-  const Corners<T> corners = corners_with(in, c, in.collider);
-  const Vec3<T> one = corners.x[1] - corners.x[0], two = corners.x[3] - corners.x[2], edge = first ? one : two;
-  // the common normal, which is the direction where both are closest inside
-  const Vec3<T> n = cross(one, two), apart = first ? corners.x[2] - corners.x[0] : corners.x[0] - corners.x[2];
-  const T size = square_root(dot(n, n));
-  if (!(T(0) < size)) return false;
-  const Vec3<T> outward = (dot(n, apart) < T(0) ? T(-1) / size : T(1) / size) * n;
-  const Place<T> from = place(in, in.collider, c.scene, c.v[first ? 0 : 2]);
-  for (int k = 0; k < 2; ++k) {
-    const int32_t wing = in.wings[2 * (first ? c.a : c.b) + k];
-    if (wing < 0) continue;
-    const Place<T> to = place(in, in.collider, c.scene, wing);
-    const Vec3<T> arm = (to.x - from.x) + (to.o - from.o), across = arm - (dot(arm, edge) / dot(edge, edge)) * edge;
-    if (!(dot(outward, across) < T(-kAcross) * square_root(dot(across, across)))) return false;
-  }
-  return true;
-}
-
 template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
   const int second = c.second();
+  Constants<T> out{in.dhat, offset_of(in, c), T(0), true};
   const bool one_body = c.kind != kPointPlane && in.body[c.v[0]] == in.body[c.v[second]];
-  Constants<T> out{in.dhat, offset_of(in, c), T(1), true};
-  if (c.kind == kPointTriangle && in.weight != nullptr) out.threshold = T(in.weight[c.b]);
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
   const auto squared_length = [&](int i, int j) {
@@ -457,10 +420,7 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   };
   const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
   if (c.kind == kEdgeEdge) out.threshold = T(kMollified) * e * f;
-  if (!one_body) {
-    if (in.sharpness != nullptr && !are_sharp(in, c)) out.dhat = T(0);
-    return out;
-  }
+  if (!one_body) return out;
   T longest = e < f ? f : e;
   if (c.kind == kPointTriangle && longest < squared_length(1, 3)) longest = squared_length(1, 3);
   const T at_rest = separation(c.kind, rest);

@@ -103,9 +103,11 @@ struct LagState {
 template <class R, class T>
 DIFFVBD_FN LagState<R> lag_state(int kind, const Corners<R>& c, const Distance<R>& at, const PairConstants<T>& a,
                                  const R& kappa) {
-  const PairTerms<R> t = pair_terms(kind, c, at, a, kappa);
-  const R force = t.inside * t.e * (t.ends.first - t.inner.first), active = select(at.d - R(a.offset) < R(a.dhat), R(1), R(0));
-  return {force, active, at.n, {at.w[0], at.w[1], at.w[2], at.w[3]}};
+  const R gap = at.d - R(a.offset);
+  const LogBarrier<R> b(gap, R(a.dhat), kappa);
+  LagState<R> out{-b.first, select(gap < R(a.dhat), R(1), R(0)), at.n, {at.w[0], at.w[1], at.w[2], at.w[3]}};
+  if (is_mollified(kind, c, a.threshold)) out.force = mollifier(c, a.threshold).e * out.force;
+  return out;
 }
 
 template <class R, class T>

@@ -165,10 +165,16 @@ DIFFVBD_FN Distance<R> point_triangle(const Corners<R>& c, int* feature = nullpt
   return chosen(inside, face, out);
 }
 
-// The distance of two edges by their ends: the closest of an end of one and a point of the other.
+// corners: the ends of the first edge, then of the second
 template <class R>
-DIFFVBD_FN Distance<R> edge_ends(const Corners<R>& c, int* feature = nullptr) {
-  Distance<R> out{};
+DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c, int* feature = nullptr) {
+  const InEdges<R> in(c);
+  const auto inside = in.holds();
+  Distance<R> across{}, out{};
+  if (any(inside)) {
+    across = in.measured(c);
+    if (all(inside)) return across;
+  }
   R best2 = R(std::numeric_limits<float>::infinity());
   const R a = closest_on_segment(c.x[0], c.x[2], c.x[3]), b = closest_on_segment(c.x[1], c.x[2], c.x[3]);
   const R d = closest_on_segment(c.x[2], c.x[0], c.x[1]), e = closest_on_segment(c.x[3], c.x[0], c.x[1]);
@@ -177,17 +183,7 @@ DIFFVBD_FN Distance<R> edge_ends(const Corners<R>& c, int* feature = nullptr) {
   keep_closer(out, best2, feature, 3, c, R(1) - d, d, R(-1), R(0));
   keep_closer(out, best2, feature, 4, c, R(1) - e, e, R(0), R(-1));
   measure_along(out, c);
-  return out;
-}
-
-// corners: the ends of the first edge, then of the second
-template <class R>
-DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c, int* feature = nullptr) {
-  const InEdges<R> in(c);
-  const auto inside = in.holds();
-  if (!any(inside)) return edge_ends(c, feature);
-  const Distance<R> across = in.measured(c);
-  return all(inside) ? across : chosen(inside, across, edge_ends(c, feature));
+  return chosen(inside, across, out);
 }
 
 // corners: the point, then three points of the plane, counterclockwise seen from the side that is free
@@ -242,16 +238,6 @@ DIFFVBD_FN Distance<Dual<R>> distance_by(int kind, int feature, const Corners<Du
     if (kind == kPointPlane) return point_plane(c);
     if (feature != kInside) return at_end(kind, end_of(kind, feature), c);
     return kind == kPointTriangle ? InFace<Dual<R>>(c).measured(c) : InEdges<Dual<R>>(c).measured(c);
-  }
-}
-
-// The same of edge_ends().
-template <class R>
-DIFFVBD_FN Distance<Dual<R>> ends_by(int feature, const Corners<Dual<R>>& c) {
-  if constexpr (!std::is_arithmetic_v<R>) {
-    return edge_ends(c);
-  } else {
-    return at_end(kEdgeEdge, end_of(kEdgeEdge, feature), c);
   }
 }
 

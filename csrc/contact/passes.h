@@ -133,9 +133,7 @@ struct Source {
   // How many corners of a pair move at once with vertex v, which is one of them.
   DIFFVBD_FN T together(const int32_t* pair, int v) const {
     int count = 0;
-    for (int k = 0; k < 4; ++k) {
-      count += pair[k] < in.num_vertices && !is_repeated(pair, k) && positions.together(pair[k], v);
-    }
+    for (int k = 0; k < 4; ++k) count += pair[k] < in.num_vertices && positions.together(pair[k], v);
     return T(count);
   }
   // The displacement of a corner point since gaps were taken, at the start of the substep.
@@ -258,7 +256,6 @@ DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec
   const int pair = entry >> 2, own = entry & 3;
   const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
   const T* constants = in.constants + int64_t{kConstants} * pair;
-  if (is_repeated(record, 3)) return exponent;  // the triangles around it limit
   const int sides_first = sides(record[4]);
   bool both = false, alone = true;
   for (int k = 0; k < 4; ++k) {

@@ -270,18 +270,21 @@ DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& 
   const Distance<double> near = distance(record[4], c);
   const double gap = near.d - a.offset, h = in.scene.time_step;
   if (!(gap < dhat)) return false;
-  const PairTerms<double> t = pair_terms(record[4], c, near, a, h * h * in.kappa.data[scene * in.kappa.scene]);
-  const bool pulls = record[4] == kEdgeEdge;
-  out.value = t.value();
-  out.force = t.first() * near.n;
+  const LogBarrier<double> b(gap, dhat, h * h * in.kappa.data[scene * in.kappa.scene]);
+  double e = 1;
+  Mollifier<double> m{};
+  const bool mollified = is_mollified(record[4], c, a.threshold);
+  if (mollified) m = mollifier(c, a.threshold), e = m.e;
+  out.value = e * b.value;
+  out.force = (e * b.first) * near.n;
   out.stiffness = Sym3<double>{};
-  add_outer(out.stiffness, t.inside * t.e * t.inner.second, near.n);
+  add_outer(out.stiffness, e * b.second, near.n);
   each_corner(first, [&](int side, int k) {
     if (out.body[side] < 0) return;
     out.weight[side] += near.w[k];
     out.at[side] += near.w[k] * relative[k];
-    if (!pulls) return;
-    const Vector pull = t.pull(k);
+    if (!mollified) return;
+    const Vector pull = b.value * m.gradient[k];
     out.pull[side] += pull;
     out.torque[side] += cross(relative[k], pull);
   });

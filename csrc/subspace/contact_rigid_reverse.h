@@ -94,8 +94,7 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   return out;
 }
 
-// Gradient and matrix of a listed pair by the motion of its weighted corners, and the parts of mollifier and ends at
-// corners.
+// Gradient and matrix of a listed pair by the motion of its weighted corners, and the part of a mollifier at corners.
 template <class R>
 struct ForceTerms {
   Vec3<R> force, n, at_corner[4];
@@ -143,10 +142,15 @@ DIFFVBD_FN void add_by_motions(const ForceTerms<double>& a, const PairMotions& m
 template <class R, class T>
 DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
-  const PairTerms<R> t = pair_terms(kind, c, near, a, R(size));
+  const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
   ForceTerms<R> out{};
-  for (int k = 0; kind == kEdgeEdge && k < 4; ++k) out.at_corner[k] = t.pull(k);
-  out.force = t.first() * near.n, out.n = near.n, out.along = t.inside * t.e * t.inner.second;
+  R e(1);
+  if (is_mollified(kind, c, a.threshold)) {
+    const Mollifier<R> m = mollifier(c, a.threshold);
+    e = m.e;
+    for (int k = 0; k < 4; ++k) out.at_corner[k] = b.value * m.gradient[k];
+  }
+  out.force = (e * b.first) * near.n, out.n = near.n, out.along = e * b.second;
   for (int k = 0; k < 4; ++k) out.w[k] = near.w[k];
   return out;
 }

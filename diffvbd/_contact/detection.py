@@ -23,8 +23,7 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
 
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
         pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
-        the mollifier or weight, hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each
-        corner point);
+        the mollifier, hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
         near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [4] int64
         (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
     """
@@ -33,9 +32,9 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (trust_radius, deformation_radius)
     )
     return ops_contact.contact_detect(
-        x, origin, was, now, s.rest, s.radius, s.faces, s.weight, s.edges, s.sharpness, s.wings, s.points, s.planes,
-        s.body, s.pinned, trust_radius, deformation_radius, s.bodies, barrier.self_contact, barrier.between_bodies,
-        barrier.dhat, capacity, not torch.compiler.is_compiling(),
+        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.pinned, trust_radius,
+        deformation_radius, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
+        not torch.compiler.is_compiling(),
     )  # fmt: skip
 
 

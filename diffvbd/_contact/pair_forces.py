@@ -6,6 +6,7 @@ detection and have no derivative. Everything is computed in float64, whatever th
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ from .._contact.barrier import PairBarrier
 from .._contact.detection import detect
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
 from ..energies import damped_fraction
-from ..reference.distance import EDGE_EDGE, PairTerms, distance, pair_terms
+from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from ..reference.energies import smoothed
 
 ADVANCES = 8  # of continuous detection after the first; fewer are on the safe side
@@ -30,20 +31,18 @@ class NearPairs(NamedTuple):
     scene: Tensor  # [Q] int64
     dhat: Tensor  # [Q] [m]
     offset: Tensor  # [Q] sum of the radii [m]
-    threshold: Tensor  # [Q] of two edges: of the mollifier [m^4]; else: what the pair counts
-
-    @property
-    def weight(self) -> Tensor:
-        """What each pair counts [Q]."""
-        return torch.where(self.kind == EDGE_EDGE, 1.0, self.threshold)
+    threshold: Tensor  # [Q] of the mollifier [m^4]
 
     def positions(self, points: Tensor) -> Tensor:
         """Corners [Q, 4, 3] in corner points [B, N, 3]."""
         return points[self.scene[:, None], self.corners]
 
-    def terms(self, points: Tensor, kappa: Tensor) -> PairTerms:
-        """Their barrier; kappa [1 | B]."""
-        return pair_terms(self.kind, self.positions(points), *self[3:], self.of_scene(kappa))
+    def measures(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gap [Q] and mollifier [Q], each followed by its gradient [Q, 4, 3] toward the corners."""
+        at = self.positions(points)
+        d, slope = with_gradient(partial(distance, self.kind), at)
+        e, turn = with_gradient(partial(mollifier, self.kind, threshold=self.threshold), at)
+        return d - self.offset, slope, e, turn
 
     def of_scene(self, value: Tensor) -> Tensor:
         """A parameter [1 | B], for each pair [Q]."""
@@ -117,7 +116,8 @@ def _raise_touching(surface: ContactSurface, touching: int, key: int) -> None:
 
 def pair_energy(pairs: NearPairs, corners: Tensor, kappa: Tensor) -> Tensor:
     """Energy of the barrier of each pair [J], [Q]; corners: [Q, 4, 3].  kappa: [1 | B] [N/m]."""
-    return pair_terms(pairs.kind, corners, *pairs[3:], pairs.of_scene(kappa)).value
+    gap = distance(pairs.kind, corners) - pairs.offset
+    return mollifier(pairs.kind, corners, pairs.threshold) * log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)[0]
 
 
 def safe_fraction(pairs: NearPairs, points: Tensor, move: Tensor, closed: float) -> Tensor:
@@ -149,14 +149,16 @@ def barrier_forces(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
     Args:
         points: Corner points [B, N, 3].  kappa: [1 | B] [N/m].
     """
-    of = pairs.terms(points, kappa)
-    return -(of.first[:, None, None] * of.slope + of.pull)
+    gap, slope, e, turn = pairs.measures(points)
+    value, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
+    return -(e * first)[:, None, None] * slope - value[:, None, None] * turn
 
 
 def barrier_stiffness(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
     """Trace of the barrier's part of each corner point's block [N/m], [B, N]; arguments as of barrier_forces."""
-    of = pairs.terms(points, kappa)
-    return pairs.summed(of.second[:, None, None] * of.slope.square(), points).sum(-1)  # of 3x3 blocks
+    gap, slope, e, _ = pairs.measures(points)
+    _, _, second = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
+    return pairs.summed((e * second)[:, None, None] * slope.square(), points).sum(-1)  # of 3x3 blocks
 
 
 class Lag(NamedTuple):
@@ -173,12 +175,12 @@ class Lag(NamedTuple):
 
 def lag_of(pairs: NearPairs, start: Tensor, kappa: Tensor) -> Lag:
     """pairs: near at the start, where corner points are ``start`` [B, N, 3]; kappa: [1 | B] [N/m]."""
-    of = pairs.terms(start, kappa)
-    normal = pairs.of_first(of.slope)  # weights of the first side sum to 1
-    weights = (of.slope * normal[:, None]).sum(-1)
-    size = -of.normal
-    fraction = pairs.weight * damped_fraction(pairs.weight * size, pairs.of_scene(kappa), pairs.dhat)
-    return Lag(pairs, start, size, normal, fraction, weights, of.slope)
+    gap, slope, e, _ = pairs.measures(start)
+    _, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
+    normal = pairs.of_first(slope)  # weights of the first side sum to 1
+    weights = (slope * normal[:, None]).sum(-1)
+    size = -e * first
+    return Lag(pairs, start, size, normal, damped_fraction(size, pairs.of_scene(kappa), pairs.dhat), weights, slope)
 
 
 def lagged_forces(

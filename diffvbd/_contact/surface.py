@@ -20,7 +20,6 @@ CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # Larger radii list more pairs.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_PINNED = 0.2, 0.3, 0.75
-FLAT = 15.0  # [degrees] between the normals of two triangles, below which their edge counts as flat
 # Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
 COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
 
@@ -33,10 +32,6 @@ class ContactSurface:
     radius: Tensor  # [N] [m]
     triangles: Tensor  # [F, 3] int32, of corner points
     edges: Tensor  # [E, 2] int32
-    faces: Tensor  # [F', 3] int32, of all dimensions, see faces_of()
-    weight: Tensor  # [F'] int32
-    sharpness: Tensor  # [E] int32, see sharpness_of()
-    wings: Tensor  # [E, 2] int32
     points: Tensor  # [P] int32
     planes: Tensor  # [L, 3] int32
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
@@ -63,11 +58,11 @@ class ContactSurface:
 
     def corners_of(self, key: int) -> tuple[int, list[int]]:
         """Scene and corner points of a pair by its key in contact_detect's counts."""
-        count = 1 + max(t.shape[0] for t in (self.faces, self.edges, self.points, self.planes))
+        count = 1 + max(t.shape[0] for t in (self.triangles, self.edges, self.points, self.planes))
         key, second = divmod(key, count)
         key, first = divmod(key, count)
         scene, kind = divmod(key, 3)
-        sides = ((self.points, self.faces), (self.edges, self.edges), (self.points, self.planes))[kind]
+        sides = ((self.points, self.triangles), (self.edges, self.edges), (self.points, self.planes))[kind]
         corners = [side[row].reshape(-1).tolist() for side, row in zip(sides, (first, second), strict=True)]
         return scene, corners[0] + corners[1]
 
@@ -127,18 +122,11 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
 
     pinned = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
-    all_triangles, all_edges = index_tensor(triangles, 3), index_tensor(edges, 2)
-    faces, weight = faces_of(all_triangles.numpy(), all_edges.numpy())
-    sharpness, wings = sharpness_of(np.concatenate(rest), all_triangles.numpy(), all_edges.numpy())
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
         radius=torch.from_numpy(np.concatenate(radius)),
-        triangles=all_triangles,
-        edges=all_edges,
-        faces=torch.from_numpy(faces),
-        weight=torch.from_numpy(weight),
-        sharpness=torch.from_numpy(sharpness),
-        wings=torch.from_numpy(wings),
+        triangles=index_tensor(triangles, 3),
+        edges=index_tensor(edges, 2),
         points=index_tensor(points, 1).reshape(-1),
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
@@ -157,48 +145,6 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         min_deformation_radius=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
-
-
-def faces_of(triangles: Any, edges: Any) -> tuple[Any, Any]:
-    """Faces of all dimensions of surfaces, int32 [F', 3], and by how much each counts, int32 [F'].
-
-    Triangles, edges (a, b, b) and vertices (a, a, a). A face counts 1 less the counts of those that contain it: an edge
-    of two triangles -1, a vertex all around which there are triangles 1, an edge or vertex of the border 0, a lone edge
-    1. So that of a surface that is flat or convex near a point only the closest face counts, and once.
-    """
-    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-    edges, each = np.unique(np.concatenate([sides, np.sort(edges, 1)]), axis=0, return_counts=True)
-    each = each - 1  # triangles of each
-    points = np.unique(edges)
-    around = np.zeros(points[-1] + 1 if len(points) else 0, np.int64)
-    np.add.at(around, triangles.reshape(-1), 1)
-    np.add.at(around, edges.reshape(-1), np.repeat(1 - each, 2))
-    faces = [triangles, edges[:, [0, 1, 1]], np.repeat(points[:, None], 3, 1)]
-    weight = np.concatenate([np.ones(len(triangles), np.int64), 1 - each, 1 - around[points]])
-    counts = weight != 0
-    return np.concatenate(faces).astype(np.int32)[counts], weight.astype(np.int32)[counts]
-
-
-def sharpness_of(points: Any, triangles: Any, edges: Any) -> tuple[Any, Any]:
-    """Sharpness of each edge, int32 [E]: 0 where its two triangles are flat at rest, up to FLAT; 2 where it has none,
-    as the axis of a capsule; else 1. And the other corners of two of its triangles, int32 [E, 2], or -1."""
-    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-    order = np.lexsort(sides.T[::-1])
-    keys, first, each = np.unique(sides[order], axis=0, return_index=True, return_counts=True)
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
-    normal = np.cross(b - a, c - a)
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    of, opposite = order // 3, triangles[:, [2, 0, 1]].reshape(-1)[order]
-    second = np.minimum(first + 1, max(len(of) - 1, 0))
-    flat = (each == 2) & ((normal[of[first]] * normal[of[second]]).sum(1) > np.cos(np.radians(FLAT)))
-    row = {(int(i), int(j)): k for k, (i, j) in enumerate(keys)}
-    at = np.array([row.get((int(min(e)), int(max(e))), -1) for e in edges], np.int64)
-    sharpness, wings = np.full(len(edges), 2), np.full((len(edges), 2), -1)
-    some = at >= 0
-    sharpness[some] = ~flat[at[some]]
-    wings[some, 0] = opposite[first[at[some]]]
-    wings[some, 1] = np.where(each[at[some]] > 1, opposite[second[at[some]]], -1)
-    return sharpness.astype(np.int32), wings.astype(np.int32)
 
 
 def units(body: Tensor, pinned_bodies: Tensor) -> Tensor:

@@ -27,7 +27,6 @@ from ..model.system import System
 from ..ops import contact as ops_contact
 from ..ops.fields import CONSTANTS
 from ..ops.sums import segment_sum, sum_by
-from ..reference.distance import EDGE_EDGE
 from ..reference.energies import smoothed
 from .potential import IncrementalPotential
 
@@ -100,8 +99,7 @@ def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor | 
     if damping is not None:
         stiffness, own = (of_scene(ops.broadcast(t, (scenes,)), listed) for t in (kappa, damping))
         dhat = torch.where(state[:, 1] > 0, listed.constants[:, 0], 1.0)  # rows that no pair fills hold anything
-        weight = torch.where(listed.pairs[:, 4] == EDGE_EDGE, 1.0, listed.constants[:, 2])
-        rate = weight * own * damped_fraction(weight * force, stiffness, dhat)
+        rate = own * damped_fraction(force, stiffness, dhat)
     return torch.cat([torch.stack([load, rate], 1), state[:, 2:]], 1)
 
 

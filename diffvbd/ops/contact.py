@@ -27,7 +27,7 @@ class Detection(NamedTuple):
     """Pairs of primitives that are closer than the barrier's reach, or may come that close."""
 
     pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
-    constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], threshold or weight; hints
+    constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]; hints
     ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
     near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
@@ -37,11 +37,9 @@ class Detection(NamedTuple):
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
-                   faces: Tensor, weight: Tensor, edges: Tensor, sharpness: Tensor, wings: Tensor, points: Tensor,
-                   planes: Tensor, body: Tensor, pinned: Tensor, trust_radius: Tensor, deformation_radius: Tensor,
-                   mesh_bodies: int,
-                   self_contact: bool, between_bodies: bool, dhat: float, capacity: int, trim: bool = False
-                   ) -> Detection:  # fmt: skip
+                   triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor,
+                   trust_radius: Tensor, deformation_radius: Tensor, mesh_bodies: int, self_contact: bool,
+                   between_bodies: bool, dhat: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
 
     ``trust_radius`` bounds the displacement of a vertex relative to its island. ``deformation_radius`` bounds it
@@ -59,12 +57,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are taken at the
             latter, or now where a plane would pass the point. What is near a plane now is listed, too.
         rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
-        faces, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique. Faces are triangles and, for pairs
-            of different bodies, edges (a, b, b) and vertices (a, a, a).
-        weight: [F] what each face counts.
-        sharpness, wings: [E], [E, 2] of each edge: 0 flat, 1 sharp, 2 without triangles; and the other corners of two
-            of its triangles, or -1. Edges of different bodies have a reach where their sharpness adds up to 2, or to 1
-            and the other edge lies across the sharp one.
+        triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, pinned: [N]; labels from ``mesh_bodies`` on are colliders; pinned: bool, no sweep moves the point.
         trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
@@ -76,9 +69,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, rest, radius, faces, weight, edges, sharpness, wings, points, planes,
-            body, pinned, trust_radius, deformation_radius, mesh_bodies, self_contact, between_bodies, dhat, capacity,
-            trim,
+            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, pinned,
+            trust_radius, deformation_radius, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
         )
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .coarse import Coarse
 from .couplings import Bounds, energies_of_sweeps
-from .distance import EDGE_EDGE, PairTerms, distance, pair_terms
+from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from .energies import FADE, floor_friction, smoothed, tangential6
 from .rigid_contact import Correction
 from .scene import Scene, build_layout, build_scene, outer6
@@ -27,7 +27,7 @@ class Substep(NamedTuple):
     vertices before colliders."""
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
-    constants: Tensor  # [Q, 3 or more]: dhat, sum of radii [m]; of edges the mollifier's threshold [m^4], else a weight
+    constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     u: Tensor  # [B, bodies, 3]: translation of each body's island
     fractions: Tensor  # [B, V]: step fraction of each vertex at the start
     truncated: Tensor  # bool [B, V]: vertices whose displacement goes on in the next substep
@@ -51,7 +51,6 @@ class Pairs:
         rows, constants = substep.pairs[order], scene.tensor(substep.constants)[order]
         self.corners, self.kind, self.batch = rows[:, :4], rows[:, 4], rows[:, 5]
         self.dhat, self.offset, self.threshold = constants[:, :3].unbind(1)
-        self.weight = torch.where(self.kind == EDGE_EDGE, 1.0, self.threshold)
         self.lead = scene.like.shape[:-2]
         self.points = scene.rest_points.shape[-1] + scene.model.collider_points.shape[-2]
         self.sizes = [len(color.vertices) for color in scene.layout.colors]
@@ -64,9 +63,7 @@ class Pairs:
         position[vertices] = torch.arange(len(vertices), device=vertices.device)
         owner = position[self.corners]
         pair, local = (owner >= 0).nonzero(as_tuple=True)
-        moves = owner >= 0
-        moves[:, 2:] &= self.corners[:, 2:] != self.corners[:, 1:-1]  # edges and vertices repeat their last corner
-        together = moves.sum(1)[pair]
+        together = (owner >= 0).sum(1)[pair]
         return pair, local, self.batch[pair] * len(vertices) + owner[pair, local], together
 
     def per_pair(self, value: Tensor) -> Tensor:
@@ -85,11 +82,12 @@ class Pairs:
         """Corners [n, 4, 3] of some pairs in corner points [B, N, 3]."""
         return points[self.batch[pairs, None], self.corners[pairs]]
 
-    def terms(self, points: Tensor, kappa: Tensor, pairs: Tensor | slice = slice(None)) -> PairTerms:
-        """The barrier of some pairs; kappa [Q]."""
-        corners = points[self.batch[pairs, None], self.corners[pairs]]
-        return pair_terms(self.kind[pairs], corners, self.dhat[pairs], self.offset[pairs], self.threshold[pairs],
-                          kappa[pairs])  # fmt: skip
+    def measures(self, points: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gap [n] and mollifier [n] of some pairs, each followed by its gradient [n, 4, 3] toward the corners."""
+        corners, kind = self.positions(points, pairs), self.kind[pairs]
+        d, slope = with_gradient(partial(distance, kind), corners)
+        e, turn = with_gradient(partial(mollifier, kind, threshold=self.threshold[pairs]), corners)
+        return d - self.offset[pairs], slope, e, turn
 
     def assemble(self, k: int, columns: Tensor) -> Tensor:
         """Sums columns [9, entries] of color k over the entries of each vertex: [..., 9, n]."""
@@ -115,29 +113,31 @@ class PairBarrier:
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         pair, local, _, together = self.pairs.entries[k]
-        of = self.pairs.terms(corner_points(x, self.colliders), self.kappa, pair)
-        entry = torch.arange(len(pair), device=pair.device)
-        slope, pull, side = (g[entry, local].T for g in (of.slope, of.pull, of.side))
-        # what counts positive along its normal, what counts negative across it
-        normal, diagonal = outer6(side), torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]).to(x)[:, None]
-        across = of.across * ((side * side).sum(0) * diagonal - normal)
-        stiffness = together * (of.stiff.clamp(min=0) * outer6(slope) + across)
-        columns = torch.cat((of.first * slope + pull, stiffness))
+        gap, slope, e, turn = self.pairs.measures(corner_points(x, self.colliders), pair)
+        slope, turn = (g[torch.arange(len(pair), device=pair.device), local].T for g in (slope, turn))
+        b, first, second = log_barrier(gap, self.kappa[pair], self.pairs.dhat[pair])
+        columns = torch.cat((e * first * slope + b * turn, together * e * second * outer6(slope)))
         return self.pairs.assemble(k, self.weight * columns)
 
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
 
     def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Of the rigid correction: forces on the corners [Q, 4, 3] and what their updates add [Q, 4, 4, 3, 3]."""
-        of = self.pairs.terms(corner_points(x, self.colliders), self.kappa)
-        across = of.slope[:, :, None, :, None] * of.slope[:, None, :, None, :]
-        force = of.first[:, None, None] * of.slope + of.pull
-        return self.weight * force, self.weight * of.second[:, None, None, None, None] * across
+        p = self.pairs
+        gap, slope, e, turn = p.measures(corner_points(x, self.colliders), torch.arange(len(p.kind), device=x.device))
+        b, first, second = log_barrier(gap, self.kappa, p.dhat)
+        b = self.weight * b
+        across = slope[:, :, None, :, None] * slope[:, None, :, None, :]
+        first, second = self.weight * e * first, self.weight * e * second
+        force = first[:, None, None] * slope + b[:, None, None] * turn
+        return force, second[:, None, None, None, None] * across
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
-        p, points = self.pairs, corner_points(x, self.colliders)
-        gap = distance(p.kind, points[p.batch[:, None], p.corners]) - p.offset
-        return self.weight * p.total(torch.where(gap > 0, p.terms(points, self.kappa).value, torch.inf))
+        p = self.pairs
+        corners = p.positions(corner_points(x, self.colliders), torch.arange(len(p.kind), device=x.device))
+        gap = distance(p.kind, corners) - p.offset
+        b, _, _ = log_barrier(gap, self.kappa, p.dhat)
+        return self.weight * p.total(torch.where(gap > 0, mollifier(p.kind, corners, p.threshold) * b, torch.inf))
 
 
 class LaggedPairForces:
@@ -149,20 +149,20 @@ class LaggedPairForces:
     def __init__(self, scene: Scene, pairs: Pairs, start: Tensor, colliders: Tensor) -> None:
         model = scene.model
         self.h, self.pairs, self.start, self.colliders = scene.time_step, pairs, start, colliders
-        kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
-        of = pairs.terms(start, kappa)
-        self.slope = of.slope
+        gap, self.slope, e, _ = pairs.measures(start, torch.arange(len(pairs.kind), device=start.device))
         # Weights of the first primitive sum to 1, so the gradients w_k n of its corners sum to the normal.
         both = (pairs.kind == EDGE_EDGE)[:, None]
         self.normal = self.slope[:, 0] + torch.where(both, self.slope[:, 1], 0.0)
-        force = -pairs.weight * of.normal
+        kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
+        _, first, _ = log_barrier(gap, kappa, pairs.dhat)
+        force = -e * first
         whole = force + FADE * kappa * pairs.dhat
-        fraction = pairs.weight * torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
+        fraction = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
         self.damping = fraction * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
-            self.largest = -pairs.of_two(scene.parameter(friction, "coefficient"), model) * of.normal
+            self.largest = -pairs.of_two(scene.parameter(friction, "coefficient"), model) * e * first
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:

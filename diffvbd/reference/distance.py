@@ -6,8 +6,7 @@ derivative, of normals and of closest points too, comes from autograd. Source: L
 """
 
 from collections.abc import Callable, Iterator
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -108,20 +107,6 @@ def distance(kind: Tensor, corners: Tensor) -> Tensor:
     return out
 
 
-def ends_distance(kind: Tensor, corners: Tensor) -> Tensor:
-    """Of two edges the distance by their ends [m], the closest of an end of one and a point of the other; else 0."""
-    rows = (kind == EDGE_EDGE).nonzero()[:, 0]
-    some = corners[rows]
-    with torch.no_grad():
-        feature, index = _closest_border(some, torch.tensor(_BORDERS[EDGE_EDGE], device=kind.device))
-    ordered = some.gather(1, index[..., None].expand(-1, -1, 3))
-    out = corners.new_zeros(len(kind))
-    for this in (TO_POINT, TO_EDGE):
-        of = (feature == this).nonzero()[:, 0]
-        out = out.index_put((rows[of],), _FORMULAS[this](*ordered[of].unbind(1)))
-    return out
-
-
 def mollifier(kind: Tensor, corners: Tensor, threshold: Tensor) -> Tensor:
     """e = s (2 - s) of s = |u x v|^2 / threshold where two edges u, v have s < 1, else 1; threshold 0: never."""
     a, b, c, d = corners.unbind(1)
@@ -135,7 +120,6 @@ def mollifier(kind: Tensor, corners: Tensor, threshold: Tensor) -> Tensor:
 def log_barrier(gap: Tensor, kappa: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """b = -kappa (gap - dhat)^2 log(gap / dhat) for 0 < gap < dhat, else 0, with its first two derivatives."""
     active = (gap > 0) & (gap < dhat)
-    dhat = torch.where(dhat > 0, dhat, 1.0)  # a pair that does not push has 0
     d = torch.where(active, gap, dhat)  # the unused branch must stay finite for autograd
     log, past = torch.log(d / dhat), d - dhat
     value = -kappa * past**2 * log
@@ -153,42 +137,6 @@ def with_gradient(function: Callable[[Tensor], Tensor], corners: Tensor) -> tupl
         value = function(corners)
         (gradient,) = torch.autograd.grad(value.sum(), corners, create_graph=tracked, materialize_grads=True)
     return (value if tracked else value.detach()), gradient
-
-
-class PairTerms(NamedTuple):
-    """The barrier of Q pairs: e (b(gap) - b(gap of the ends)) of two edges that are closest inside both, 0 where an end
-    is closest; else b(gap) times what the pair counts."""
-
-    value: Tensor  # [Q]
-    first: Tensor  # [Q] e b'
-    second: Tensor  # [Q] e b''
-    stiff: Tensor  # [Q] the same for the block of a vertex, which does not know what is inside, lest it jump
-    slope: Tensor  # [Q, 4, 3] of the gap toward the corners
-    pull: Tensor  # [Q, 4, 3] the rest of the gradient: of the mollifier and of the ends
-    across: Tensor  # [Q] curvature across the normal of what counts negative, -b' / d
-    side: Tensor  # [Q, 4, 3] the gradient of its d
-    normal: Tensor  # [Q] e (b' - b' of the ends), less the normal force
-
-
-def pair_terms(kind: Tensor, corners: Tensor, dhat: Tensor, offset: Tensor, threshold: Tensor, kappa: Tensor
-               ) -> PairTerms:  # fmt: skip
-    """All [Q], but corners [Q, 4, 3]; threshold: of two edges that of the mollifier, else what the pair counts."""
-    d, slope = with_gradient(partial(distance, kind), corners)
-    edges = kind == EDGE_EDGE
-    size = torch.where(edges, kappa, threshold * kappa)
-    b, first, second = log_barrier(d - offset, size, dhat)
-    if not bool(edges.any()):
-        return PairTerms(b, first, second, second, slope, torch.zeros_like(slope), first.clamp(min=0) / d, slope, first)
-    ends, back = with_gradient(partial(ends_distance, kind), corners)
-    e, turn = with_gradient(partial(mollifier, kind, threshold=threshold), corners)
-    of_ends, end, _ = log_barrier(ends - offset, torch.where(edges, kappa, 0.0), dhat)
-    inside = ~edges | (d < ends)
-    height = torch.where(inside, b - of_ends, 0.0)
-    pull = height[:, None, None] * turn - (inside * e * end)[:, None, None] * back
-    across = torch.where(edges, -e * end / torch.where(edges, ends, 1.0), first.clamp(min=0) / d)
-    side = torch.where(edges[:, None, None], back, slope)
-    return PairTerms(e * height, inside * e * first, inside * e * second, e * second, slope, pull, across, side,
-                     inside * e * (first - end))  # fmt: skip
 
 
 CHUNK = 1 << 21  # boxes compared at a time

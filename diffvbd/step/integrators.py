@@ -349,7 +349,7 @@ def _near_pairs(model: System, begun: Begun, prepared: Prepared, displacement: T
     at = torch.cat([step.x_prev if begun.origin is None else step.x_prev + step.origin, before], 1)
     most = _displacement_between(kind, [displacements[scene, c] for c in corner], [at[scene, c] for c in corner])
     gap, dhat = step.gaps_before(found.listed), found.listed.constants[:, 0]
-    near = (gap - MARGIN * most < (1 + LEAST) * dhat) & (dhat > 0)
+    near = gap - MARGIN * most < (1 + LEAST) * dhat
     near = near & (rows < found.listed.ptr[-1] // 4)  # that pairs fill
     if _extrapolates(model, prepared):
         # colliders do not give way: their masses count as infinite

@@ -172,7 +172,7 @@ def held_up() -> Scene:
     barrier = PairBarrier(kappa=1e4, dhat=0.02, self_contact=False, damping=1.0)
     scene = build("held_up", boxes((0, 0, 0), (0.05, 0.23, 0.03), points=2), (barrier, Friction(0.2, 0.1)),
                   batch=(2,), jitter=2e-3)  # fmt: skip
-    scene.v[0, 8:, 1] -= 100.0
+    scene.v[0, 8:, 1] -= 80.0
     return scene
 
 

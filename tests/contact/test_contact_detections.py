@@ -20,7 +20,7 @@ MATERIAL: dict[str, Any] = {"mu": 8e3, "lam": 1.2e4, "gravity": (0.0, 0.0, 0.0)}
 def meeting(speed: float, device: str, dtype: torch.dtype = torch.float64, **options: Any) -> tuple[dv.Model, Any, Any]:
     """A small cube thrown at a larger one, off its center."""
     lower, upper = box(4, 0.2, split="kuhn"), box(4, 0.12, split="kuhn").translate((0.04, 0.22, 0.03))
-    barrier = dv.PairBarrier(kappa=4e4, dhat=0.01, self_contact=False, **options)
+    barrier = dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False, **options)
     model = dv.Model(join([lower, upper]), energies=(dv.StableNeoHookean(), barrier), device=device, dtype=dtype)
     v = torch.zeros_like(model.rest_points)
     v[lower.num_vertices :, 1] = -speed

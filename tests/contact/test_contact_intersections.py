@@ -21,8 +21,8 @@ DTYPES = (torch.float64, torch.float32)
 
 
 def arguments(s: Scene, device: str, dtype: torch.dtype, capacity: int) -> tuple:
-    of = s.arguments(device, dtype, capacity)
-    return (*of[:3], *of[4:7], of[8], *of[11:15], *of[17:20], capacity)
+    of_detection = s.arguments(device, dtype, capacity)
+    return (*of_detection[:3], *of_detection[4:12], *of_detection[14:17], capacity)
 
 
 def find(s: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64, capacity: int = 5000) -> Any:

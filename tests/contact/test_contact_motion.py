@@ -94,12 +94,12 @@ def test_a_block_on_a_soft_block_does_not_sink() -> None:
     assert abs(row["value"] - row["reference"]) <= tolerance("dented_rest")
 
 
-@pytest.mark.parametrize(("speed", "time_step"), [(5.0, 0.01), (5.0, 1 / 60), (4.0, 0.01)])
+@pytest.mark.parametrize(("speed", "time_step"), [(5.0, 0.01), (5.0, 1 / 60), (7.0, 0.01)])
 def test_an_impact_of_more_than_an_edge_a_step_keeps_its_momentum(speed: float, time_step: float) -> None:
     """The rigid correction after the sweeps goes as far as the whole part may. With what the sweeps had left of their
     rooms these lost 9, 27 and 34 % of it."""
     large, small = dv.mesh.cube(4, size=0.2), dv.mesh.cube(4, size=0.12).translate((0.225, 0.08, 0.06))
-    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=4e4, dhat=0.01, detections=1))
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=0.01, detections=1))
     model = dv.Model(dv.mesh.join([large, small]), energies=energies)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     v[64:, 0] = -speed

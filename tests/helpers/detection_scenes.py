@@ -138,10 +138,7 @@ class Scene:
         trust_radius = np.tile([*self.trust_radii, self.trust_radius], (len(x), 1))
         return (
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
-            real(self.radius), index(self.triangles), torch.ones(len(self.triangles), dtype=torch.int32, device=device),
-            index(self.edges), torch.full((len(self.edges),), 2, dtype=torch.int32, device=device),
-            torch.full((len(self.edges), 2), -1, dtype=torch.int32, device=device),
-            index(self.points), index(self.planes),
+            real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
             index(self.body), index(self.pinned), real(trust_radius), real(self.own_fraction * trust_radius),
             self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
         )  # fmt: skip
@@ -267,7 +264,7 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         at_rest = closest(kind, rest)[0] if kind != POINT_PLANE else np.full(len(d), np.inf)
         at_rest = np.where(one == other, at_rest, np.inf)
         edges = [np.linalg.norm(rest[:, n] - rest[:, m], axis=-1) for m, n in ((0, 1), (1, 2), (2, 3), (3, 1))]
-        threshold = 1e-3 * (edges[0] * edges[2]) ** 2 if kind == EDGE_EDGE else np.ones(len(d))
+        threshold = 1e-3 * (edges[0] * edges[2]) ** 2 if kind == EDGE_EDGE else np.zeros(len(d))
         dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, s.dhat)
         trust_radii = np.append(s.trust_radii, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
         trust_radii = np.where(one == other, s.own_fraction * trust_radii, trust_radii)

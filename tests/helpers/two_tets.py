@@ -80,7 +80,7 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor) -> reference.Subs
     offset = radius[corners[:, 0]] + radius[second]
     rest = torch.cat((model.rest_points, model.collider_points))[corners]
     edges = ((rest[:, 1] - rest[:, 0]) ** 2).sum(-1), ((rest[:, 3] - rest[:, 2]) ** 2).sum(-1)
-    threshold = torch.where(kind == distance.EDGE_EDGE, 1e-3 * edges[0] * edges[1], 1.0)
+    threshold = torch.where(kind == distance.EDGE_EDGE, 1e-3 * edges[0] * edges[1], 0.0)
     rows, constants = [], []
     for b in range(len(x)):
         points = torch.cat((x[b], torch.where(model.plane_points[:, None], now[b], before[b])))

@@ -20,20 +20,6 @@ from diffvbd.reference.energies import build_energies, floor_friction
 from diffvbd.reference.scene import build_layout
 from diffvbd.testing import generator, relative_error, tolerance
 
-
-def rest_of(kind: Tensor, corners: Tensor, offset: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Gap of the ends of pairs, beyond dhat but of two edges that are closest inside both; and pairs of which something
-    is left: no edges whose ends are closest."""
-    edges, ends = kind == distance.EDGE_EDGE, distance.ends_distance(kind, corners)
-    return torch.where(edges, ends - offset, DHAT), ~edges | (d < ends)
-
-
-def slope_of(gap: Tensor) -> Tensor:
-    """-b' of 200 N/m."""
-    inner = torch.where(gap < DHAT, gap, DHAT)
-    return 200 * (2 * (inner - DHAT) * (inner / DHAT).log() + (inner - DHAT) ** 2 / inner)
-
-
 # --- two tets, a sphere, a capsule, a plane ---------------------------------------------------------------------------
 
 
@@ -60,8 +46,7 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
     model, x, pairs = setup()
     if mollified:  # thresholds above where the edges are
         a, b, c, d = torch.cat((x, COLLIDERS))[pairs.corners].unbind(1)
-        edges = pairs.kind == distance.EDGE_EDGE
-        pairs.threshold = torch.where(edges, 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1), 1.0)
+        pairs.threshold = 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1)
     barrier = PairBarrier(scene_of(model, x), pairs, COLLIDERS[None])
     state = x.clone().requires_grad_()
     (expected,) = torch.autograd.grad(barrier.energy(state.T, x.T), state)
@@ -73,47 +58,36 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
 
 
 def test_barrier_block_is_the_curvature_along_the_normals() -> None:
-    """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d) of what counts positive, and N h^2 e (-b' / d)
-    (|a|^2 - a a') with a = grad d of what counts negative: N of its corners share the vertex's color."""
+    """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d): N of its corners share the vertex's color."""
     model, x, _ = setup()
     part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None])
     vertex = 4
     color, counts = colors(model, len(x) + len(COLLIDERS)), []
-    numbers = torch.tensor([200.0, DHAT], dtype=torch.float64)
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
         one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
-        edges = bool(one.pairs[0, 4] == distance.EDGE_EDGE)
+        one.constants[:, 2] = 0
+        barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
 
-        def block(threshold: float, one: reference.Substep = one) -> Tensor:
-            one.constants[:, 2] = threshold
-            barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
-            return blocks(model, barrier, x, x)[1][vertex]
+        def potential(p: Tensor, barrier: PairBarrier = barrier) -> Tensor:
+            return barrier.energy(torch.cat((x[:vertex], p[None], x[vertex + 1 :])).T, x.T)
 
-        def gap(p: Tensor, of: Any = distance.distance, one: reference.Substep = one) -> Tensor:
+        def gap(p: Tensor, one: reference.Substep = one) -> Tensor:
             points = torch.cat((x[:vertex], p[None], x[vertex + 1 :], COLLIDERS))
-            return (of(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
+            return (distance.distance(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
 
-        def across(of: Any, gap: Any = gap, one: reference.Substep = one) -> Tensor:
-            a = torch.autograd.functional.jacobian(lambda p: gap(p, of), x[vertex])
-            _, slope, _ = distance.log_barrier(gap(x[vertex], of), *numbers)
-            bend = -slope / (gap(x[vertex], of) + one.constants[0, 1])
-            return bend * (a.square().sum() * torch.eye(3, dtype=torch.float64) - torch.outer(a, a))
-
-        _, first, _ = distance.log_barrier(gap(x[vertex]), *numbers)
-        full = torch.autograd.functional.hessian(
-            lambda p, gap=gap: distance.log_barrier(gap(p), *numbers)[0], x[vertex]
-        )
-        along = full - first * torch.autograd.functional.hessian(gap, x[vertex])
+        _, first, _ = distance.log_barrier(gap(x[vertex]), *torch.tensor([200.0, DHAT], dtype=torch.float64))
+        full = torch.autograd.functional.hessian(potential, x[vertex])
+        bent = torch.autograd.functional.hessian(gap, x[vertex])
+        _, hessian = blocks(model, barrier, x, x)
         counts.append(int((color[one.pairs[0, :4]] == color[vertex]).sum()))
-        expected = {0.0: along + across(distance.ends_distance)} if edges else {
-            1.0: along, -1.0: across(distance.distance)}  # fmt: skip
-        if edges:
+        difference = hessian[vertex] - counts[-1] * (full - 1e-4 * first * bent)
+        assert difference.abs().max() <= tolerance("cancelling") * hessian[vertex].abs().max()
+        if one.pairs[0, 4] == distance.EDGE_EDGE:
             a, b, c, d = torch.cat((x, COLLIDERS))[one.pairs[0, :4]]
-            half = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
-            expected[float(half)] = 0.75 * expected[0.0]
-        for threshold, value in expected.items():
-            found, value = block(threshold), 1e-4 * counts[-1] * value
-            assert (found - value).abs().max() <= tolerance("cancelling") * found.abs().max(), threshold
+            one.constants[:, 2] = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
+            barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
+            _, mollified = blocks(model, barrier, x, x)
+            assert torch.allclose(mollified, 0.75 * hessian, rtol=tolerance("cancelling"), atol=0)
     assert set(counts) == {1, 2}
 
 
@@ -132,9 +106,10 @@ def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
     (slope,) = torch.autograd.grad(d.sum(), corners)
     normal = slope[:, 0] + (pairs.kind == distance.EDGE_EDGE)[:, None] * slope[:, 1]
     weights = (slope * normal[:, None]).sum(-1)
+    gap = (d - pairs.offset).detach().requires_grad_()
     e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
-    ends, left = rest_of(pairs.kind, corners.detach(), pairs.offset, d.detach())
-    force = e * left * (slope_of((d - pairs.offset).detach()) - slope_of(ends))
+    inside = gap < DHAT
+    (force,) = torch.autograd.grad((200 * inside * e * (gap - DHAT) ** 2 * (gap / DHAT).log()).sum(), gap)
     reach = 0.01 * 0.05
 
     def potential(state: Tensor) -> Tensor:
@@ -170,8 +145,7 @@ def test_damping_opposes_approach_alone() -> None:
 
     gap = distance.distance(pairs.kind, corners.detach()) - pairs.offset
     e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
-    ends, left = rest_of(pairs.kind, corners.detach(), pairs.offset, gap + pairs.offset)
-    size = e * left * (slope_of(gap) - slope_of(ends))
+    size = 200 * e * (2 * (gap - DHAT) * (gap / DHAT).log() + (gap - DHAT) ** 2 / gap) * (gap < DHAT)
     share = size / (size + 20 * DHAT)
     assert (gap > DHAT).any()
     along = change(x)

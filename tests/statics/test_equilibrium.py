@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.reference.distance import EDGE_EDGE, POINT_TRIANGLE, distance, ends_distance, log_barrier, mollifier
+from diffvbd.reference.distance import EDGE_EDGE, POINT_TRIANGLE, distance, log_barrier, mollifier
 from diffvbd.testing.dense_statics import newton, potential, residual, weight
 from diffvbd.testing.soft_scenes import PROBLEMS, Problem, necked, on_floor
 
@@ -66,40 +66,23 @@ def test_two_blocks_pressed_together() -> None:
     faces, count = torch.as_tensor(mesh.surface), low.num_vertices
     sides = [faces[faces[:, 0] < count], faces[faces[:, 0] >= count]]
     edges = [torch.unique(side[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(1).values, dim=0) for side in sides]
-    lists = []  # kind, first and second sides, and what each of these counts
-    for k in (0, 1):  # on closed surfaces triangles and vertices count 1, edges -1
-        corners, other = sides[k].unique()[:, None], sides[1 - k].unique()[:, None].expand(-1, 3)
-        for second, count in ((sides[1 - k], 1.0), (edges[1 - k][:, [0, 1, 1]], -1.0), (other, 1.0)):
-            lists.append((POINT_TRIANGLE, corners, second, count))
-    lists.append((EDGE_EDGE, *(edge[sharp(x, side, edge)] for side, edge in zip(sides, edges, strict=True)), 1.0))
+    lists = [(EDGE_EDGE, edges[0], edges[1])]
+    lists += [(POINT_TRIANGLE, sides[k].unique()[:, None], sides[1 - k]) for k in (0, 1)]
 
     def contact(at: Tensor) -> Tensor:
         total = at.new_zeros(())
-        for kind, first, second, count in lists:
+        for kind, first, second in lists:
             pairs = torch.cat([first.repeat_interleave(len(second), 0), second.repeat(len(first), 1)], 1)
             kinds, threshold = torch.full((len(pairs),), kind), 1e-3 * edge_squares(x, pairs)
-            gap, numbers = distance(kinds, at[pairs]), x.new_tensor([kappa, dhat])
-            b = log_barrier(gap, *numbers)[0]
-            if kind == EDGE_EDGE:
-                ends = ends_distance(kinds, at[pairs])
-                b = torch.where(gap < ends, b - log_barrier(ends, *numbers)[0], 0.0)
-            total = total + count * (mollifier(kinds, at[pairs], threshold) * b).sum()
+            gap = distance(kinds, at[pairs])
+            b = log_barrier(gap, gap.new_tensor(kappa), gap.new_tensor(dhat))[0]
+            total = total + (mollifier(kinds, at[pairs], threshold) * b).sum()
         return total
 
     mu, lam = dv.lame(3e4, 0.3)
     load = weight(model)
     assert float(contact(done.x)) > 0
     assert residual(model, potential(model, load, mu, lam, contact), load, done.x) < 1e-8
-
-
-def sharp(x: Tensor, triangles: Tensor, edges: Tensor) -> Tensor:
-    """Which edges [E] of a box are no diagonals and not inside a face: their two triangles have other normals."""
-    a, b, c = x[triangles].unbind(1)
-    normal, out = torch.linalg.cross(b - a, c - a), []
-    for edge in edges:
-        one, two = normal[((triangles[:, :, None] == edge).any(1).all(-1))]
-        out.append(bool((torch.linalg.cross(one, two).abs() > 1e-9).any()))
-    return torch.tensor(out)
 
 
 def edge_squares(x: Tensor, pairs: Tensor) -> Tensor:
