@@ -91,7 +91,7 @@ def add_an_energy(root: Path) -> None:
     edit(python, "\nVERTEX_ENERGIES:", "\n" + renamed(class_of(python, "Anchor")) + "\nVERTEX_ENERGIES:")
     edit(python, "(FloorBarrier, Anchor)", "(FloorBarrier, Anchor, Tether)")
     edit(reference, "\nENERGIES:", "\n" + renamed(class_of(reference, "Anchor")) + "\nENERGIES:")
-    edit(reference, '"anchor": Anchor}', '"anchor": Anchor, "tether": Tether}')
+    edit(reference, '"anchor": Anchor,', '"anchor": Anchor, "tether": Tether,')
 
 
 def test_blocks_that_an_energy_does_not_have_follow_from_its_gradient() -> None:
