@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.marks import slow
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -18,7 +17,7 @@ import diffvbd as dv
 from diffvbd import reference
 from diffvbd.testing import evaluate, relative_error
 
-pytestmark = needs_csrc
+pytestmark = [needs_csrc, pytest.mark.slow]  # a law is compiled
 F64 = torch.float64
 # stress-free at rest, with every invariant; not quadratic in one vertex
 TEXT = ("mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2 + c*(I2*J**(-4/3) - 3) + m*(trU - 3)**2"
@@ -77,7 +76,7 @@ def compare(model: dv.Model, solver: dv.VBD, inputs: dict[str, Any], bar: float 
         assert float(value.nan_to_num().abs().max()) > 0, name
 
 
-@pytest.mark.parametrize(("sweeps", "jitter"), [(1, 0.005), (1, 0.06), slow(4, 0.06)])
+@pytest.mark.parametrize(("sweeps", "jitter"), [(1, 0.005), (1, 0.06), pytest.param(4, 0.06, marks=pytest.mark.hours)])
 def test_gradients_are_those_of_the_executed_sweeps(sweeps: int, jitter: float) -> None:
     """Against autograd through the reference; the larger jitter turns tets inside out and shortens updates."""
     model = model_of()
@@ -238,7 +237,7 @@ def test_inputs_and_refusals() -> None:
     assert "law(" in repr(model) and bool(dv.diagnose(model, x, solver).smallest_volume_ratio > 0.9)
 
 
-@pytest.mark.slow
+@pytest.mark.hours
 def test_the_built_in_law_as_a_law_of_ones_own() -> None:
     """A law that is quadratic in one vertex: values and gradients of StableNeoHookean, in float32 too; parameters that
     make it concave are refused."""
