@@ -175,7 +175,7 @@ def diagnose(
         loads = {name: given.loads[name] for name in LOADS}
         refuse_non_finite(system, loads)
         unbalanced, residuals, friction = _balance(model, x, previous, solver, given)
-        estimable = not (model.touches or model.renews)
+        estimable = not (model.touches or model._renews)
         if estimable and solver.sweeps and isinstance(solver.integrator, ImplicitEuler):
             prepared = prepare(system, lead, given, time_step=solver.time_step, sweeps=solver.sweeps)
             prepared = damped(system, prepared, previous[0])

@@ -190,8 +190,8 @@ class Model:
         return bool(self.energy_mask & CONTACT)
 
     @property
-    def renews(self) -> bool:
-        """Whether each sweep begins with bounds of energies about its own start: of couplings, of patches."""
+    def _renews(self) -> bool:
+        """Whether each sweep begins with bounds of couplings or patches about its own start."""
         return bool(self.couplings) or self.patches is not None
 
     @property

@@ -120,7 +120,7 @@ def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
-    simple = simple and not model.renews
+    simple = simple and not model._renews
     simple = simple and not model.corrects and model.coarse is None and model.starts_from == "predictor"
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False

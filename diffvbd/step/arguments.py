@@ -263,7 +263,7 @@ def prepare(
         materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
-    if model.renews and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
+    if model._renews and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
         raise NotImplementedError(f"adjoint: expected ReverseSweep or Unrolled with {what_renews(model)}, got "
                                   "GlobalAdjoint")  # fmt: skip
     averaged = None

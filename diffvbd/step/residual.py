@@ -331,7 +331,7 @@ class ErrorEstimate(NamedTuple):
 
 def check_estimable(model: Model, name: str) -> None:
     """Raises where steps of the Model have no estimate; ``name``: of the argument that asks for one."""
-    if model.touches or model.renews:
+    if model.touches or model._renews:
         others = "springs, tendons or pressure" if model.couplings else "patches"
         what = "contact or friction" if model.touches else others
         raise NotImplementedError(f"{name}: the error of a step with {what} is not estimated")

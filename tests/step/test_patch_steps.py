@@ -209,7 +209,7 @@ def test_patches_of_one_tet_change_nothing() -> None:
     one = built(law=dv.StableNeoHookean(patches=torch.arange(built().num_tets)))
     bare, solver, values = built(law=dv.StableNeoHookean()), dv.VBD(STEP, 4), inputs_of(built())
     result, expected = (evaluate(run_of(model, solver), values, STEP) for model in (one, bare))
-    assert bare.patches is None and not bare.renews
+    assert bare.patches is None and not bare._renews
     assert all(relative_error(result[name], value) <= tolerance("coupled_adjoint") for name, value in expected.items())
 
 
