@@ -546,16 +546,3 @@ def load_of(couplings: Sequence[Coupling], values: Sequence[dict[str, Tensor]], 
     """The sum of their loads at x [B, V, 3], [B, V, 4]; values: of each one."""
     parts = [energy.load(x, own) for energy, own in zip(couplings, values, strict=True)]
     return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
-
-
-def joined(couplings: Sequence[Coupling], body: Tensor) -> Tensor:
-    """``body`` [V] with one number for all bodies that couplings join."""
-    pairs = torch.cat([energy.joins()[0] for energy in couplings])
-    own = torch.arange(int(body.max()) + 1, device="cpu")
-    pairs = body.cpu()[pairs]
-    while True:
-        low = own[pairs].amin(1, keepdim=True).expand(-1, 2)
-        after = own.scatter_reduce(0, pairs.reshape(-1), low.reshape(-1), "amin")
-        if torch.equal(after, own):
-            return own.to(body.device)[body]
-        own = after

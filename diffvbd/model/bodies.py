@@ -59,15 +59,14 @@ class _Grouped(NamedTuple):
     groups: Groups
 
 
-def connected(tets: Tensor, count: int) -> Tensor:
-    """The lowest vertex of the connected set of tets that each of ``count`` vertices is in, int64 [count]."""
-    label, corners = torch.arange(count), tets.T.contiguous()
-    while True:  # every vertex takes the lowest label of its tets, and that label's own: paths halve each time
-        a, b, c, d = (label[corner] for corner in corners)
-        low = torch.minimum(torch.minimum(a, b), torch.minimum(c, d))
+def connected(sets: Tensor, count: int) -> Tensor:
+    """Lowest item of the connected sets that each of ``count`` items is in, int64 [count]; sets: int64 [N, n]."""
+    label, members = torch.arange(count), sets.T.contiguous()
+    while True:  # every item takes the lowest label of its sets, and that label's own: paths halve each time
+        low = label[members].amin(0)
         new = label
-        for corner in corners:
-            new = new.scatter_reduce(0, corner, low, "amin")
+        for member in members:
+            new = new.scatter_reduce(0, member, low, "amin")
         new = new[new]
         if torch.equal(new, label):
             return label

@@ -1,6 +1,5 @@
 """Scenes with springs, tendons and pressure: a box with a cavity, pinned or free, and a cube beside it."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -65,14 +64,3 @@ def inputs_of(model: dv.Model, batch: tuple[int, ...] = ()) -> dict[str, Tensor]
     if "anchor_stiffness" in model.inputs:
         values["anchor_stiffness"] = torch.from_numpy(rng.uniform(10, 30, model.num_vertices))
     return {name: value.double().to(model.device) for name, value in values.items()}
-
-
-def run_of(model: dv.Model, solver: dv.VBD, steps: int = 1, **options: Any) -> Callable[..., tuple[Tensor, Tensor]]:
-    """The end of some steps as a function of the inputs."""
-
-    def run(x: Tensor, v: Tensor, **inputs: Any) -> tuple[Tensor, Tensor]:
-        for _ in range(steps):
-            x, v = dv.step(model, x, v, solver, **inputs, **options)
-        return x, v
-
-    return run

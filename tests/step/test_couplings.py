@@ -5,12 +5,13 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.coupled import coupled, inputs_of, run_of
+from helpers.coupled import coupled, inputs_of
+from helpers.executed import assert_executed, assert_like_differences, run_of
 from helpers.marks import slow
 from helpers.spreads import assert_near_contact
 
 import diffvbd as dv
-from diffvbd.testing import contact_scenes, evaluate, generator, relative_error, tolerance
+from diffvbd.testing import contact_scenes, evaluate, relative_error, tolerance
 
 FLOOR = dv.FloorBarrier(height=-0.01, kappa=1e4, dhat=0.03)
 STEP = 0.01
@@ -39,13 +40,7 @@ HOURS = [pytest.param(*run, marks=pytest.mark.hours) for run in EVERY if run not
 def test_gradients_are_those_of_the_executed_sweeps(device: str, case: str, sweeps: int, steps: int) -> None:
     scene, energies, options = CASES[case]
     model, solver = coupled(*energies, **scene), dv.VBD(STEP, sweeps, **options)
-    there = coupled(*energies, **scene, device=device)
-    expected = evaluate(run_of(model, solver, steps, adjoint=dv.Unrolled()), inputs_of(model), STEP)
-    result = evaluate(run_of(there, solver, steps), inputs_of(there), STEP)
-    assert relative_error(result["x"], expected["x"]) <= tolerance("coupled_forward")
-    for name in (key for key in expected if key.startswith("grad_")):
-        assert result[name].any(), name
-        assert relative_error(result[name], expected[name]) <= tolerance("coupled_adjoint"), name
+    assert_executed((model, coupled(*energies, **scene, device=device)), solver, steps, inputs_of)
 
 
 @pytest.mark.parametrize("sweeps", [2, slow(8)])
@@ -68,22 +63,7 @@ def test_scenes_of_a_batch_are_those_alone(device: str, sweeps: int) -> None:
 def test_gradients_are_those_of_differences(case: str, sweeps: int) -> None:
     scene, energies, options = CASES[case]
     model, solver = coupled(*energies, **scene), dv.VBD(STEP, sweeps, **options)
-    run, values = run_of(model, solver), inputs_of(model)
-    found = evaluate(run, values, STEP)
-    rng = generator("loss")
-    weights = [torch.as_tensor(rng.standard_normal(values["x"].shape)) for _ in range(2)]
-
-    def loss(name: str, change: torch.Tensor) -> float:
-        x, v = run(**{**values, name: values[name] + change})
-        return float((weights[0] * x).sum() + STEP * (weights[1] * v).sum())
-
-    for name, value in values.items():
-        along = torch.from_numpy(generator("difference", name).standard_normal(value.shape)) * value.abs().mean()
-        step = 1e-5 if name in ("x", "v", "rest_points", "force") else 1e-4
-        difference = (loss(name, step * along) - loss(name, -step * along)) / (2 * step)
-        derivative = float((found[f"grad_{name}"] * along).sum())
-        size = float((found[f"grad_{name}"].abs() * along.abs()).sum())
-        assert abs(difference - derivative) <= tolerance("finite_difference") * size, name
+    assert_like_differences(run_of(model, solver), inputs_of(model), STEP)
 
 
 def test_attached_bodies_touch(device: str) -> None:

@@ -1,13 +1,13 @@
 """Claim: steps whose tets average volumes over patches, and their gradients, equal autograd through an independent
 execution of the same bounds and sweeps; the gradients are those of differences; and no sweep raises the potential."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers.executed import assert_executed, assert_like_differences, run_of
 from helpers.marks import slow
 from helpers.results import saved_bytes
 from helpers.spreads import assert_near_contact
@@ -81,26 +81,11 @@ def inputs_of(model: dv.Model, batch: tuple[int, ...] = (), *, viscous: bool = F
     return {name: value.double().to(model.device) for name, value in values.items()}
 
 
-def run_of(model: dv.Model, solver: dv.VBD, steps: int = 1, **options: Any) -> Callable[..., tuple[Tensor, Tensor]]:
-    def run(x: Tensor, v: Tensor, **inputs: Any) -> tuple[Tensor, Tensor]:
-        for _ in range(steps):
-            x, v = dv.step(model, x, v, solver, **inputs, **options)
-        return x, v
-
-    return run
-
-
 @pytest.mark.parametrize(("case", "sweeps", "steps"), [*RUNS, *(slow(*run) for run in LONG)])
 def test_gradients_are_those_of_the_executed_sweeps(device: str, case: str, sweeps: int, steps: int) -> None:
     scene, options = CASES[case]
     model, solver = built(**scene), dv.VBD(STEP, sweeps, **options)
-    there = built(**scene, device=device)
-    expected = evaluate(run_of(model, solver, steps, adjoint=dv.Unrolled()), inputs_of(model, **scene), STEP)
-    result = evaluate(run_of(there, solver, steps), inputs_of(there, **scene), STEP)
-    assert relative_error(result["x"], expected["x"]) <= tolerance("coupled_forward")
-    for name in (key for key in expected if key.startswith("grad_")):
-        assert result[name].any(), name
-        assert relative_error(result[name], expected[name]) <= tolerance("coupled_adjoint"), name
+    assert_executed((model, built(**scene, device=device)), solver, steps, lambda of: inputs_of(of, **scene))
 
 
 @pytest.mark.parametrize("sweeps", [2, slow(8)])
@@ -120,22 +105,7 @@ def test_scenes_of_a_batch_are_those_alone(device: str, sweeps: int) -> None:
 def test_gradients_are_those_of_differences(case: str, sweeps: int) -> None:
     scene, options = CASES[case]
     model, solver = built(**scene), dv.VBD(STEP, sweeps, **options)
-    run, values = run_of(model, solver), inputs_of(model, **scene)
-    found = evaluate(run, values, STEP)
-    rng = generator("loss")
-    weights = [torch.as_tensor(rng.standard_normal(values["x"].shape)) for _ in range(2)]
-
-    def loss(name: str, change: Tensor) -> float:
-        x, v = run(**{**values, name: values[name] + change})
-        return float((weights[0] * x).sum() + STEP * (weights[1] * v).sum())
-
-    for name, value in values.items():
-        along = torch.from_numpy(generator("difference", name).standard_normal(value.shape)) * value.abs().mean()
-        step = 1e-5 if name in ("x", "v", "rest_points", "force", "stress_free") else 1e-4
-        difference = (loss(name, step * along) - loss(name, -step * along)) / (2 * step)
-        derivative = float((found[f"grad_{name}"] * along).sum())
-        size = float((found[f"grad_{name}"].abs() * along.abs()).sum())
-        assert abs(difference - derivative) <= tolerance("finite_difference") * size, name
+    assert_like_differences(run_of(model, solver), inputs_of(model, **scene), STEP)
 
 
 def test_bodies_that_touch(device: str) -> None:
