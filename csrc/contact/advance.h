@@ -250,7 +250,7 @@ template <class T>
 DIFFVBD_FN bool stays_far_at_any_fraction(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
   const T* constants = in.constants + kConstants * pair;
-  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (pair_list.h)
+  if (!is_limiting(record) || PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;
   Motion<T> m[4];
   T size = T(0), most = T(0);
   for (int k = 0; k < 4; ++k) {
@@ -297,7 +297,7 @@ template <class T, class Find>
 DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, PairPlane<T>& plane, int64_t pair,
                           int round, const Find& find) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
-  if (round > 0 && !is_retried(in, s, record, round)) return true;
+  if (!is_limiting(record) || (round > 0 && !is_retried(in, s, record, round))) return true;
   if (stays_far(in, s, record, in.constants + kConstants * pair)) return true;
   if (!plane.is_known()) plane = find();
   return plane.holds(record[4], TrialDisplacements<T>(in, s, record));
@@ -311,8 +311,9 @@ DIFFVBD_FN bool test_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   if (round > 0 && !is_retried(in, s, record, round)) return true;
   if (!s.first && round == 0 && !is_open(in, s, record)) return true;
   const T* constants = in.constants + kConstants * pair;
-  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (pair_list.h)
-  if (stays_far(in, s, record, constants)) return true;                                // as do most
+  // the second: left out (pair_list.h)
+  if (!is_limiting(record) || PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;
+  if (stays_far(in, s, record, constants)) return true;  // as do most
   const TrialDisplacements<T> a(in, s, record);
   const bool plane = record[4] == kPointPlane;
   if (plane && PairPlane<T>(in, s, pair).holds(record[4], a)) return true;

@@ -169,6 +169,7 @@ struct Surfaces {
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
   const int32_t *triangles, *edges, *points, *planes, *body;
+  const int32_t* counts;  // of triangles, then of edges: how often a face counts, and whether an edge is sharp
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -202,7 +203,7 @@ template <class T>
 struct Detected {
   int64_t capacity;
   int32_t* pairs;         // [capacity, 6]  corner points, kind, scene
-  T* constants;           // [capacity, 8]  dhat, offset, threshold; what limit.h takes as hints, the pair's gap last
+  T* constants;           // [capacity, 8]  PairConstants; what limit.h takes as hints, the pair's gap last
   int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
   int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
   T* near_values;         // [B, N, 8]  weights, normal, gap
@@ -347,6 +348,11 @@ DIFFVBD_FN Candidate candidate_of_key(const Surfaces<T>& in, uint64_t key) {
                    static_cast<int32_t>(key % m));
 }
 
+template <class T>
+DIFFVBD_FN bool is_of_one_body(const Surfaces<T>& in, const Candidate& c) {
+  return c.kind != kPointPlane && in.body[c.v[0]] == in.body[c.v[c.second()]];
+}
+
 // Whether the rules admit the pair, but for the distance at rest of two sides of one body.
 template <class T>
 DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
@@ -359,6 +365,8 @@ DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
       }
     }
     for (int k = 1; k < 4; ++k) pinned = pinned && in.pinned[c.v[k]];
+    // a body's own faces are its triangles: what a point is part of is missing, and no counts would add up
+    if (is_of_one_body(in, c) && !is_limiting(c.v) && c.kind == kPointTriangle) return false;
   }
   return !pinned && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
 }
@@ -398,7 +406,7 @@ DIFFVBD_APART T height(const Corners<T>& c) {
 
 template <class T>
 struct Constants {
-  T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier [m^4]
+  T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier of edges [m^4]
   bool admitted;              // false for two sides of one body that are one place of the material
 };
 
@@ -409,9 +417,8 @@ DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
 
 template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
-  const int second = c.second();
   Constants<T> out{in.dhat, offset_of(in, c), T(0), true};
-  const bool one_body = c.kind != kPointPlane && in.body[c.v[0]] == in.body[c.v[second]];
+  const bool one_body = is_of_one_body(in, c);
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
   const auto squared_length = [&](int i, int j) {
@@ -427,6 +434,15 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   out.admitted = at_rest > T(kSamePlace) * square_root(longest);
   if (at_rest < in.dhat) out.dhat = T(kRestFraction) * at_rest;
   return out;
+}
+
+// The measure of a pair (PairConstants). Two edges of different bodies have a barrier where both are sharp: along
+// others the surfaces are as good as flat, and their vertices have it.
+template <class T>
+DIFFVBD_FN T measure_of(const Surfaces<T>& in, const Candidate& c, T threshold) {
+  if (c.kind != kEdgeEdge) return T(c.kind == kPointTriangle ? in.counts[c.b] : 1);
+  const int32_t* sharp = in.counts + in.num_triangles;
+  return is_of_one_body(in, c) || (sharp[c.a] && sharp[c.b]) ? threshold : T(0);
 }
 
 // The gap of a pair, where its collider begins, and its smallest. A plane counts where it ends, or where it begins if
@@ -497,7 +513,7 @@ DIFFVBD_FN void store_listed_pair(const Surfaces<T>& in, uint64_t key, int32_t* 
   for (int k = 0; k < 4; ++k) pair[k] = c.v[k];
   pair[4] = c.kind, pair[5] = static_cast<int32_t>(c.scene);
   const Constants<T> a = constants_of(in, c);
-  constants[0] = a.dhat, constants[1] = a.offset, constants[2] = a.threshold;
+  constants[0] = a.dhat, constants[1] = a.offset, constants[2] = measure_of(in, c, a.threshold);
 }
 
 // The hints of a listed pair: of its corners' nearest gaps the smallest, with its direction from the second side of

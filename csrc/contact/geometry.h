@@ -1,15 +1,18 @@
-// Distance of a pair of primitives, its gradient, and the mollifier of almost parallel edges (Li et al. 2020). A pair
+// Distance of a pair of primitives, its gradient, and the weight of its barrier (docs/method.md, section 12). A pair
 // has four corners; by the envelope theorem the gradient of the distance toward corner k is w_k n, with the weights w
 // of the closest points (they sum to 0) and the unit vector n between them, whatever features are closest. Scalars may
 // be Dual: the features are chosen by values, so that a derivative is that of the executed branch. Or packs of lanes,
 // of pairs of one kind: what one pair needs is worked out for all, and chosen.
 #pragma once
 
+#include <cstdint>
+
 #include "../core/dual.h"
 
 namespace diffvbd::contact {
 
-// The kind of the corners: point and triangle, edge and edge, or point and the unbounded plane of a triangle.
+// The kind of the corners: point and face, edge and edge, or point and the unbounded plane of a triangle. The faces of
+// a surface are its triangles, its edges as (a, b, b), and its vertices as (a, a, a).
 enum Kind { kPointTriangle = 0, kEdgeEdge = 1, kPointPlane = 2 };
 
 // Corner positions [m], relative to a point of the pair.
@@ -241,35 +244,105 @@ DIFFVBD_FN Distance<Dual<R>> distance_by(int kind, int feature, const Corners<Du
   }
 }
 
-// e(s) = s (2 - s) of s = |u x v|^2 / threshold below 1, else 1, with u and v along the edges: it takes the kink out of
-// the distance of edges that become parallel. Gradients toward the corners.
+// Constants of a listed pair. measure: of a point and a face, how often that counts: 1 less the counts of the faces
+// that contain it, so that a point that is close to several faces of a surface has one barrier in all (Li et al. 2023).
+// Of two edges, 0 if they have no barrier; else 1e-3 |u|^2 |v|^2 at rest, for edges u and v [m^4].
+template <class T>
+struct PairConstants {
+  T dhat, offset, measure;  // the first two [m]: reach of the barrier, and the radii that the gap is less than d
+  DIFFVBD_FN explicit PairConstants(const T* a) : dhat(a[0]), offset(a[1]), measure(a[2]) {}
+  DIFFVBD_FN PairConstants(const T& dhat, const T& offset, const T& measure)
+      : dhat(dhat), offset(offset), measure(measure) {}
+};
+
+// The weight of a pair's barrier, and its gradients toward the corners: `varies` where they are not zero.
 template <class R>
-struct Mollifier {
+struct Weight {
   R e;
   Vec3<R> gradient[4];
 };
 
-// s of two edges; the threshold is 1e-3 |u|^2 |v|^2 at rest
+// Up to this length, in dhat, from an end of an edge the weight of two edges fades: there the end has a barrier.
+constexpr double kRamp = 0.5;
+
+// 3 q^2 - 2 q^3 of q = along / length between 0 and 1, and its derivative.
 template <class R>
-DIFFVBD_FN R squared_cross(const Corners<R>& c) {
-  const Vec3<R> n = cross(c.x[1] - c.x[0], c.x[3] - c.x[2]);
-  return dot(n, n);
+DIFFVBD_FN void ramp(const R& along, const R& length, R& value, R& slope) {
+  const R q = clamped(along / length);
+  value = q * q * (R(3) - R(2) * q);
+  slope = R(6) * q * (R(1) - q) / length;
 }
 
+// Of two edges that are closest inside both, m(s') f(s |u|) f((1 - s) |u|) f(t |v|) f((1 - t) |v|), else 0. m(s') =
+// s' (2 - s') of s' = |u x v|^2 / measure below 1, else 1, takes out the kink of edges that become parallel (Li et al.
+// 2020); f fades toward the ends, beyond which the edges do not go on.
 template <class R, class T>
-DIFFVBD_FN Mollifier<R> mollifier(const Corners<R>& c, const T& threshold) {
+DIFFVBD_FN Weight<R> weight_of_edges(const Corners<R>& c, const PairConstants<T>& a) {
+  const InEdges<R> in(c);
+  const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], n = in.normal;
+  const R uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), reach = R(T(kRamp) * a.dhat);
+  const R w[4] = {R(1) - in.s, in.s, in.t - R(1), -in.t};
+  const Vec3<R> gap = weighted(w, c);
+  // the mollifier, and its derivative by |u x v|^2 times 2
+  const R inverse = R(1) / R(a.measure), part = inverse * in.size2;
+  const auto parallel = part < R(1);
+  const R m = select(parallel, part * (R(2) - part), R(1));
+  const R m_rate = select(parallel, R(2) * inverse * (R(2) - R(2) * part), R(0));
+  // the ramps from both ends of an edge, and their derivatives by the place and the length of the edge
+  const R lengths[2] = {square_root(uu), square_root(vv)}, places[2] = {in.s, in.t};
+  R f[2], by_place[2], by_length[2];
+  for (int i = 0; i < 2; ++i) {
+    R from, to, from_slope, to_slope;
+    ramp(places[i] * lengths[i], reach, from, from_slope);
+    ramp((R(1) - places[i]) * lengths[i], reach, to, to_slope);
+    f[i] = from * to;
+    by_place[i] = lengths[i] * (from_slope * to - from * to_slope);
+    by_length[i] = (places[i] * from_slope * to + (R(1) - places[i]) * from * to_slope) / lengths[i];
+  }
+  const R by_s = m * f[1] * by_place[0], by_t = m * f[0] * by_place[1], turned = f[0] * f[1] * m_rate;
+  // s and t solve  u . gap = v . gap = 0
+  const R size = R(1) / in.size2, on_u = size * (vv * by_s + uv * by_t), on_v = -size * (uv * by_s + uu * by_t);
+  const Vec3<R> by_u = (m * f[1] * by_length[0]) * u + turned * cross(v, n) - on_u * gap;
+  const Vec3<R> by_v = (m * f[0] * by_length[1]) * v + turned * cross(n, u) - on_v * gap;
+  const Vec3<R> by_gap = on_u * u + on_v * v;
+  const auto inside = in.holds();
+  Weight<R> out{select(inside, m * f[0] * f[1], R(0)), {-by_u, by_u, -by_v, by_v}};
+  for (int k = 0; k < 4; ++k) out.gradient[k] = select(inside, out.gradient[k] - w[k] * by_gap, zero3<R>());
+  return out;
+}
+
+// Whether the weight of an active pair may differ from a constant.
+template <class R, class T>
+DIFFVBD_FN auto varies(int kind, const Corners<R>& c, const Distance<R>& at, const PairConstants<T>& a) {
   const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], n = cross(u, v);
-  const R inverse = R(1) / R(threshold), s = inverse * dot(n, n);
-  const R rate = R(2) * inverse * (R(2) - R(2) * s);  // e' times the 2 of the derivative of |n|^2
-  const Vec3<R> by_u = rate * cross(v, n), by_v = rate * cross(n, u);
-  return {s * (R(2) - s), {-by_u, by_u, -by_v, by_v}};
+  // the shorter parts of both edges
+  const auto near_end = [&](const R& w, const Vec3<R>& edge) {
+    const R from = absolute(w), least = select(from < R(0.5), from, R(1) - from);
+    return least * least * dot(edge, edge) < R(T(kRamp * kRamp) * a.dhat * a.dhat);
+  };
+  const auto some = either(dot(n, n) < R(a.measure), either(near_end(at.w[1], u), near_end(at.w[3], v)));
+  return kind == kEdgeEdge ? some : R(0) < R(0);
 }
 
-// Whether a pair of edges is close enough to parallel for its mollifier to differ from 1. threshold 0: no mollifier.
-template <class R, class T>
-DIFFVBD_FN auto is_mollified(int kind, const Corners<R>& c, const T& threshold) {
-  const auto close = squared_cross(c) < R(threshold);
-  return kind == kEdgeEdge ? close : R(0) < R(0);
+// The weight of a pair, without its gradients where it does not vary.
+template <class R, class T, class M>
+DIFFVBD_FN Weight<R> weight_of(int kind, const Corners<R>& c, const PairConstants<T>& a, const M& varied) {
+  Weight<R> out{kind == kEdgeEdge ? R(1) : R(a.measure), {zero3<R>(), zero3<R>(), zero3<R>(), zero3<R>()}};
+  if (!any(varied)) return out;
+  const Weight<R> own = weight_of_edges(c, a);
+  out.e = select(varied, own.e, out.e);
+  for (int k = 0; k < 4; ++k) out.gradient[k] = select(varied, own.gradient[k], out.gradient[k]);
+  return out;
 }
+
+// Whether a pair has a barrier.
+template <class R, class T>
+DIFFVBD_FN auto is_weighted(int kind, const PairConstants<T>& a) {
+  return kind == kEdgeEdge ? R(0) < R(a.measure) : R(0) < R(1);
+}
+// A record of a pair: four corner points, kind, scene. Whether corner k is one before it, of a face that is an edge or
+// a vertex; and whether the pair limits motions: such a face does not, as its triangles do.
+DIFFVBD_FN bool is_repeated(const int32_t* record, int k) { return k >= 2 && record[k] == record[k - 1]; }
+DIFFVBD_FN bool is_limiting(const int32_t* record) { return !is_repeated(record, 3); }
 
 }  // namespace diffvbd::contact

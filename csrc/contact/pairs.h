@@ -1,22 +1,13 @@
 // The barrier of a pair in the block of one of its corners, and the exact adjoint (docs/method.md, section 12): the
-// gradient of e b(gap), and of its Hessian e b'' grad_gap grad_gap^T. `together`: the number of corners that move at
-// once, this one included; the block takes so many times the stiffness along the normal, so that together they do not
-// overshoot.
+// gradient of e b(gap), and of its Hessian e b'' grad_gap grad_gap^T and, where e < 0, a bound of e b' Hess gap, which
+// is positive there. `together`: the number of corners that move at once, this one included; the block takes so many
+// times the stiffness, so that together they do not overshoot.
 #pragma once
 
 #include "../energies/log_barrier.h"
 #include "geometry.h"
 
 namespace diffvbd::contact {
-
-// Constants of a listed pair.
-template <class T>
-struct PairConstants {
-  T dhat, offset, threshold;  // [m], radii that the gap is less than the distance [m], of the mollifier [m^4]
-  DIFFVBD_FN explicit PairConstants(const T* a) : dhat(a[0]), offset(a[1]), threshold(a[2]) {}
-  DIFFVBD_FN PairConstants(const T& dhat, const T& offset, const T& threshold)
-      : dhat(dhat), offset(offset), threshold(threshold) {}
-};
 
 // The item of corner i; in a pack of lanes each has an i of its own.
 template <class A>
@@ -25,25 +16,28 @@ DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
 }
 DIFFVBD_FN bool is_corner(int i, int k) { return i == k; }
 
+// Hess d <= w w^T (I - n n^T) / d bounds the curvature across n where a pair counts negative.
+template <class R>
+DIFFVBD_FN R curvature_across(const R& e, const R& first, const R& d) {
+  return select(e < R(0), e * first / d, R(0));
+}
+
 // Adds the barrier's part of the block of corner i of a pair whose distance is `at`; returns whether it is active.
 template <class R, class Index>
 DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at, const Index& i, const R& together,
                             const PairConstants<R>& a, const R& kappa, const R& h2, Vec3<R>& g, Sym3<R>& H) {
   const R gap = at.d - a.offset;
-  const auto active = gap < a.dhat;
+  const auto active = both(gap < a.dhat, is_weighted<R>(kind, a));
   if (!any(active)) return active;
   const LogBarrier<R> b(gap, a.dhat, h2 * kappa);
-  R e = R(1);
-  Vec3<R> own = zero3<R>();
-  const auto mollified = is_mollified(kind, c, a.threshold);
-  if (any(mollified)) {
-    const Mollifier<R> m = mollifier(c, a.threshold);
-    e = select(mollified, m.e, e);
-    own = select(mollified, b.value * of_corner(m.gradient, i), own);
-  }
-  const R w = of_corner(at.w, i);
-  g += own + (e * b.first * w) * at.n;
-  add_outer(H, together * e * b.second * w * w, at.n);
+  const auto varied = both(active, varies(kind, c, at, a));
+  const Weight<R> e = weight_of(kind, c, a, varied);
+  const R w = of_corner(at.w, i), across = curvature_across(e.e, b.first, at.d);
+  const R own = select(active, e.e, R(0));
+  g += (own * b.first * w) * at.n;
+  if (any(varied)) g += b.value * of_corner(e.gradient, i);
+  add_diagonal(H, together * across * w * w);
+  add_outer(H, together * (own * b.second - across) * w * w, at.n);
   return active;
 }
 
@@ -55,7 +49,7 @@ struct PairAdjoint {
   T kappa;
 };
 
-// The Hessians of gap and mollifier are needed only times vectors that sit at corner i: one Dual evaluation each.
+// The Hessians of gap and weight are needed only times vectors that sit at corner i: one Dual evaluation each.
 template <class T, class Index>
 DIFFVBD_FN Corners<Dual<T>> moved_along(const Corners<T>& c, const Index& i, const Vec3<T>& z) {
   Corners<Dual<T>> out;
@@ -79,34 +73,34 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   int feature = kInside;
   const Distance<R> at = distance(kind, c, &feature);
   const R gap = at.d - a.offset;
-  const auto active = gap < a.dhat;
+  const auto active = both(gap < a.dhat, is_weighted<R>(kind, a));
   if (!any(active)) return active;
   const LogBarrier<R> b(gap, a.dhat, h2);  // kappa scales everything: it comes last
-  const R w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw);
-  R e = R(1), phi = R(0), by_gap = R(0);
-  const auto mollified = is_mollified(kind, c, a.threshold);
-  Mollifier<R> m{};
-  if (any(mollified)) {
-    m = mollifier(c, a.threshold);
-    e = select(mollified, m.e, e);
-    const R toward = dot(of_corner(m.gradient, i), p);
-    phi = select(mollified, b.value * toward, phi);
-    by_gap = select(mollified, b.first * toward, by_gap);
-  }
+  const auto varied = both(active, varies(kind, c, at, a));
+  const Weight<R> weight = weight_of(kind, c, a, varied);
+  const R e = weight.e, w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw), pd = dot(p, d_raw);
   const R by_e = b.first * s + b.second * s * t;
-  phi = phi + e * by_e;
-  by_gap = by_gap + e * (b.second * s + b.third * s * t);
-  const Vec3<R> z = (e * (b.first + b.second * t)) * p + (e * b.second * s) * d_raw;
+  const R across = curvature_across(e, b.first, at.d), stiff = w * w * pd - s * t;
+  R phi = e * by_e + across * stiff;
+  R by_gap = e * (b.second * s + b.third * s * t) + (curvature_across(e, b.second, at.d) - across / at.d) * stiff;
+  // the Hessian of d times n at corner i is the gradient of w_i
+  const Vec3<R> z = (e * (b.first + b.second * t) - across * t) * p + ((e * b.second - across) * s) * d_raw +
+                    (R(2) * across * w * pd) * at.n;
+  if (any(varied)) {
+    const R toward = dot(of_corner(weight.gradient, i), p);
+    phi = phi + b.value * toward;
+    by_gap = by_gap + b.first * toward;
+  }
   const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, z));
   for (int k = 0; k < 4; ++k) {
     const Vec3<Dual<R>> row = turned.w[k] * turned.n;
     out.x[k] = (-kappa) * ((by_gap * at.w[k]) * at.n + derivative(row));
   }
-  if (any(mollified)) {
-    const Mollifier<Dual<R>> curved = mollifier(moved_along(c, i, b.value * p), a.threshold);
+  if (any(varied)) {
+    const Weight<Dual<R>> curved = weight_of_edges(moved_along(c, i, b.value * p), a);
     for (int k = 0; k < 4; ++k) {
-      const Vec3<R> own = kappa * (by_e * m.gradient[k] + derivative(curved.gradient[k]));
-      out.x[k] -= select(mollified, own, zero3<R>());
+      const Vec3<R> own = kappa * (by_e * weight.gradient[k] + derivative(curved.gradient[k]));
+      out.x[k] -= select(varied, own, zero3<R>());
     }
   }
   out.kappa = -phi;

@@ -130,10 +130,12 @@ struct Source {
     for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
     return out;
   }
-  // How many corners of a pair move at once with vertex v, which is one of them.
+  // How many corners of a pair move at once with vertex v, which is one of them; those that repeat count once.
   DIFFVBD_FN T together(const int32_t* pair, int v) const {
     int count = 0;
-    for (int k = 0; k < 4; ++k) count += pair[k] < in.num_vertices && positions.together(pair[k], v);
+    for (int k = 0; k < 4; ++k) {
+      count += pair[k] < in.num_vertices && !is_repeated(pair, k) && positions.together(pair[k], v);
+    }
     return T(count);
   }
   // The displacement of a corner point since gaps were taken, at the start of the substep.
@@ -144,7 +146,8 @@ struct Source {
     return contact::is_above(pair[4], [&](int k) { return moved(pair[k]); }, constants, length);
   }
   DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
-    return is_above(pair, constants, PairConstants<T>(constants).dhat);
+    const PairConstants<T> a(constants);
+    return !is_weighted<T>(pair[4], a) || is_above(pair, constants, a.dhat);
   }
   DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
     Vec3<T> m = zero3<T>();
@@ -244,8 +247,9 @@ struct TrustRegion {
 template <class T, class Positions>
 DIFFVBD_FN bool may_limit(const Source<T, Positions>& s, int64_t entry, T length, T guard, int exponent) {
   const int64_t pair = entry >> 2;
-  return !s.is_above(s.in.listed.pairs + kPairRow * pair, s.in.constants + kConstants * pair,
-                     limit_of<T>(exponent) * length / T(kBothGapFraction) + guard);
+  const int32_t* record = s.in.listed.pairs + kPairRow * pair;
+  return is_limiting(record) && !s.is_above(record, s.in.constants + kConstants * pair,
+                                            limit_of<T>(exponent) * length / T(kBothGapFraction) + guard);
 }
 
 // The exponent of the limit by one of the vertex's pairs, not below `exponent`, by the length of d and the guard of v.
@@ -257,6 +261,7 @@ DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec
   const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
   const T* constants = in.constants + int64_t{kConstants} * pair;
   const int sides_first = sides(record[4]);
+  if (!is_limiting(record)) return exponent;
   bool both = false, alone = true;
   for (int k = 0; k < 4; ++k) {
     if (k == own || record[k] >= in.num_vertices || !s.positions.goes(record[k])) continue;

@@ -26,6 +26,7 @@ DIFFVBD_FN float select(bool condition, float a, float b) { return condition ? a
 DIFFVBD_FN bool any(bool condition) { return condition; }
 DIFFVBD_FN bool all(bool condition) { return condition; }
 DIFFVBD_FN bool both(bool a, bool b) { return a && b; }
+DIFFVBD_FN bool either(bool a, bool b) { return a || b; }
 DIFFVBD_FN double square_root(double a) { return std::sqrt(a); }
 DIFFVBD_FN float square_root(float a) { return std::sqrt(a); }
 DIFFVBD_FN double natural_log(double a) { return std::log(a); }

@@ -134,6 +134,7 @@ int ContactScene<T>::limit_by_near(const Source<T, Before>& source, int32_t v, c
   const auto all = near_.of(v);
   for (int64_t e = all.first; e < all.first + all.count; ++e) {
     const PairSite& site = near_.site(e);
+    if (!is_limiting(in_.listed.pairs + kPairRow * int64_t{near_.entry(e) >> 2})) continue;
     const bool first = site.is_first(site.own);
     bool both = false;
     for (int k = 0; k < 4; ++k) {

@@ -106,6 +106,10 @@ template <class I>
 DIFFVBD_FN Mask<I> both(const Mask<I>& a, const Mask<I>& b) {
   return {a.v & b.v};
 }
+template <class I>
+DIFFVBD_FN Mask<I> either(const Mask<I>& a, const Mask<I>& b) {
+  return {a.v | b.v};
+}
 template <class T>
 DIFFVBD_FN Lanes<T> square_root(const Lanes<T>& a) {
   Lanes<T> r;

@@ -57,7 +57,8 @@ class PairRows {
     out.kind = static_cast<uint8_t>(record[4]), out.own = static_cast<uint8_t>(entry & 3);
     out.together = 1;
     for (int k = 0; k < 4 && out.at[out.own] >= 0; ++k) {
-      out.together += k != out.own && record[k] < in_.num_vertices && are_together(record[k], record[out.own]);
+      out.together += record[k] != record[out.own] && record[k] < in_.num_vertices &&
+                      !contact::is_repeated(record, k) && are_together(record[k], record[out.own]);
     }
     return out;
   }

@@ -84,7 +84,7 @@ struct CoarseInputs {
 
 // --- gradient and matrix
 
-// A pair's gradient by the motion of its weighted corners, its derivative, and a mollifier's part at the corners.
+// A pair's gradient by the motion of its weighted corners, its derivative, and its weight's part at the corners.
 struct CornerForce {
   Vector force;
   Sym3<double> stiffness;

@@ -144,8 +144,8 @@ DIFFVBD_FN Vector moved_by(const double* motion, const Vector& r) {
   return cross(vector_at(motion), r) + vector_at(motion + 3);
 }
 
-// A pair's gradient and its derivative by the motion of the first side relative to the second, and the mollifier's part
-// at corners. Moments are about the origin of x.
+// A pair's gradient and its derivative by the motion of the first side relative to the second, and the part of its
+// weight at corners. Moments are about the origin of x.
 struct PairForce {
   int32_t body[2];  // moving body on either side, or -1; a pair within one body has it on the first
   Vector force;
@@ -269,22 +269,20 @@ DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& 
   const PairConstants<T> a(constants);
   const Distance<double> near = distance(record[4], c);
   const double gap = near.d - a.offset, h = in.scene.time_step;
-  if (!(gap < dhat)) return false;
+  if (!(gap < dhat) || !is_weighted<double>(record[4], a)) return false;
   const LogBarrier<double> b(gap, dhat, h * h * in.kappa.data[scene * in.kappa.scene]);
-  double e = 1;
-  Mollifier<double> m{};
-  const bool mollified = is_mollified(record[4], c, a.threshold);
-  if (mollified) m = mollifier(c, a.threshold), e = m.e;
-  out.value = e * b.value;
-  out.force = (e * b.first) * near.n;
+  const bool varied = varies(record[4], c, near, a);
+  const Weight<double> weight = weight_of(record[4], c, a, varied);
+  out.value = weight.e * b.value;
+  out.force = (weight.e * b.first) * near.n;
   out.stiffness = Sym3<double>{};
-  add_outer(out.stiffness, e * b.second, near.n);
+  add_outer(out.stiffness, weight.e * b.second, near.n);
   each_corner(first, [&](int side, int k) {
     if (out.body[side] < 0) return;
     out.weight[side] += near.w[k];
     out.at[side] += near.w[k] * relative[k];
-    if (!mollified) return;
-    const Vector pull = b.value * m.gradient[k];
+    if (!varied) return;
+    const Vector pull = b.value * weight.gradient[k];
     out.pull[side] += pull;
     out.torque[side] += cross(relative[k], pull);
   });

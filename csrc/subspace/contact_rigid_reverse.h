@@ -94,7 +94,7 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   return out;
 }
 
-// Gradient and matrix of a listed pair by the motion of its weighted corners, and the part of a mollifier at corners.
+// Gradient and matrix of a listed pair by the motion of its weighted corners, and the part of its weight at corners.
 template <class R>
 struct ForceTerms {
   Vec3<R> force, n, at_corner[4];
@@ -144,13 +144,9 @@ DIFFVBD_FN ForceTerms<R> barrier_terms(int kind, const Corners<R>& c, const Pair
   const Distance<R> near = distance(kind, c);
   const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
   ForceTerms<R> out{};
-  R e(1);
-  if (is_mollified(kind, c, a.threshold)) {
-    const Mollifier<R> m = mollifier(c, a.threshold);
-    e = m.e;
-    for (int k = 0; k < 4; ++k) out.at_corner[k] = b.value * m.gradient[k];
-  }
-  out.force = (e * b.first) * near.n, out.n = near.n, out.along = e * b.second;
+  const Weight<R> weight = weight_of(kind, c, a, varies(kind, c, near, a));
+  for (int k = 0; k < 4; ++k) out.at_corner[k] = b.value * weight.gradient[k];
+  out.force = (weight.e * b.first) * near.n, out.n = near.n, out.along = weight.e * b.second;
   for (int k = 0; k < 4; ++k) out.w[k] = near.w[k];
   return out;
 }

@@ -22,8 +22,8 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
             [B, bodies + 1] [m]; None: zero.
 
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
-        pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
-        the mollifier, hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
+        pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, measure,
+        hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
         near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [4] int64
         (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
     """
@@ -33,8 +33,8 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
     )
     return ops_contact.contact_detect(
         x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.pinned, trust_radius,
-        deformation_radius, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
-        not torch.compiler.is_compiling(),
+        deformation_radius, s.face_counts, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat,
+        capacity, not torch.compiler.is_compiling(),
     )  # fmt: skip
 
 
@@ -50,6 +50,7 @@ def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: Contact
     s = surface
     with torch.no_grad():
         return ops_contact.contact_intersections(
-            x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius, s.triangles, s.edges,
-            s.points, s.planes, s.body, s.pinned, s.bodies, self_contact, between_bodies, capacity,
+            x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius,
+            s.triangles[: s.num_triangles], s.edges, s.points, s.planes, s.body, s.pinned, s.bodies, self_contact,
+            between_bodies, capacity,
         )  # fmt: skip

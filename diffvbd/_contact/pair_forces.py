@@ -17,7 +17,7 @@ from .._contact.barrier import PairBarrier
 from .._contact.detection import detect
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
 from ..energies import damped_fraction
-from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
+from ..reference.distance import EDGE_EDGE, distance, log_barrier, weight, with_gradient
 from ..reference.energies import smoothed
 
 ADVANCES = 8  # of continuous detection after the first; fewer are on the safe side
@@ -31,17 +31,17 @@ class NearPairs(NamedTuple):
     scene: Tensor  # [Q] int64
     dhat: Tensor  # [Q] [m]
     offset: Tensor  # [Q] sum of the radii [m]
-    threshold: Tensor  # [Q] of the mollifier [m^4]
+    measure: Tensor  # [Q] that weighs the pair (reference.distance.weight)
 
     def positions(self, points: Tensor) -> Tensor:
         """Corners [Q, 4, 3] in corner points [B, N, 3]."""
         return points[self.scene[:, None], self.corners]
 
     def measures(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gap [Q] and mollifier [Q], each followed by its gradient [Q, 4, 3] toward the corners."""
+        """Gap [Q] and weight [Q], each followed by its gradient [Q, 4, 3] toward the corners."""
         at = self.positions(points)
         d, slope = with_gradient(partial(distance, self.kind), at)
-        e, turn = with_gradient(partial(mollifier, self.kind, threshold=self.threshold), at)
+        e, turn = with_gradient(partial(weight, self.kind, dhat=self.dhat, measure=self.measure), at)
         return d - self.offset, slope, e, turn
 
     def of_scene(self, value: Tensor) -> Tensor:
@@ -117,7 +117,9 @@ def _raise_touching(surface: ContactSurface, touching: int, key: int) -> None:
 def pair_energy(pairs: NearPairs, corners: Tensor, kappa: Tensor) -> Tensor:
     """Energy of the barrier of each pair [J], [Q]; corners: [Q, 4, 3].  kappa: [1 | B] [N/m]."""
     gap = distance(pairs.kind, corners) - pairs.offset
-    return mollifier(pairs.kind, corners, pairs.threshold) * log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)[0]
+    return (
+        weight(pairs.kind, corners, pairs.dhat, pairs.measure) * log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)[0]
+    )
 
 
 def safe_fraction(pairs: NearPairs, points: Tensor, move: Tensor, closed: float) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .._contact.barrier import PairBarrier
@@ -22,6 +23,8 @@ MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_PINNED = 0.2, 0.3, 0.75
 # Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
 COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
+# Degrees by which a surface turns at rest along a sharp edge. Below, it lies within 3 % of an edge from its vertices.
+SHARP = 15.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +33,12 @@ class ContactSurface:
 
     rest: Tensor  # [N, 3] [m]
     radius: Tensor  # [N] [m]
-    triangles: Tensor  # [F, 3] int32, of corner points
+    triangles: (
+        Tensor  # [F, 3] int32, of corner points: triangles, then edges (a, b, b) and vertices (a, a, a) that count
+    )
+    num_triangles: int  # of those
     edges: Tensor  # [E, 2] int32
+    face_counts: Tensor  # [F + E] int32: how often each face counts, and which edges are sharp (faces_of, sharp_edges)
     points: Tensor  # [P] int32
     planes: Tensor  # [L, 3] int32
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
@@ -120,13 +127,18 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
         return torch.from_numpy(joined.astype(np.int32))
 
+    triangles, edges = index_tensor(triangles, 3), index_tensor(edges, 2)
+    faces, counts = faces_of(triangles.numpy(), edges.numpy())
+    sharp = sharp_edges(np.concatenate(rest), triangles.numpy(), edges.numpy())
     pinned = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
         radius=torch.from_numpy(np.concatenate(radius)),
-        triangles=index_tensor(triangles, 3),
-        edges=index_tensor(edges, 2),
+        triangles=torch.from_numpy(faces),
+        num_triangles=len(triangles),
+        edges=edges,
+        face_counts=torch.from_numpy(np.concatenate([counts, sharp]).astype(np.int32)),
         points=index_tensor(points, 1).reshape(-1),
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
@@ -145,6 +157,47 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         min_deformation_radius=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
+
+
+def _edges_of(triangles: NDArray[Any], edges: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """All edges once, lower vertex first; the row there of each of ``edges`` [E]; and of the sides of triangles [3F]:
+    those between corners 0 and 1 of all, then 1 and 2, then 2 and 0."""
+    sides = np.concatenate([edges, triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    rows, inverse = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    inverse = inverse.reshape(-1)
+    return rows, inverse[: len(edges)], inverse[len(edges) :]
+
+
+def faces_of(triangles: NDArray[Any], edges: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The faces of surfaces [F, 3], (a, b, b) of edges and (a, a, a) of vertices, and how often each counts [F].
+
+    A face counts 1 less what the faces that contain it count: inclusion and exclusion. Then a point has the barrier of
+    its distance to the surface once, however many faces are as close. Faces that count 0 are left out.
+
+    Source: Li et al. (2023), Convergent incremental potential contact.
+    """
+    rows, _, of_triangles = _edges_of(triangles, edges)
+    of_edges = 1 - np.bincount(of_triangles, minlength=len(rows))
+    vertices = np.unique(rows)
+    of_vertices = np.ones(vertices.max(initial=-1) + 1, np.int64)
+    np.subtract.at(of_vertices, triangles, 1)
+    np.subtract.at(of_vertices, rows, of_edges[:, None])
+    faces = np.concatenate([triangles, rows[:, [0, 1, 1]], np.repeat(vertices[:, None], 3, 1)])
+    counts = np.concatenate([np.ones(len(triangles), np.int64), of_edges, of_vertices[vertices]])
+    return faces[counts != 0].astype(np.int32), counts[counts != 0].astype(np.int32)
+
+
+def sharp_edges(points: NDArray[np.float64], triangles: NDArray[Any], edges: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether a surface turns by more than SHARP at each edge [E]; all other edges than of two triangles are sharp."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    rows, own, of_triangles = _edges_of(triangles, edges)
+    total = np.zeros((len(rows), 3))
+    np.add.at(total, of_triangles, np.concatenate([normal] * 3))
+    flat = np.bincount(of_triangles, minlength=len(rows)) == 2
+    flat &= np.linalg.norm(total, axis=1) > 2 * np.cos(np.radians(SHARP) / 2)  # |n + m| of unit normals n and m
+    return ~flat[own]
 
 
 def units(body: Tensor, pinned_bodies: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ class Detection(NamedTuple):
     """Pairs of primitives that are closer than the barrier's reach, or may come that close."""
 
     pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
-    constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]; hints
+    constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], measure (csrc/contact); hints
     ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
     near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
@@ -38,8 +38,9 @@ class Detection(NamedTuple):
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor,
-                   trust_radius: Tensor, deformation_radius: Tensor, mesh_bodies: int, self_contact: bool,
-                   between_bodies: bool, dhat: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
+                   trust_radius: Tensor, deformation_radius: Tensor, face_counts: Tensor, mesh_bodies: int,
+                   self_contact: bool, between_bodies: bool, dhat: float, capacity: int,
+                   trim: bool = False) -> Detection:  # fmt: skip
     """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
 
     ``trust_radius`` bounds the displacement of a vertex relative to its island. ``deformation_radius`` bounds it
@@ -57,10 +58,13 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are taken at the
             latter, or now where a plane would pass the point. What is near a plane now is listed, too.
         rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
-        triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
+        triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique. Edges and vertices of surfaces
+            may be faces, too, with points of other bodies: (a, b, b) and (a, a, a).
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, pinned: [N]; labels from ``mesh_bodies`` on are colliders; pinned: bool, no sweep moves the point.
         trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
+        face_counts: [F + E] how often the barrier of each of ``triangles`` counts; whether each edge is sharp (1 or 0):
+            two edges of different bodies have a barrier if both are. Other edges keep from crossing.
         self_contact, between_bodies: Pairs of mesh bodies to consider.
         dhat: [m].
         capacity: Rows of the list.
@@ -70,7 +74,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     return Detection(
         *raw.contact_detect(
             x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, pinned,
-            trust_radius, deformation_radius, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
+            trust_radius, deformation_radius, face_counts, mesh_bodies, self_contact, between_bodies, dhat, capacity,
+            trim,
         )
     )  # fmt: skip
 

@@ -3,7 +3,7 @@ corrections.
 
 Pairs, islands and decisions of a step are data (`Substep`). The rest is computed here from positions and differentiated
 by autograd.
-Source: Li et al. 2020 (barrier, mollifier, friction).
+Source: Li et al. 2020 (barrier, mollifier, friction), 2023 (counts of faces).
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .coarse import Coarse
 from .couplings import Bounds, energies_of_sweeps
-from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
+from .distance import EDGE_EDGE, distance, log_barrier, weight, with_gradient
 from .energies import FADE, floor_friction, smoothed, tangential6
 from .rigid_contact import Correction
 from .scene import Scene, build_layout, build_scene, outer6
@@ -27,7 +27,7 @@ class Substep(NamedTuple):
     vertices before colliders."""
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
-    constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
+    constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], measure (distance.weight)
     u: Tensor  # [B, bodies, 3]: translation of each body's island
     fractions: Tensor  # [B, V]: step fraction of each vertex at the start
     truncated: Tensor  # bool [B, V]: vertices whose displacement goes on in the next substep
@@ -50,7 +50,7 @@ class Pairs:
         order = torch.arange(len(substep.pairs), device=substep.pairs.device) if order is None else order
         rows, constants = substep.pairs[order], scene.tensor(substep.constants)[order]
         self.corners, self.kind, self.batch = rows[:, :4], rows[:, 4], rows[:, 5]
-        self.dhat, self.offset, self.threshold = constants[:, :3].unbind(1)
+        self.dhat, self.offset, self.measure = constants[:, :3].unbind(1)
         self.lead = scene.like.shape[:-2]
         self.points = scene.rest_points.shape[-1] + scene.model.collider_points.shape[-2]
         self.sizes = [len(color.vertices) for color in scene.layout.colors]
@@ -62,8 +62,9 @@ class Pairs:
         position = vertices.new_full((self.points,), -1)
         position[vertices] = torch.arange(len(vertices), device=vertices.device)
         owner = position[self.corners]
+        repeated = self.corners == self.corners.roll(1, 1)  # of faces that are edges or vertices
         pair, local = (owner >= 0).nonzero(as_tuple=True)
-        together = (owner >= 0).sum(1)[pair]
+        together = ((owner >= 0) & ~repeated).sum(1)[pair]
         return pair, local, self.batch[pair] * len(vertices) + owner[pair, local], together
 
     def per_pair(self, value: Tensor) -> Tensor:
@@ -83,10 +84,10 @@ class Pairs:
         return points[self.batch[pairs, None], self.corners[pairs]]
 
     def measures(self, points: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gap [n] and mollifier [n] of some pairs, each followed by its gradient [n, 4, 3] toward the corners."""
+        """Gap [n] and weight [n] of some pairs, each followed by its gradient [n, 4, 3] toward the corners."""
         corners, kind = self.positions(points, pairs), self.kind[pairs]
         d, slope = with_gradient(partial(distance, kind), corners)
-        e, turn = with_gradient(partial(mollifier, kind, threshold=self.threshold[pairs]), corners)
+        e, turn = with_gradient(partial(weight, kind, dhat=self.dhat[pairs], measure=self.measure[pairs]), corners)
         return d - self.offset[pairs], slope, e, turn
 
     def assemble(self, k: int, columns: Tensor) -> Tensor:
@@ -103,8 +104,8 @@ class Pairs:
 class PairBarrier:
     """e b(d - offset) over the pairs of a substep.
 
-    The block drops b' Hess d and the curvature of the mollifier e, and takes the stiffness of a pair once for each of
-    its corners of the color: they move at once.
+    The block drops b' Hess d where e > 0, and bounds it where e < 0; it drops the curvature of the weight e. It takes
+    the stiffness of a pair once for each of its corners of the color: they move at once.
     """
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:
@@ -116,7 +117,10 @@ class PairBarrier:
         gap, slope, e, turn = self.pairs.measures(corner_points(x, self.colliders), pair)
         slope, turn = (g[torch.arange(len(pair), device=pair.device), local].T for g in (slope, turn))
         b, first, second = log_barrier(gap, self.kappa[pair], self.pairs.dhat[pair])
-        columns = torch.cat((e * first * slope + b * turn, together * e * second * outer6(slope)))
+        across = torch.where(e < 0, e * first / (gap + self.pairs.offset[pair]), 0.0)
+        size = slope.square().sum(0)
+        stiffness = (e * second - across) * outer6(slope) + across * size * outer6(torch.eye(3).to(slope)).sum(-1, True)
+        columns = torch.cat((e * first * slope + b * turn, together * stiffness))
         return self.pairs.assemble(k, self.weight * columns)
 
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
@@ -137,7 +141,7 @@ class PairBarrier:
         corners = p.positions(corner_points(x, self.colliders), torch.arange(len(p.kind), device=x.device))
         gap = distance(p.kind, corners) - p.offset
         b, _, _ = log_barrier(gap, self.kappa, p.dhat)
-        return self.weight * p.total(torch.where(gap > 0, mollifier(p.kind, corners, p.threshold) * b, torch.inf))
+        return self.weight * p.total(torch.where(gap > 0, weight(p.kind, corners, p.dhat, p.measure) * b, torch.inf))
 
 
 class LaggedPairForces:
@@ -156,7 +160,7 @@ class LaggedPairForces:
         kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
         force = -e * first
-        whole = force + FADE * kappa * pairs.dhat
+        whole = force.abs() + FADE * kappa * pairs.dhat
         fraction = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
         self.damping = fraction * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)

@@ -1,4 +1,4 @@
-"""Distance of pairs of primitives, the mollifier of almost parallel edges and the log barrier, by textbook formulas.
+"""Distance of pairs of primitives, the weight of their barrier and the log barrier, by textbook formulas.
 
 A pair has four corners [Q, 4, 3]: a point and a triangle, two edges, or a point and three points that span a plane.
 Its closest features are chosen without gradient; the distance is then that features' own formula, so that every
@@ -18,6 +18,9 @@ PARALLEL = 1e-16  # squared sine below which two directions span no plane
 
 # A point and the ends of an edge, as local corners: what is left when the closest points are not inside both features.
 _BORDERS = {POINT_TRIANGLE: ((0, 1, 2), (0, 2, 3), (0, 3, 1)), EDGE_EDGE: ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1))}
+
+
+_CROSSED = torch.tensor([[-1.0, 0, 0], [1, 0, 0], [0, -1, 1], [0, 1, 1]])  # two edges without a singular derivative
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -107,14 +110,28 @@ def distance(kind: Tensor, corners: Tensor) -> Tensor:
     return out
 
 
-def mollifier(kind: Tensor, corners: Tensor, threshold: Tensor) -> Tensor:
-    """e = s (2 - s) of s = |u x v|^2 / threshold where two edges u, v have s < 1, else 1; threshold 0: never."""
-    a, b, c, d = corners.unbind(1)
-    normal = _cross(b - a, d - c)
+def weight(kind: Tensor, corners: Tensor, dhat: Tensor, measure: Tensor) -> Tensor:
+    """What the barrier of pairs [Q] is multiplied by.
+
+    Of a point and a face or plane ``measure``, how often it counts. Of two edges u, v that are closest inside both,
+    s (2 - s) of s = |u x v|^2 / measure < 1, else 1, times a smooth step, over half of dhat, of the distance from there
+    to each of the four ends. Of other edges, and where measure is 0, 0."""
+    edges = (kind == EDGE_EDGE) & (measure > 0)
+    safe = torch.where(edges[:, None, None], corners, _CROSSED.to(corners))
+    a, b, c, d = safe.unbind(1)
+    inside = edges & _inside_edges(a.detach(), b.detach(), c.detach(), d.detach())
+    a, b, c, d = torch.where(inside[:, None, None], safe, _CROSSED.to(corners)).unbind(1)
+    u, v, r = b - a, d - c, c - a
+    normal = _cross(u, v)
     square = _dot(normal, normal)
-    active = (kind == EDGE_EDGE) & (square < threshold)
-    s = square / torch.where(active, threshold, 1.0)
-    return torch.where(active, s * (2 - s), 1.0)
+    threshold, reach = torch.where(edges, measure, 1.0), dhat / 2
+    part = square / threshold
+    out = torch.where(part < 1, part * (2 - part), 1.0)
+    for place, edge in ((_dot(_cross(r, v), normal) / square, u), (_dot(_cross(r, u), normal) / square, v)):
+        for along in (place, 1 - place):
+            q = (along * _length(edge) / reach).clamp(0, 1)
+            out = out * q**2 * (3 - 2 * q)
+    return torch.where(kind == EDGE_EDGE, torch.where(inside, out, 0.0), measure)
 
 
 def log_barrier(gap: Tensor, kappa: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
