@@ -161,6 +161,9 @@ DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t e
 constexpr double kRestFraction = 0.9, kSamePlace = 1e-9;
 // Squared sine below which edges are mollified (Li et al. 2020), with the lengths at rest.
 constexpr double kMollified = 1e-3;
+// Of dhat: the reach of two edges of different bodies of which one is not sharp. The surface there is as good as flat
+// and its vertices bear what rests on it; the edges bear what comes closer than vertices let it.
+constexpr double kBlunt = 0.25;
 
 // Surfaces of all scenes and what is known of their corner points: `vertices` of the mesh, then those of colliders.
 template <class T>
@@ -169,7 +172,7 @@ struct Surfaces {
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
   const int32_t *triangles, *edges, *points, *planes, *body;
-  const int32_t* counts;  // of triangles, then of edges: how often a face counts, and whether an edge is sharp
+  const int32_t* counts;  // of triangles, then of edges: how often a face counts, and whether an edge is sharp; or null
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -406,8 +409,8 @@ DIFFVBD_APART T height(const Corners<T>& c) {
 
 template <class T>
 struct Constants {
-  T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier of edges [m^4]
-  bool admitted;              // false for two sides of one body that are one place of the material
+  T dhat, offset, measure;  // PairConstants
+  bool admitted;            // false for two sides of one body that are one place of the material
 };
 
 template <class T>
@@ -417,8 +420,9 @@ DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
 
 template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
-  Constants<T> out{in.dhat, offset_of(in, c), T(0), true};
+  Constants<T> out{in.dhat, offset_of(in, c), T(1), true};
   const bool one_body = is_of_one_body(in, c);
+  if (c.kind == kPointTriangle && in.counts) out.measure = T(in.counts[c.b]);
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
   const auto squared_length = [&](int i, int j) {
@@ -426,7 +430,11 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
     return dot(edge, edge);
   };
   const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
-  if (c.kind == kEdgeEdge) out.threshold = T(kMollified) * e * f;
+  if (c.kind == kEdgeEdge) out.measure = T(kMollified) * e * f;
+  if (c.kind == kEdgeEdge && !one_body && in.counts) {
+    const int32_t* sharp = in.counts + in.num_triangles;
+    if (!sharp[c.a] || !sharp[c.b]) out.dhat = T(kBlunt) * in.dhat;
+  }
   if (!one_body) return out;
   T longest = e < f ? f : e;
   if (c.kind == kPointTriangle && longest < squared_length(1, 3)) longest = squared_length(1, 3);
@@ -434,15 +442,6 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   out.admitted = at_rest > T(kSamePlace) * square_root(longest);
   if (at_rest < in.dhat) out.dhat = T(kRestFraction) * at_rest;
   return out;
-}
-
-// The measure of a pair (PairConstants). Two edges of different bodies have a barrier where both are sharp: along
-// others the surfaces are as good as flat, and their vertices have it.
-template <class T>
-DIFFVBD_FN T measure_of(const Surfaces<T>& in, const Candidate& c, T threshold) {
-  if (c.kind != kEdgeEdge) return T(c.kind == kPointTriangle ? in.counts[c.b] : 1);
-  const int32_t* sharp = in.counts + in.num_triangles;
-  return is_of_one_body(in, c) || (sharp[c.a] && sharp[c.b]) ? threshold : T(0);
 }
 
 // The gap of a pair, where its collider begins, and its smallest. A plane counts where it ends, or where it begins if
@@ -513,7 +512,7 @@ DIFFVBD_FN void store_listed_pair(const Surfaces<T>& in, uint64_t key, int32_t* 
   for (int k = 0; k < 4; ++k) pair[k] = c.v[k];
   pair[4] = c.kind, pair[5] = static_cast<int32_t>(c.scene);
   const Constants<T> a = constants_of(in, c);
-  constants[0] = a.dhat, constants[1] = a.offset, constants[2] = measure_of(in, c, a.threshold);
+  constants[0] = a.dhat, constants[1] = a.offset, constants[2] = a.measure;
 }
 
 // The hints of a listed pair: of its corners' nearest gaps the smallest, with its direction from the second side of

@@ -94,7 +94,7 @@ DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, T together, const Vec3
 template <class R>
 struct LagState {
   R force;   // normal force of the barrier, negative where the pair counts so [N]
-  R active;  // 1 where the pair has a barrier and is closer than dhat, else 0
+  R active;  // 1 where the pair is closer than dhat, else 0
   Vec3<R> n;
   R w[4];
 };
@@ -105,9 +105,8 @@ DIFFVBD_FN LagState<R> lag_state(int kind, const Corners<R>& c, const Distance<R
                                  const R& kappa) {
   const R gap = at.d - R(a.offset);
   const LogBarrier<R> b(gap, R(a.dhat), kappa);
-  const bool active = gap < R(a.dhat) && is_weighted<R>(kind, a);
-  const R e = active ? weight_of(kind, c, a, varies(kind, c, at, a)).e : R(0);
-  return {-e * b.first, R(active ? 1 : 0), at.n, {at.w[0], at.w[1], at.w[2], at.w[3]}};
+  const R e = weight_of(kind, c, a, varies(kind, c, at, a)).e;
+  return {-e * b.first, select(gap < R(a.dhat), R(1), R(0)), at.n, {at.w[0], at.w[1], at.w[2], at.w[3]}};
 }
 
 template <class R, class T>

@@ -246,7 +246,7 @@ DIFFVBD_FN Distance<Dual<R>> distance_by(int kind, int feature, const Corners<Du
 
 // Constants of a listed pair. measure: of a point and a face, how often that counts: 1 less the counts of the faces
 // that contain it, so that a point that is close to several faces of a surface has one barrier in all (Li et al. 2023).
-// Of two edges, 0 if they have no barrier; else 1e-3 |u|^2 |v|^2 at rest, for edges u and v [m^4].
+// Of two edges u and v 1e-3 |u|^2 |v|^2 at rest [m^4].
 template <class T>
 struct PairConstants {
   T dhat, offset, measure;  // the first two [m]: reach of the barrier, and the radii that the gap is less than d
@@ -265,12 +265,12 @@ struct Weight {
 // Up to this length, in dhat, from an end of an edge the weight of two edges fades: there the end has a barrier.
 constexpr double kRamp = 0.5;
 
-// 3 q^2 - 2 q^3 of q = along / length between 0 and 1, and its derivative.
+// A step of q = along / length from 0 to 1, with two continuous derivatives; and its first.
 template <class R>
 DIFFVBD_FN void ramp(const R& along, const R& length, R& value, R& slope) {
-  const R q = clamped(along / length);
-  value = q * q * (R(3) - R(2) * q);
-  slope = R(6) * q * (R(1) - q) / length;
+  const R q = clamped(along / length), left = R(1) - q;
+  value = q * q * q * (R(10) - q * (R(15) - R(6) * q));
+  slope = R(30) * q * q * left * left / length;
 }
 
 // Of two edges that are closest inside both, m(s') f(s |u|) f((1 - s) |u|) f(t |v|) f((1 - t) |v|), else 0. m(s') =
@@ -335,11 +335,6 @@ DIFFVBD_FN Weight<R> weight_of(int kind, const Corners<R>& c, const PairConstant
   return out;
 }
 
-// Whether a pair has a barrier.
-template <class R, class T>
-DIFFVBD_FN auto is_weighted(int kind, const PairConstants<T>& a) {
-  return kind == kEdgeEdge ? R(0) < R(a.measure) : R(0) < R(1);
-}
 // A record of a pair: four corner points, kind, scene. Whether corner k is one before it, of a face that is an edge or
 // a vertex; and whether the pair limits motions: such a face does not, as its triangles do.
 DIFFVBD_FN bool is_repeated(const int32_t* record, int k) { return k >= 2 && record[k] == record[k - 1]; }

@@ -1,7 +1,7 @@
 // The barrier of a pair in the block of one of its corners, and the exact adjoint (docs/method.md, section 12): the
-// gradient of e b(gap), and of its Hessian e b'' grad_gap grad_gap^T and, where e < 0, a bound of e b' Hess gap, which
-// is positive there. `together`: the number of corners that move at once, this one included; the block takes so many
-// times the stiffness, so that together they do not overshoot.
+// gradient F of E = e b(gap), and a matrix that bounds the positive part of its Hessian. `together`: the number of
+// corners that move at once, this one included; the block takes so many times the stiffness, so that together they do
+// not overshoot.
 #pragma once
 
 #include "../energies/log_barrier.h"
@@ -16,28 +16,46 @@ DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
 }
 DIFFVBD_FN bool is_corner(int i, int k) { return i == k; }
 
-// Hess d <= w w^T (I - n n^T) / d bounds the curvature across n where a pair counts negative.
+// The matrix of corner i: F F^T / E where e varies, which holds the mixed terms of the Hessian exactly, and c w_i^2 n
+// n^T with c = e b'' less what that has of it: 2/3 b'^2 <= b b''. Where a pair counts negative, a bound of e b' Hess d
+// as well, by Hess d <= w w^T (I - n n^T) / d.
 template <class R>
-DIFFVBD_FN R curvature_across(const R& e, const R& first, const R& d) {
-  return select(e < R(0), e * first / d, R(0));
-}
+struct PairStiffness {
+  R e, inverse, along, along_rate, across, across_rate;  // inverse: 1 / E or 0; rates: by the gap, along's over e
+  DIFFVBD_FN PairStiffness(int kind, const R& weight, const LogBarrier<R>& b, const R& d)
+      : e(weight), inverse(R(0)), along(b.second), along_rate(b.third), across(R(0)), across_rate(R(0)) {
+    if (kind == kEdgeEdge) {
+      const auto pushes = R(0) < e * b.value;
+      inverse = select(pushes, R(1) / (e * b.value), R(0));
+      const R ratio = select(pushes, b.first / b.value, R(0)), part = R(2.0 / 3) * ratio;
+      along = along - part * b.first;
+      along_rate = along_rate - part * (R(2) * b.second - ratio * b.first);
+    } else {
+      const auto negative = e < R(0);
+      across = select(negative, e * b.first / d, R(0));
+      across_rate = select(negative, e * b.second / d, R(0)) - across / d;
+    }
+  }
+};
 
 // Adds the barrier's part of the block of corner i of a pair whose distance is `at`; returns whether it is active.
 template <class R, class Index>
 DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at, const Index& i, const R& together,
                             const PairConstants<R>& a, const R& kappa, const R& h2, Vec3<R>& g, Sym3<R>& H) {
   const R gap = at.d - a.offset;
-  const auto active = both(gap < a.dhat, is_weighted<R>(kind, a));
+  const auto active = gap < a.dhat;
   if (!any(active)) return active;
   const LogBarrier<R> b(gap, a.dhat, h2 * kappa);
   const auto varied = both(active, varies(kind, c, at, a));
   const Weight<R> e = weight_of(kind, c, a, varied);
-  const R w = of_corner(at.w, i), across = curvature_across(e.e, b.first, at.d);
-  const R own = select(active, e.e, R(0));
-  g += (own * b.first * w) * at.n;
-  if (any(varied)) g += b.value * of_corner(e.gradient, i);
-  add_diagonal(H, together * across * w * w);
-  add_outer(H, together * (own * b.second - across) * w * w, at.n);
+  const PairStiffness<R> matrix(kind, e.e, b, at.d);
+  const R w = of_corner(at.w, i);
+  Vec3<R> force = (e.e * b.first * w) * at.n;
+  if (any(varied)) force += b.value * of_corner(e.gradient, i);
+  g += force;
+  add_outer(H, together * matrix.inverse, force);
+  add_diagonal(H, together * matrix.across * w * w);
+  add_outer(H, together * (matrix.e * matrix.along - matrix.across) * w * w, at.n);
   return active;
 }
 
@@ -73,34 +91,35 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   int feature = kInside;
   const Distance<R> at = distance(kind, c, &feature);
   const R gap = at.d - a.offset;
-  const auto active = both(gap < a.dhat, is_weighted<R>(kind, a));
+  const auto active = gap < a.dhat;
   if (!any(active)) return active;
   const LogBarrier<R> b(gap, a.dhat, h2);  // kappa scales everything: it comes last
   const auto varied = both(active, varies(kind, c, at, a));
   const Weight<R> weight = weight_of(kind, c, a, varied);
+  const PairStiffness<R> matrix(kind, weight.e, b, at.d);
   const R e = weight.e, w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw), pd = dot(p, d_raw);
-  const R by_e = b.first * s + b.second * s * t;
-  const R across = curvature_across(e, b.first, at.d), stiff = w * w * pd - s * t;
-  R phi = e * by_e + across * stiff;
-  R by_gap = e * (b.second * s + b.third * s * t) + (curvature_across(e, b.second, at.d) - across / at.d) * stiff;
+  const Vec3<R> own = of_corner(weight.gradient, i), force = (e * b.first * w) * at.n + b.value * own;
+  // the Hessian of E times z at corner i is the gradient of p . F + (p . F) (F . d_raw) / E at fixed E
+  const R pushed = dot(force, p), pushes = matrix.inverse * dot(force, d_raw), sideways = w * w * pd - s * t;
+  const Vec3<R> z = (R(1) + pushes) * p + (matrix.inverse * pushed) * d_raw;
+  const R normal = w * dot(at.n, z), by_value = -matrix.inverse * pushed * pushes;
+  const R by_e = b.first * normal + matrix.along * s * t + b.value * by_value;
+  const R by_gap = e * (b.second * normal + matrix.along_rate * s * t + b.first * by_value) +
+                   matrix.across_rate * sideways + b.first * dot(own, z);
+  const R phi = pushed * (R(1) + pushes) + e * matrix.along * s * t + matrix.across * sideways;
   // the Hessian of d times n at corner i is the gradient of w_i
-  const Vec3<R> z = (e * (b.first + b.second * t) - across * t) * p + ((e * b.second - across) * s) * d_raw +
-                    (R(2) * across * w * pd) * at.n;
-  if (any(varied)) {
-    const R toward = dot(of_corner(weight.gradient, i), p);
-    phi = phi + b.value * toward;
-    by_gap = by_gap + b.first * toward;
-  }
-  const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, z));
+  const Vec3<R> by_turn = (e * b.first) * z + (e * matrix.along - matrix.across) * (t * p + s * d_raw) +
+                          (R(2) * matrix.across * w * pd) * at.n;
+  const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, by_turn));
   for (int k = 0; k < 4; ++k) {
     const Vec3<Dual<R>> row = turned.w[k] * turned.n;
     out.x[k] = (-kappa) * ((by_gap * at.w[k]) * at.n + derivative(row));
   }
   if (any(varied)) {
-    const Weight<Dual<R>> curved = weight_of_edges(moved_along(c, i, b.value * p), a);
+    const Weight<Dual<R>> curved = weight_of_edges(moved_along(c, i, b.value * z), a);
     for (int k = 0; k < 4; ++k) {
-      const Vec3<R> own = kappa * (by_e * weight.gradient[k] + derivative(curved.gradient[k]));
-      out.x[k] -= select(varied, own, zero3<R>());
+      const Vec3<R> part = kappa * (by_e * weight.gradient[k] + derivative(curved.gradient[k]));
+      out.x[k] -= select(varied, part, zero3<R>());
     }
   }
   out.kappa = -phi;

@@ -146,8 +146,7 @@ struct Source {
     return contact::is_above(pair[4], [&](int k) { return moved(pair[k]); }, constants, length);
   }
   DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
-    const PairConstants<T> a(constants);
-    return !is_weighted<T>(pair[4], a) || is_above(pair, constants, a.dhat);
+    return is_above(pair, constants, PairConstants<T>(constants).dhat);
   }
   DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
     Vec3<T> m = zero3<T>();

@@ -269,7 +269,7 @@ DIFFVBD_FN bool barrier_force(const RigidInputs<T>& in, int64_t pair, const At& 
   const PairConstants<T> a(constants);
   const Distance<double> near = distance(record[4], c);
   const double gap = near.d - a.offset, h = in.scene.time_step;
-  if (!(gap < dhat) || !is_weighted<double>(record[4], a)) return false;
+  if (!(gap < dhat)) return false;
   const LogBarrier<double> b(gap, dhat, h * h * in.kappa.data[scene * in.kappa.scene]);
   const bool varied = varies(record[4], c, near, a);
   const Weight<double> weight = weight_of(record[4], c, a, varied);

@@ -63,8 +63,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, pinned: [N]; labels from ``mesh_bodies`` on are colliders; pinned: bool, no sweep moves the point.
         trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
-        face_counts: [F + E] how often the barrier of each of ``triangles`` counts; whether each edge is sharp (1 or 0):
-            two edges of different bodies have a barrier if both are. Other edges keep from crossing.
+        face_counts: [F + E] how often the barrier of each of ``triangles`` counts; whether each edge is sharp (1 or 0).
+            The barrier of two edges of different bodies that are not both sharp reaches ``dhat / 4``.
         self_contact, between_bodies: Pairs of mesh bodies to consider.
         dhat: [m].
         capacity: Rows of the list.

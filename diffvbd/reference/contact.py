@@ -104,8 +104,9 @@ class Pairs:
 class PairBarrier:
     """e b(d - offset) over the pairs of a substep.
 
-    The block drops b' Hess d where e > 0, and bounds it where e < 0; it drops the curvature of the weight e. It takes
-    the stiffness of a pair once for each of its corners of the color: they move at once.
+    With E = e b and its gradient F, the block is e b'' n n' of a point and a face, and where e < 0 a bound of e b' Hess d;
+    of two edges F F' / E + e (b'' - 2/3 b'^2 / b) n n'. It takes the stiffness of a pair once for each of its corners of
+    the color: they move at once.
     """
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:
@@ -117,10 +118,16 @@ class PairBarrier:
         gap, slope, e, turn = self.pairs.measures(corner_points(x, self.colliders), pair)
         slope, turn = (g[torch.arange(len(pair), device=pair.device), local].T for g in (slope, turn))
         b, first, second = log_barrier(gap, self.kappa[pair], self.pairs.dhat[pair])
+        force, unit = e * first * slope + b * turn, outer6(slope)
+        edges = (self.pairs.kind[pair] == EDGE_EDGE) & (e * b > 0)
+        value, height = torch.where(edges, e * b, 1.0), torch.where(edges, b, 1.0)
+        stiffness = e * (second - torch.where(edges, 2 / 3 * first**2 / height, 0.0)) * unit
+        stiffness = stiffness + torch.where(edges, outer6(force) / value, 0.0)
         across = torch.where(e < 0, e * first / (gap + self.pairs.offset[pair]), 0.0)
         size = slope.square().sum(0)
-        stiffness = (e * second - across) * outer6(slope) + across * size * outer6(torch.eye(3).to(slope)).sum(-1, True)
-        columns = torch.cat((e * first * slope + b * turn, together * stiffness))
+        whole = outer6(torch.eye(3).to(slope)).sum(-1, True)
+        stiffness = stiffness + across * (size * whole - unit)
+        columns = torch.cat((force, together * stiffness))
         return self.pairs.assemble(k, self.weight * columns)
 
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does

@@ -115,8 +115,8 @@ def weight(kind: Tensor, corners: Tensor, dhat: Tensor, measure: Tensor) -> Tens
 
     Of a point and a face or plane ``measure``, how often it counts. Of two edges u, v that are closest inside both,
     s (2 - s) of s = |u x v|^2 / measure < 1, else 1, times a smooth step, over half of dhat, of the distance from there
-    to each of the four ends. Of other edges, and where measure is 0, 0."""
-    edges = (kind == EDGE_EDGE) & (measure > 0)
+    to each of the four ends. Of other edges 0."""
+    edges = kind == EDGE_EDGE
     safe = torch.where(edges[:, None, None], corners, _CROSSED.to(corners))
     a, b, c, d = safe.unbind(1)
     inside = edges & _inside_edges(a.detach(), b.detach(), c.detach(), d.detach())
@@ -130,7 +130,7 @@ def weight(kind: Tensor, corners: Tensor, dhat: Tensor, measure: Tensor) -> Tens
     for place, edge in ((_dot(_cross(r, v), normal) / square, u), (_dot(_cross(r, u), normal) / square, v)):
         for along in (place, 1 - place):
             q = (along * _length(edge) / reach).clamp(0, 1)
-            out = out * q**2 * (3 - 2 * q)
+            out = out * q**3 * (10 - q * (15 - 6 * q))
     return torch.where(kind == EDGE_EDGE, torch.where(inside, out, 0.0), measure)
 
 
