@@ -234,8 +234,8 @@ def pair_energy(model: dv.Model, x: Tensor) -> Tensor:
     assert barrier is not None and surface is not None
     colliders = model.collider_points.expand(len(x), -1, 3)
     found = near_pairs(x, None, colliders, colliders, surface, barrier)
-    gap, _, mollifier, _ = found.measures(corner_points(x, None, colliders))
-    value = mollifier * log_barrier(gap, torch.full_like(gap, barrier.kappa), found.dhat)[0]
+    gap, _, weight, _ = found.measures(corner_points(x, None, colliders))
+    value = weight * log_barrier(gap, torch.full_like(gap, barrier.kappa), found.dhat)[0]
     return torch.zeros_like(x[:, 0, 0]).index_add(0, found.scene, value)
 
 

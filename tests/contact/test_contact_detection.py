@@ -174,8 +174,9 @@ def test_far_from_the_origin(device: str, dtype: torch.dtype) -> None:
     """Bodies relative to a point of their own lose nothing, however far away they are."""
     s = mixed_scene()
     v, far = s.x.shape[1], np.array([4096.0, -8192.0, 1024.0])
-    mesh = replace(s, triangles=s.triangles[(s.triangles < v).all(1)], edges=s.edges[(s.edges < v).all(1)],
-                   points=s.points[s.points < v], planes=s.planes[:0])  # fmt: skip
+    triangles, edges = (s.triangles < v).all(1), (s.edges < v).all(1)
+    mesh = replace(s, triangles=s.triangles[triangles], edges=s.edges[edges],
+                   face_counts=s.face_counts[np.concatenate([triangles, edges])], points=s.points[s.points < v], planes=s.planes[:0])  # fmt: skip
     body = mesh.body[:v]
     mesh.origin = np.stack([np.round(mesh.x[0, body == b][0], 1) for b in range(3)])[body][None]
     mesh.origin = mesh.origin.astype(np.float32).astype(np.float64)

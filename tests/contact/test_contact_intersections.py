@@ -21,8 +21,14 @@ DTYPES = (torch.float64, torch.float32)
 
 
 def arguments(s: Scene, device: str, dtype: torch.dtype, capacity: int) -> tuple:
-    of_detection = s.arguments(device, dtype, capacity)
-    return (*of_detection[:3], *of_detection[4:12], *of_detection[14:17], capacity)
+    given = s.arguments(device, dtype, capacity)
+    triangles = torch.as_tensor(triangles_of(s), device=device)
+    return (*given[:3], *given[4:6], triangles, *given[7:12], *given[15:18], capacity)
+
+
+def triangles_of(s: Scene) -> np.ndarray:
+    """Without the faces that are edges and vertices."""
+    return s.triangles[s.triangles[:, 1] != s.triangles[:, 2]]
 
 
 def find(s: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64, capacity: int = 5000) -> Any:
@@ -34,7 +40,7 @@ def expected(s: Scene, dtype: torch.dtype = torch.float64) -> list[list[int]]:
     """Rows (scene, edge, triangle) by the reference, and the rules for what is tested at all."""
     x, origin, collider = (t.double() for t in s.arguments("cpu", dtype)[:3])
     x = x + origin if origin.numel() else x
-    edges, triangles = s.edges, s.triangles
+    edges, triangles = s.edges, triangles_of(s)
     group = np.minimum(s.body, s.mesh_bodies)
     rows = []
     for scene, points in enumerate(torch.cat([x, collider], 1)):

@@ -75,6 +75,7 @@ class Scene:
     body: np.ndarray
     pinned: np.ndarray
     mesh_bodies: int
+    face_counts: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))  # of triangles, then sharp edges
     self_contact: bool = True
     between_bodies: bool = True
     dhat: float = 0.03
@@ -96,14 +97,18 @@ class Scene:
         v = sum(sizes[: len(bodies)])
         planes = [[f, f + 1, f + 2] for p, f in zip(parts, first, strict=True) if p.flat]
         collider = np.broadcast_to(rest[v:], (scenes, len(rest) - v, 3)).copy()
+        triangles, edges = stack("triangles", 3), stack("edges", 2)
+        faces = np.concatenate([triangles, edges[::3, [0, 1, 1]], np.repeat(edges[::4, :1], 3, 1)])
+        counts = np.concatenate([1 - 2 * (faces.sum(1) % 2), edges.sum(1) % 3 > 0])  # any will do
         return Scene(
             x=np.broadcast_to(rest[:v], (scenes, v, 3)).copy(),
             collider=collider,
             collider_next=collider.copy(),
             rest=rest,
             radius=np.repeat([p.radius for p in parts], sizes),
-            triangles=stack("triangles", 3),
-            edges=stack("edges", 2),
+            triangles=faces,
+            edges=edges,
+            face_counts=counts.astype(np.int32),
             points=stack("lone", 1).reshape(-1),
             planes=np.array(planes, np.int32).reshape(-1, 3),
             body=np.repeat(np.arange(len(parts)), sizes).astype(np.int32),
@@ -140,7 +145,7 @@ class Scene:
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
             index(self.body), index(self.pinned), real(trust_radius), real(self.own_fraction * trust_radius),
-            self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
+            index(self.face_counts), self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
         )  # fmt: skip
 
 
@@ -252,6 +257,8 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         admitted &= ~(pinned[:, 0] if kind == POINT_PLANE else pinned.all(1))
         for m, n in itertools.product(range(second), range(second, 4)):
             admitted &= corners[:, m] != corners[:, n]
+        if kind == POINT_TRIANGLE:  # edges and vertices are no faces for points of their own body
+            admitted &= (one != other) | (corners[:, 2] != corners[:, 3])
         i, j, corners, one, other = (a[admitted] for a in (i, j, corners, one, other))
         offset = s.radius[corners[:, 0]] + s.radius[corners[:, second]]
         d, weights = closest(kind, now[corners])
@@ -264,13 +271,17 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         at_rest = closest(kind, rest)[0] if kind != POINT_PLANE else np.full(len(d), np.inf)
         at_rest = np.where(one == other, at_rest, np.inf)
         edges = [np.linalg.norm(rest[:, n] - rest[:, m], axis=-1) for m, n in ((0, 1), (1, 2), (2, 3), (3, 1))]
-        threshold = 1e-3 * (edges[0] * edges[2]) ** 2 if kind == EDGE_EDGE else np.zeros(len(d))
-        dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, s.dhat)
+        counts, sharp = s.face_counts[: len(s.triangles)], s.face_counts[len(s.triangles) :]
+        if kind == EDGE_EDGE:
+            measure, blunt = 1e-3 * (edges[0] * edges[2]) ** 2, (one != other) & (sharp[i] * sharp[j] == 0)
+        else:
+            measure, blunt = counts[j] if kind == POINT_TRIANGLE else np.ones(len(d)), np.zeros(len(d), bool)
+        dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, np.where(blunt, 0.25 * s.dhat, s.dhat))
         trust_radii = np.append(s.trust_radii, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
         trust_radii = np.where(one == other, s.own_fraction * trust_radii, trust_radii)
         keep = (least - offset < s.dhat + trust_radii) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
         columns = (np.full(len(d), kind), corners, d - offset, least - offset, weights,
-                   np.stack([dhat, offset, threshold], -1), ((b * 3 + kind) * base + i) * base + j, takes,
+                   np.stack([dhat, offset, measure], -1), ((b * 3 + kind) * base + i) * base + j, takes,
                    begins - offset)  # fmt: skip
         found.append([a[keep] for a in columns])
     kind, corners, gap, least, weights, constants, key, ends, begins = (

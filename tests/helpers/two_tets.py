@@ -80,7 +80,7 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor) -> reference.Subs
     offset = radius[corners[:, 0]] + radius[second]
     rest = torch.cat((model.rest_points, model.collider_points))[corners]
     edges = ((rest[:, 1] - rest[:, 0]) ** 2).sum(-1), ((rest[:, 3] - rest[:, 2]) ** 2).sum(-1)
-    threshold = torch.where(kind == distance.EDGE_EDGE, 1e-3 * edges[0] * edges[1], 0.0)
+    measure = torch.where(kind == distance.EDGE_EDGE, 1e-3 * edges[0] * edges[1], 1.0)
     rows, constants = [], []
     for b in range(len(x)):
         points = torch.cat((x[b], torch.where(model.plane_points[:, None], now[b], before[b])))
@@ -88,7 +88,7 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor) -> reference.Subs
         listed = gap < model.contact.dhat + 0.1
         tail = torch.stack((kind, torch.full_like(kind, b)), 1)
         rows.append(torch.cat((corners, tail), 1)[listed])
-        constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, threshold), 1)[listed])
+        constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, measure), 1)[listed])
     fractions, corrections = torch.ones(x.shape[:2]), torch.ones((2, len(x), 2))
     return reference.Substep(torch.cat(rows), torch.cat(constants), x.new_zeros((len(x), 2, 3)), fractions,
                              fractions < 1, corrections)  # fmt: skip

@@ -46,7 +46,8 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
     model, x, pairs = setup()
     if mollified:  # thresholds above where the edges are
         a, b, c, d = torch.cat((x, COLLIDERS))[pairs.corners].unbind(1)
-        pairs.threshold = 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1)
+        edges = 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1)
+        pairs.measure = torch.where(pairs.kind == distance.EDGE_EDGE, edges, 1.0)
     barrier = PairBarrier(scene_of(model, x), pairs, COLLIDERS[None])
     state = x.clone().requires_grad_()
     (expected,) = torch.autograd.grad(barrier.energy(state.T, x.T), state)
@@ -57,38 +58,41 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
     assert (least[:, 0] >= -tolerance("formula") * least[:, 2]).all() and (least[:, 2] > 0).any()
 
 
-def test_barrier_block_is_the_curvature_along_the_normals() -> None:
-    """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d): N of its corners share the vertex's color."""
+def test_barrier_block_is_that_of_the_manual() -> None:
+    """Of one pair at a time; N of its corners share the vertex's color. With E = e b, its gradient F and that s of the
+    gap, H is N h^2 times e b'' s s' of a point and a face, and where e < 0 also b' e / d (s's I - s s'); and of two edges
+    F F' / E + e (b'' - 2/3 b'^2 / b) s s'."""
     model, x, _ = setup()
     part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None])
-    vertex = 4
-    color, counts = colors(model, len(x) + len(COLLIDERS)), []
+    vertex, kappa = 4, torch.tensor(200.0, dtype=torch.float64)
+    color, found = colors(model, len(x) + len(COLLIDERS)), []
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
         one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
-        one.constants[:, 2] = 0
-        barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
-
-        def potential(p: Tensor, barrier: PairBarrier = barrier) -> Tensor:
-            return barrier.energy(torch.cat((x[:vertex], p[None], x[vertex + 1 :])).T, x.T)
-
-        def gap(p: Tensor, one: reference.Substep = one) -> Tensor:
-            points = torch.cat((x[:vertex], p[None], x[vertex + 1 :], COLLIDERS))
-            return (distance.distance(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
-
-        _, first, _ = distance.log_barrier(gap(x[vertex]), *torch.tensor([200.0, DHAT], dtype=torch.float64))
-        full = torch.autograd.functional.hessian(potential, x[vertex])
-        bent = torch.autograd.functional.hessian(gap, x[vertex])
-        _, hessian = blocks(model, barrier, x, x)
-        counts.append(int((color[one.pairs[0, :4]] == color[vertex]).sum()))
-        difference = hessian[vertex] - counts[-1] * (full - 1e-4 * first * bent)
-        assert difference.abs().max() <= tolerance("cancelling") * hessian[vertex].abs().max()
-        if one.pairs[0, 4] == distance.EDGE_EDGE:
-            a, b, c, d = torch.cat((x, COLLIDERS))[one.pairs[0, :4]]
-            one.constants[:, 2] = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
+        kind, (dhat, offset, measure) = int(one.pairs[0, 4]), one.constants[0, :3]
+        for e in (1.0, -1.0) if kind == distance.POINT_TRIANGLE else (1.0,):
+            one.constants[0, 2] = measure if kind == distance.EDGE_EDGE else e
             barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
-            _, mollified = blocks(model, barrier, x, x)
-            assert torch.allclose(mollified, 0.75 * hessian, rtol=tolerance("cancelling"), atol=0)
-    assert set(counts) == {1, 2}
+            at = x[vertex].clone().requires_grad_()
+            state = torch.cat((x[:vertex], at[None], x[vertex + 1 :]))
+            d = distance.distance(one.pairs[:, 4], torch.cat((state, COLLIDERS))[one.pairs[:, :4]])[0]
+            b, first, second = (1e-4 * value for value in distance.log_barrier(d - offset, kappa, dhat))
+            energy = barrier.energy(state.T, x.T).sum()
+            (F,) = torch.autograd.grad(energy, at, retain_graph=True)
+            (s,) = torch.autograd.grad(d, at)
+            normal, b = s.outer(s), b.detach()
+            if float(energy) == 0:
+                expected = 0 * normal
+            elif kind == distance.EDGE_EDGE:
+                expected = F.outer(F) / energy + energy / b * (second - 2 / 3 * first**2 / b) * normal
+            else:
+                expected = e * second * normal
+                expected = expected + (e < 0) * e * first / d * (s.dot(s) * torch.eye(3).double() - normal)
+            together = int((color[one.pairs[0, :4]] == color[vertex]).sum())
+            _, hessian = blocks(model, barrier, x, x)
+            assert relative_error(hessian[vertex], together * expected.detach()) <= tolerance("cancelling")
+            found.append((kind, together, e, bool(energy != 0)))
+    assert {1, 2} <= {n for _, n, _, acts in found if acts} and {-1.0, 1.0} == {e for *_, e, acts in found if acts}
+    assert {0, 1} <= {kind for kind, *_, acts in found if acts}
 
 
 @pytest.mark.parametrize("travel", (1e-4, 1e-2))
@@ -107,7 +111,7 @@ def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
     normal = slope[:, 0] + (pairs.kind == distance.EDGE_EDGE)[:, None] * slope[:, 1]
     weights = (slope * normal[:, None]).sum(-1)
     gap = (d - pairs.offset).detach().requires_grad_()
-    e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
+    e = distance.weight(pairs.kind, corners.detach(), pairs.dhat, pairs.measure)
     inside = gap < DHAT
     (force,) = torch.autograd.grad((200 * inside * e * (gap - DHAT) ** 2 * (gap / DHAT).log()).sum(), gap)
     reach = 0.01 * 0.05
@@ -144,7 +148,7 @@ def test_damping_opposes_approach_alone() -> None:
         return torch.where(gap < DHAT, moved, 0.0)
 
     gap = distance.distance(pairs.kind, corners.detach()) - pairs.offset
-    e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
+    e = distance.weight(pairs.kind, corners.detach(), pairs.dhat, pairs.measure)
     size = 200 * e * (2 * (gap - DHAT) * (gap / DHAT).log() + (gap - DHAT) ** 2 / gap) * (gap < DHAT)
     share = size / (size + 20 * DHAT)
     assert (gap > DHAT).any()

@@ -1,11 +1,14 @@
 """Claim: dv.equilibrium finds the rest states that an independent dense Newton solver finds on its own energy."""
 
+import itertools
+
 import pytest
 import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.reference.distance import EDGE_EDGE, POINT_TRIANGLE, distance, log_barrier, mollifier
+from diffvbd.reference.distance import EDGE_EDGE, POINT_TRIANGLE, distance, log_barrier
+from diffvbd.reference.distance import weight as pair_weight
 from diffvbd.testing.dense_statics import newton, potential, residual, weight
 from diffvbd.testing.soft_scenes import PROBLEMS, Problem, necked, on_floor
 
@@ -66,23 +69,36 @@ def test_two_blocks_pressed_together() -> None:
     faces, count = torch.as_tensor(mesh.surface), low.num_vertices
     sides = [faces[faces[:, 0] < count], faces[faces[:, 0] >= count]]
     edges = [torch.unique(side[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(1).values, dim=0) for side in sides]
-    lists = [(EDGE_EDGE, edges[0], edges[1])]
-    lists += [(POINT_TRIANGLE, sides[k].unique()[:, None], sides[1 - k]) for k in (0, 1)]
+    points = [side.unique()[:, None] for side in sides]
+    lists = []  # kind, sides, how often each pair counts; of a closed surface triangles less edges plus vertices
+    for k in (0, 1):
+        lists += [(POINT_TRIANGLE, points[k], sides[1 - k], 1), (POINT_TRIANGLE, points[k], points[1 - k].expand(-1, 3), 1),
+                  (POINT_TRIANGLE, points[k], edges[1 - k][:, [0, 1, 1]], -1)]  # fmt: skip
+    sharp = [on_two_sides(x, edge, side) for edge, side in zip(edges, points, strict=True)]
+    for a, b in itertools.product((True, False), repeat=2):
+        lists += [(EDGE_EDGE, edges[0][sharp[0] == a], edges[1][sharp[1] == b], 1 if a and b else 0)]
 
     def contact(at: Tensor) -> Tensor:
         total = at.new_zeros(())
-        for kind, first, second in lists:
+        for kind, first, second, count in lists:
             pairs = torch.cat([first.repeat_interleave(len(second), 0), second.repeat(len(first), 1)], 1)
-            kinds, threshold = torch.full((len(pairs),), kind), 1e-3 * edge_squares(x, pairs)
-            gap = distance(kinds, at[pairs])
-            b = log_barrier(gap, gap.new_tensor(kappa), gap.new_tensor(dhat))[0]
-            total = total + (mollifier(kinds, at[pairs], threshold) * b).sum()
+            kinds = torch.full((len(pairs),), kind)
+            reach = at.new_full((len(pairs),), dhat if kind == POINT_TRIANGLE or count else dhat / 4)
+            measure = 1e-3 * edge_squares(x, pairs) if kind == EDGE_EDGE else at.new_full((len(pairs),), count)
+            b = log_barrier(distance(kinds, at[pairs]), at.new_tensor(kappa), reach)[0]
+            total = total + (pair_weight(kinds, at[pairs], reach, measure) * b).sum()
         return total
 
     mu, lam = dv.lame(3e4, 0.3)
     load = weight(model)
     assert float(contact(done.x)) > 0
     assert residual(model, potential(model, load, mu, lam, contact), load, done.x) < 1e-8
+
+
+def on_two_sides(x: Tensor, edges: Tensor, points: Tensor) -> Tensor:
+    """Which edges [E] are on two sides of the box of some points [P, 1]: along its own edges."""
+    at, box = x[edges], torch.stack([x[points[:, 0]].amin(0), x[points[:, 0]].amax(0)])
+    return (at[:, None] == box[None, :, None]).all(2).any(1).sum(1) >= 2
 
 
 def edge_squares(x: Tensor, pairs: Tensor) -> Tensor:

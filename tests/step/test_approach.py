@@ -24,7 +24,7 @@ SHAPES = {
 
 def model_above(shape: str, gap: float, device: str) -> dv.Model:
     cube = dv.mesh.cube(2, size=0.1).translate((0.0, gap, 0.0))
-    pairs = dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False, detections=1)
+    pairs = dv.PairBarrier(kappa=4e4, dhat=0.01, self_contact=False, detections=1)
     return dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[SHAPES[shape]], device=device)
 
 

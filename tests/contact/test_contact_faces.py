@@ -1,0 +1,72 @@
+"""Claim: the faces of a surface count so that a point has the barrier of its distance to the surface, once."""
+
+import numpy as np
+import pytest
+import torch
+
+import diffvbd as dv
+from diffvbd._contact.surface import faces_of, sharp_edges
+from diffvbd.reference.distance import POINT_TRIANGLE, distance
+from diffvbd.testing import generator, tolerance
+
+SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def edges_of(triangles: np.ndarray) -> np.ndarray:
+    return np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+
+
+def surface(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, triangles and edges."""
+    if name == "axis of a capsule":
+        return np.array([[0.0, 0, 0], [0.4, 0, 0]]), np.zeros((0, 3), int), np.array([[0, 1]])
+    if name == "sheet":
+        return np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]), SQUARE, edges_of(SQUARE)
+    mesh = dv.mesh.box(4, (0.5, 0.4, 0.3)) if name == "box" else dv.mesh.cube(3, size=0.4)
+    return mesh.points, mesh.surface, edges_of(mesh.surface)
+
+
+@pytest.mark.parametrize("name", ["box", "cube", "sheet", "axis of a capsule"])
+def test_a_point_outside_has_one_barrier(name: str) -> None:
+    points, triangles, edges = surface(name)
+    faces, counts = faces_of(triangles, edges)
+    low, high = points.min(0), points.max(0)
+    p = generator("outside", name).uniform(low - 0.2, high + 0.2, (400, 3))
+    away = np.linalg.norm(p - p.clip(low, high), axis=1)  # all are boxes
+    p, away = p[away > 1e-3], away[away > 1e-3]
+    corners = np.concatenate([np.repeat(p, len(faces), 0)[:, None], np.tile(points[faces], (len(p), 1, 1))], 1)
+    kind = torch.full((len(corners),), POINT_TRIANGLE)
+    d = distance(kind, torch.from_numpy(corners)).reshape(len(p), -1)
+    assert np.allclose(d.amin(1), away, atol=1e-12)
+    # what is in reach of a point is one piece without holes: less than the way around
+    barrier = [(0.25 - of).clamp(min=0) ** 2 for of in (d, torch.from_numpy(away))]
+    assert torch.allclose((barrier[0] * torch.from_numpy(counts)).sum(1), barrier[1], rtol=0, atol=tolerance("formula"))
+    assert barrier[1].count_nonzero() > 100
+    assert (np.isin(counts, (-1, 1))).all()
+
+
+def test_faces_of_a_closed_surface() -> None:
+    """Triangles and vertices count once, edges -1; a border and its vertices are parts of one triangle: not at all."""
+    _, triangles, edges = surface("cube")
+    faces, counts = faces_of(triangles, edges)
+    assert [int((counts[[len(set(f)) == n for f in faces.tolist()]]).sum()) for n in (3, 2, 1)] == [48, -72, 26]
+    faces, counts = faces_of(SQUARE, edges_of(SQUARE))
+    assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 2, 2]] and counts.tolist() == [1, 1, -1]
+
+
+@pytest.mark.parametrize(("angle", "sharp"), [(-20, True), (-10, False), (0, False), (14, False), (16, True)])
+def test_edges_are_sharp_from_fifteen_degrees_on(angle: float, sharp: bool) -> None:
+    turn = np.radians(angle)
+    points = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0.5], [-np.cos(turn), -np.sin(turn), 0.5]])
+    triangles = np.array([[0, 1, 2], [1, 0, 3]])
+    edges = edges_of(triangles)
+    found = sharp_edges(points, triangles, edges)
+    assert found[edges.tolist().index([0, 1])] == sharp and found.sum() == 4 + sharp  # the border is
+
+
+def test_edges_of_bodies() -> None:
+    """The 12 edges of a box, in three parts each, and none of a ball."""
+    points, triangles, edges = surface("box")
+    assert sharp_edges(points, triangles, edges).sum() == 36
+    ball = dv.mesh.blob(20)
+    assert not sharp_edges(ball.points, ball.surface, edges_of(ball.surface)).any()
