@@ -153,7 +153,7 @@ def test_tapes_agree_and_updates_are_shortened() -> None:
     y = torch.where(model.pinned[:, None], x, y)
 
     def potential(at: Tensor) -> Tensor:
-        return reference.incremental_potential(model, at, y, 0.0, 0.0, 0.01, parameters=model.law.values)
+        return reference.incremental_potential(model, at, y, None, None, 0.01)
 
     values = [potential(y)]
     for sweeps in range(1, 6):
@@ -235,6 +235,17 @@ def test_inputs_and_refusals() -> None:
     with pytest.raises(ValueError, match="a0: expected directions of finite length > 0"):
         dv.step(model, x, v, solver, a0=torch.zeros(3, dtype=F64))
     assert "law(" in repr(model) and bool(dv.diagnose(model, x, solver).smallest_volume_ratio > 0.9)
+
+
+def test_a_modulus_of_zero_is_given() -> None:
+    """It is not taken for the law's own; in the reference, too."""
+    model, solver = model_of(), dv.VBD(0.01, 2)
+    inputs = inputs_of(model, 0.004)
+    x, v = inputs["x"], inputs["v"]
+    own, without = (dv.step(model, x, v, solver, **given)[0] for given in ({}, {"lam": 0.0}))
+    assert float((own - without).abs().max()) > 1e-6
+    for expected, given in ((own, {}), (without, {"lam": 0.0})):
+        assert relative_error(reference.step(model, x, v, solver, **given)[0], expected) < 1e-12
 
 
 @pytest.mark.hours
