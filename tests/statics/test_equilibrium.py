@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -26,7 +27,8 @@ def check(problem: Problem, from_rest: bool = True) -> None:
     assert float((done.x - newton(model, energy, start if from_rest else done.x)).abs().max()) < 1e-6 * moved
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+# coupled bodies, of which test_equilibrium_couplings.py has small ones
+@pytest.mark.parametrize("name", [slow(name) if name == "bent by a tendon" else name for name in PROBLEMS])
 def test_rest_states(name: str) -> None:
     check(PROBLEMS[name]())
 
