@@ -148,9 +148,9 @@ ROLLOUTS = [
     ("full", 24, dv.BinomialCheckpoints(5), "all"),
     ("compact", 12, None, "last"),
     ("compact", 12, 4, "all"),
-    ("compact", 40, dv.BinomialCheckpoints(4), "last"),
+    ("compact", 24, dv.BinomialCheckpoints(4), "last"),
     ("recompute", 12, None, "all"),
-    ("recompute", 40, 10, "last"),
+    ("recompute", 24, 10, "last"),
 ]
 
 
