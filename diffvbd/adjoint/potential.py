@@ -324,7 +324,8 @@ class IncreaseInputs(NamedTuple):
         """Whether the potential of each body lets it go from x to ``to`` [B, V, 3]: it does not rise by more than
         rounding, is a number, and ``to`` is not too near a plane; bool [B, bodies]."""
         increase, size = increase_of_bodies(self, x, to).unbind(-1)
-        return increase <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # False where it is not a number
+        # a difference, also where both are infinite; False where it is not a number
+        return torch.sub(increase, size, alpha=ROUNDINGS * torch.finfo(x.dtype).eps) <= 0
 
     def increases_potential(self, x: Tensor, to: Tensor) -> Tensor:
         """Vertices of bodies whose potential does not let them go from x to ``to``, bool [B, V]."""

@@ -189,6 +189,7 @@ class StaticPotential(IncrementalPotential):
         work = self.given.load * (to.x - self.x)
         before, after = self.pair_energies(), to.pair_energies()
         more, size = more - work.sum((1, 2)) + after - before, size + work.abs().sum((1, 2)) + after + before
+        size = size if self.own is None else size + self.own.size
         before, after = self.coupling_terms, to.coupling_terms
         return more + (after - before).sum(-1), size + before.abs().sum(-1) + after.abs().sum(-1)
 

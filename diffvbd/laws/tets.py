@@ -69,6 +69,16 @@ class LawTets:
             self.corners, self.rest = (t.detach().clone().requires_grad_() for t in (corners, rest))
 
     @cached_property
+    def size(self) -> Tensor:
+        """The energy of each scene that rounding of the invariants is a share of, [B]: psi may be small where its terms
+        are not."""
+        corners, rest = self.corners.detach(), self.rest.detach()
+        _, invariants, _ = measures(self.density, corners, rest)
+        slopes = self.density.slopes(invariants, parameters_of(self.density, rest))
+        terms = sum((w * i).abs() for w, i in zip(slopes, invariants, strict=True))
+        return self.h2 * (terms / (6 * rest[..., 6])).sum(-1)
+
+    @cached_property
     def _gradient(self) -> Tensor:
         with torch.inference_mode(False), torch.enable_grad():
             total = self.h2 * energy(self.density, self.corners, self.rest)

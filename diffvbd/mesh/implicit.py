@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from diffvbd.mesh.arrays import FloatArray, IntArray, connected, float_array, positive
-from diffvbd.mesh.tet_mesh import EDGES, TET_FACES, TetMesh, oriented
+from diffvbd.mesh.tet_mesh import EDGES, TetMesh, inner_faces, oriented
 
 ImplicitFunction = Callable[[FloatArray], FloatArray]
 
@@ -190,9 +190,5 @@ def _prism(a: IntArray, b: IntArray, c: IntArray, a2: IntArray, b2: IntArray, c2
 
 def _largest_piece(tets: IntArray) -> IntArray:
     """Of the tets connected through faces, the largest set."""
-    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = np.nonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))[0]
-    left, right = order[same] // 4, order[same + 1] // 4
-    label = connected(np.stack([left, right], axis=1), len(tets))
+    label = connected(np.stack(inner_faces(tets), axis=1) // 4, len(tets))
     return tets[label == np.bincount(label).argmax()]

@@ -45,6 +45,14 @@ def oriented(points: FloatArray, tets: IntArray) -> IntArray:
     return flipped
 
 
+def inner_faces(tets: IntArray) -> tuple[IntArray, IntArray]:
+    """Faces that two tets share, [F] each: for either of them, four times the tet plus the corner opposite."""
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+    return order[:-1][same], order[1:][same]
+
+
 def boundary_faces(tets: IntArray, num_vertices: int) -> tuple[IntArray, IntArray]:
     """Triangles that belong to exactly one tet, wound outwards, shape [F, 3], and that tet, shape [F], ascending."""
     if len(tets) == 0:

@@ -22,6 +22,7 @@ from torch import Tensor
 from .. import ops
 from .._common.checks import fail
 from ..mesh import TetMesh
+from ..mesh.tet_mesh import inner_faces
 from ..ops.sums import Rows
 from .bodies import connected
 from .material import cross, dot
@@ -202,11 +203,8 @@ def patches_of(mesh: TetMesh, given: Any) -> Patches | None:
 
 def face_neighbors(tets: np.ndarray) -> np.ndarray:
     """Tets across the face opposite each corner [T, 4]; -1 where there is none."""
-    faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(1)
-    one, two = order[:-1][same], order[1:][same]
-    out = np.full(len(faces), -1)
+    one, two = inner_faces(tets)
+    out = np.full(4 * len(tets), -1)
     out[one], out[two] = two // 4, one // 4
     return out.reshape(-1, 4)
 

@@ -143,10 +143,6 @@ def of_tets(value: Any, layout: Layout, like: Tensor) -> Tensor:
     return value if layout.order is None else value[..., layout.order]
 
 
-def _is_default(value: Any) -> bool:
-    return isinstance(value, float) and value == 0.0
-
-
 def law_values(law: Any, parameters: dict[str, Any], per_tet: Callable[[Any], Tensor]) -> list[Tensor]:
     """Parameters of a law in their order, [..., T]: those given, else its own."""
     return [per_tet(parameters.get(name, law.values[name])) for name in law.density.parameters]
@@ -174,10 +170,11 @@ def build_scene(
         return of_tets(value, layout, like)
 
     own = next((e for e in getattr(model, "energies", ()) if getattr(e, "name", None) == "law"), None)
-    if own is not None:  # its parameters may have the names of moduli, which are 0.0 where not given
-        moduli = {k: v for k, v in (("mu", mu), ("lam", lam)) if k in own.values and not _is_default(v)}
+    if own is not None:  # its parameters may have the names of moduli
+        moduli = {k: v for k, v in (("mu", mu), ("lam", lam)) if k in own.values and v is not None}
         parameters = {**moduli, **(parameters or {})}
         mu, lam, _ = own.at_rest(law_values(own, parameters, per_tet))
+    mu, lam = (0.0 if modulus is None else modulus for modulus in (mu, lam))
     points = torch.as_tensor(model.rest_points if rest_points is None else rest_points, device=like.device)
     points = points.to(like).transpose(-1, -2)
     gradients, volume = shape_functions(points, layout.tets)

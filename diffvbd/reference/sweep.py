@@ -36,8 +36,8 @@ def step(
     v: Tensor,
     solver: Any,
     *,
-    mu: Any = 0.0,
-    lam: Any = 0.0,
+    mu: Any = None,
+    lam: Any = None,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,
@@ -51,10 +51,10 @@ def step(
     """One time step of a model by a solver (`diffvbd.VBD`); every tensor argument is differentiable by autograd.
 
     x, v: positions [m] and velocities [m/s], [..., V, 3]; leading dimensions are scenes. mu, lam [Pa] broadcast to
-    x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
-    [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
-    coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
-    given; record: a list, to which the step appends the lengths that it took.
+    x.shape[:-2] + (T,); None: those of a law of one's own, else 0. force [N], gravity [m/s^2], prescribed, rest_points
+    [m] broadcast to x's shape; density [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only
+    the order of summation. coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are
+    searched for if not given; record: a list, to which the step appends the lengths that it took.
     parameters: of energies, as `floor_kappa`, and those of MATERIAL. Raises ValueError when an unpinned vertex starts
     below a floor plane. Returns (x', v').
     """
@@ -73,8 +73,8 @@ def rollout(
     solver: Any,
     *,
     steps: int,
-    mu: Any = 0.0,
-    lam: Any = 0.0,
+    mu: Any = None,
+    lam: Any = None,
     force: Tensor | None = None,
     gravity: Any = (0.0, -9.81, 0.0),
     prescribed: Tensor | None = None,

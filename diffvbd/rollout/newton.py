@@ -203,7 +203,8 @@ def _decreases(at: StaticPotential, to: StaticPotential, promised: Tensor, input
     admitted at all; bool [B]."""
     more, size = at.increase(inputs, to)
     eps = torch.finfo(more.dtype).eps
-    return more <= DECREASE * promised + ROUNDINGS * eps * size, torch.isfinite(more)
+    # a difference: where both are infinite it is no number
+    return more - ROUNDINGS * eps * size <= DECREASE * promised, torch.isfinite(more)
 
 
 def _state(at: StaticPotential, x: Tensor) -> StaticPotential:

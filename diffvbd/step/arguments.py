@@ -206,7 +206,7 @@ def prepare(
         of_law = {name: parameters[name] for name in model.law.inputs if name in parameters}
         parameters = {name: value for name, value in parameters.items() if name not in of_law}
         law = law_inputs(model, of_law, lambda name, value, shape: _scenes_first(name, value, like, lead, shape))
-        mu = lam = 0.0
+        mu = lam = None
     elif not model.energy_mask & ELASTIC:
         mu = lam = 0.0
     elif mu is None or lam is None or young is not None or poisson is not None:

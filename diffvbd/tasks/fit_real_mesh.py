@@ -36,6 +36,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.mesh.tet_mesh import TET_FACES, inner_faces
 from diffvbd.tasks.optimizer import lbfgs
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
@@ -222,11 +223,10 @@ def scaled(mesh: dv.TetMesh, height: float) -> dv.TetMesh:
 
 def neighbors(mesh: dv.TetMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Both tets of each inner face and its area [m^2], shape [F] each."""
-    faces = np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(1))
-    a, b, c = mesh.points[faces[order[same]]].transpose(1, 0, 2)
-    return order[same] // 4, order[same + 1] // 4, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    one, two = inner_faces(mesh.tets)
+    faces = np.sort(mesh.tets[:, TET_FACES].reshape(-1, 3)[one], axis=1)
+    a, b, c = mesh.points[faces].transpose(1, 0, 2)
+    return one // 4, two // 4, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def pulls(mesh: dv.TetMesh, count: int) -> np.ndarray:

@@ -20,15 +20,15 @@ def hollow_box(cells: tuple[int, int, int] = (3, 3, 3), size: Any = 0.3, low: in
 
 
 def coupled(*extra: Any, pinned: bool = True, gas: bool = False, places: bool = False, tension_only: bool = False,
-            device: Any = "cpu") -> dv.Model:  # fmt: skip
-    """All three couplings at once, and other energies."""
+            law: Any = None, device: Any = "cpu") -> dv.Model:  # fmt: skip
+    """All three couplings at once, and other energies; law: the elastic one, default: stable Neo-Hookean."""
     mesh = dv.mesh.join([hollow_box(), dv.mesh.cube(2, 0.1).translate((0.5, 0.1, 0.1))])
     first = dv.Embedding.of_points(mesh, [[0.3, 0.15, 0.15], [0.28, 0.03, 0.1]])
     second = dv.Embedding.of_points(mesh, [[0.5, 0.14, 0.15], [0.52, 0.13, 0.12]])
     route = dv.Embedding.of_points(mesh, [[0.05, 0.3, 0.1], [0.15, 0.3, 0.12], [0.29, 0.28, 0.1], [0.55, 0.15, 0.15]])
     frame = torch.tensor([[0.52, 0.1, 0.1], [0.4, 0.2, 0.1]])
     energies = (
-        dv.StableNeoHookean(),
+        dv.StableNeoHookean() if law is None else law,
         dv.Springs(first, frame if places else second, 100.0, tension_only=tension_only),
         dv.Tendons(route, [[0, 1, 2], [3, 2]], 80.0, 0.2),
         dv.Pressure(pressure=900.0, gas=gas),

@@ -5,17 +5,24 @@ One law with every invariant and function is compiled for all quick tests, once 
 """
 
 import math
+import os
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
+from helpers.coupled import coupled
+from helpers.coupled import inputs_of as inputs_of_coupled
+from helpers.executed import assert_executed, assert_like_differences, run_of
 from helpers.paths import needs_csrc
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
+from diffvbd.laws import tets
+from diffvbd.model.material import shape_gradients
 from diffvbd.testing import evaluate, relative_error
+from diffvbd.testing.dense_statics import coupling_energy, residual, weight
 
 pytestmark = [needs_csrc, pytest.mark.slow]  # a law is compiled
 F64 = torch.float64
@@ -30,8 +37,10 @@ PINNED = MESH.points[:, 0] == 0.0
 
 @pytest.fixture(scope="module", autouse=True)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    own = tmp_path_factory.getbasetemp()
+    shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own  # by the processes of the session
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path_factory.mktemp("laws")))
+        patch.setenv("TORCH_EXTENSIONS_DIR", str(shared / "laws"))
         yield
 
 
@@ -87,6 +96,80 @@ def test_batches_floors_anchors() -> None:
     model = model_of(dv.FloorBarrier(height=-0.03, kappa=500.0, dhat=0.05, damping=5.0), dv.Anchor(40.0), pinned=None)
     inputs = {k: v for k, v in inputs_of(model, 0.004, (2,)).items() if k != "stress_free"}
     compare(model, dv.VBD(0.005, 2), inputs | {"anchor_stiffness": torch.tensor(40.0, dtype=F64)}, 1e-10)
+
+
+def held_and_pulled(**options: Any) -> tuple[dv.Model, dict[str, Tensor]]:
+    """Bodies of the law with springs, tendons and pressure, and every input."""
+    model = coupled(law=law_of(), **options)
+    inputs = inputs_of_coupled(model)
+    stiff = inputs["mu"]
+    inputs |= {"c": stiff / 5, "m": stiff / 4, "k": stiff / 2, "s": VALUES["s"] + 0 * stiff}
+    inputs["a0"] = torch.tensor([1.0, 0.3, -0.2], dtype=F64) + torch.sin(torch.arange(3 * len(stiff), dtype=F64)
+                                                                          ).view(-1, 3) / 4  # fmt: skip
+    return model, inputs
+
+
+@pytest.mark.parametrize(("sweeps", "options"), [(1, {}), (5, {}), (5, {"gas": True, "places": True})], ids=str)
+def test_couplings(sweeps: int, options: dict[str, Any]) -> None:
+    model, inputs = held_and_pulled(**options)
+    assert_executed((model, model), dv.VBD(0.01, sweeps), 1, lambda model: inputs)
+
+
+@pytest.mark.parametrize("sweeps", [1, 5])
+def test_central_differences_with_couplings(sweeps: int) -> None:
+    model, inputs = held_and_pulled(gas=True, places=True)
+    assert_like_differences(run_of(model, dv.VBD(0.01, sweeps)), inputs, 0.01)
+
+
+def test_rest_states_with_couplings() -> None:
+    """Forces balance, those of a spring and a tendon from their definitions; gradients are those of differences."""
+    end, route = (dv.Embedding.of_points(MESH, p) for p in ([[0.3, 0.1, 0.12]], [[0.28, 0.2, 0.1], [0.05, 0.2, 0.07]]))
+    springs = dv.Springs(end, torch.tensor([[0.35, 0.3, 0.2]], dtype=F64), 900.0, 0.1)
+    model = model_of(springs, dv.Tendons(route, [[0, 1]], 500.0, 0.2))
+    law, x, solver = law_of(), model.rest_points, dv.VBD(1.0, 0, subspace="coarse")
+    names = ("spring_stiffness", "spring_rest_length", "spring_points", "tendon_stiffness", "tendon_rest_length")
+    inputs = {f"{e.name}_{k}": v for e in model.couplings for k, v in model.constants(e).items()}
+    inputs = {name: inputs[name] for name in names} | {k: v.expand(model.num_tets) for k, v in law.values.items()}
+    fibres = shape_gradients(x[model.tets])[0] @ (law.a0 / law.a0.norm())
+    parameters = torch.stack([inputs[name] for name in law.density.parameters], -1)
+    scalars = torch.cat([model.rest_scalars[0], fibres, parameters], -1)
+
+    def energy(at: Tensor) -> Tensor:
+        elastic = tets.energy(law.density, at[model.tets], scalars).sum()
+        return elastic + coupling_energy(model, at, inputs) - (weight(model) * at).sum()
+
+    options: Any = {"tolerance": 1e-10, "adjoint": dv.GlobalAdjoint(tolerance=1e-12)}
+    rest = dv.equilibrium(model, x, solver, **options, **inputs).x
+    assert float((rest - x).abs().max()) > 5e-3
+    assert residual(model, energy, weight(model), rest) < 1e-8
+
+    def loss(**given: Any) -> Tensor:
+        return dv.equilibrium(model, rest, solver, **options, **given).x.square().sum()
+
+    inputs = {name: inputs[name] for name in (*names, "mu", "k")}
+    check = dv.check_gradients(loss, inputs, relative_steps=(1e-3, 1e-4), verbose=False)
+    assert check.ok and all(size > 0 for _, size, *_ in check.rows), str(check)
+
+
+def test_a_step_to_an_infinite_energy_is_not_taken() -> None:
+    """The first whole Newton step stretches fibres until the exponential overflows."""
+    model = coupled(law=law_of())
+    done = dv.equilibrium(model, model.rest_points, dv.VBD(1.0, 0))
+    assert done.converged and float((done.x - model.rest_points).abs().max()) > 5e-3
+
+
+LOG = "mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2"
+
+
+@pytest.mark.parametrize("law", [
+    dv.law("C10*(I1*J**(-2/3) - 3) + C01*(I2*J**(-4/3) - 3) + K/2*(J - 1)**2", C10=4e4, C01=1e4, K=4e5),
+    pytest.param(dv.law(LOG + " + k1/(2*k2)*(exp(k2*(I4 - 1)**2) - 1)", mu=3e4, lam=1e5, k1=5e4, k2=2.0,
+                        a0=(1.0, 0.0, 0.0)), marks=pytest.mark.hours),  # all of its terms are in TEXT
+], ids=["Mooney-Rivlin", "fibres"])  # fmt: skip
+@pytest.mark.parametrize("sweeps", [1, 5])
+def test_laws_of_the_guide(law: Any, sweeps: int) -> None:
+    model = dv.Model(MESH, pinned=PINNED, energies=(law,))
+    compare(model, dv.VBD(0.01, sweeps), inputs_of(model, 0.005))
 
 
 def test_coarse_corrections() -> None:
@@ -153,7 +236,7 @@ def test_tapes_agree_and_updates_are_shortened() -> None:
     y = torch.where(model.pinned[:, None], x, y)
 
     def potential(at: Tensor) -> Tensor:
-        return reference.incremental_potential(model, at, y, 0.0, 0.0, 0.01, parameters=model.law.values)
+        return reference.incremental_potential(model, at, y, None, None, 0.01)
 
     values = [potential(y)]
     for sweeps in range(1, 6):
@@ -235,6 +318,17 @@ def test_inputs_and_refusals() -> None:
     with pytest.raises(ValueError, match="a0: expected directions of finite length > 0"):
         dv.step(model, x, v, solver, a0=torch.zeros(3, dtype=F64))
     assert "law(" in repr(model) and bool(dv.diagnose(model, x, solver).smallest_volume_ratio > 0.9)
+
+
+def test_a_modulus_of_zero_is_given() -> None:
+    """It is not taken for the law's own; in the reference, too."""
+    model, solver = model_of(), dv.VBD(0.01, 2)
+    inputs = inputs_of(model, 0.004)
+    x, v = inputs["x"], inputs["v"]
+    own, without = (dv.step(model, x, v, solver, **given)[0] for given in ({}, {"lam": 0.0}))
+    assert float((own - without).abs().max()) > 1e-6
+    for expected, given in ((own, {}), (without, {"lam": 0.0})):
+        assert relative_error(reference.step(model, x, v, solver, **given)[0], expected) < 1e-12
 
 
 @pytest.mark.hours

@@ -9,10 +9,10 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from helpers.marks import slow
 from helpers.paths import CSRC, ROOT, needs_csrc
 from torch.utils import cpp_extension
 
@@ -97,11 +97,19 @@ UNITS = [*KERNELS, *map(Path, INSTANCES)]
 TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(UNITS)]
 STEMS = [k.stem for k in UNITS]
 QUICK = ("scene_reverse_float", "contact_float")  # the sweep, all energies with their adjoints, pairs
+HOURS = ("reverse_state", "reverse_material")  # instances of what reverse_rest has, with fewer gradients
+
+
+def marked(kernel: Path, architecture: str) -> Any:
+    if kernel.stem in QUICK:
+        return kernel, architecture
+    mark = pytest.mark.hours if kernel.stem.startswith(HOURS) else pytest.mark.slow
+    return pytest.param(kernel, architecture, marks=mark)
 
 
 @needs_csrc
 @needs_nvcc
-@pytest.mark.parametrize(("kernel", "architecture"), [t if t[0].stem in QUICK else slow(*t) for t in TURNS], ids=STEMS)
+@pytest.mark.parametrize(("kernel", "architecture"), [marked(*turn) for turn in TURNS], ids=STEMS)
 def test_kernels_compile(tmp_path: Path, kernel: Path, architecture: str) -> None:
     """To machine code, as ptxas alone finds what does not fit the hardware: the variant that has everything. The
     architectures take turns."""
@@ -246,6 +254,7 @@ def test_jit_survives_a_killed_build(fake: Fake) -> None:
         # the loader alone: the rest of the package takes seconds
         f"""import sys, types, torch
 from pathlib import Path
+from typing import Any
 for name in ("diffvbd", "diffvbd.ops"):
     sys.modules[name] = types.ModuleType(name)
     sys.modules[name].__path__ = [{str(ROOT)!r} + "/" + name.replace(".", "/")]

@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch
+from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -29,7 +30,8 @@ def check(problem: Problem, from_rest: bool = True) -> None:
     assert float((done.x - newton(model, energy, start if from_rest else done.x)).abs().max()) < 1e-6 * moved
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+# coupled bodies, of which test_equilibrium_couplings.py has small ones
+@pytest.mark.parametrize("name", [slow(name) if name == "bent by a tendon" else name for name in PROBLEMS])
 def test_rest_states(name: str) -> None:
     check(PROBLEMS[name]())
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.coupled import hollow_box
-from helpers.marks import slow
 
 import diffvbd as dv
 from diffvbd.testing import tolerance
@@ -182,7 +181,7 @@ def blown(h: float, sweeps: int, *, gas: bool = False, explicit: bool = False, d
     return (motion.x - x)[:, x[:, 0] > 0.0999, 1].mean(1).double()
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, slow(torch.float32)])
+@pytest.mark.parametrize("dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.hours)])
 def test_a_blown_finger_moves_alike_at_long_and_short_steps(dtype: torch.dtype) -> None:
     short, long = blown(1e-3, 8, dtype=dtype), blown(1e-2, 60, dtype=dtype)
     assert float(short[250:].mean()) < -2e-3
