@@ -104,9 +104,9 @@ class Pairs:
 class PairBarrier:
     """e b(d - offset) over the pairs of a substep.
 
-    With E = e b and its gradient F, the block is e b'' n n' of a point and a face, and where e < 0 a bound of e b' Hess d;
-    of two edges F F' / E + e (b'' - 2/3 b'^2 / b) n n'. It takes the stiffness of a pair once for each of its corners of
-    the color: they move at once.
+    With E = e b and its gradient F, the block is e b'' n n' of a point and a face, and where e < 0 a bound of
+    e b' Hess d; of two edges F F' / E + e (b'' - 2/3 b'^2 / b) n n'. It takes the stiffness of a pair once for each of
+    its corners of the color: they move at once.
     """
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:

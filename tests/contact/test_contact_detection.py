@@ -175,8 +175,10 @@ def test_far_from_the_origin(device: str, dtype: torch.dtype) -> None:
     s = mixed_scene()
     v, far = s.x.shape[1], np.array([4096.0, -8192.0, 1024.0])
     triangles, edges = (s.triangles < v).all(1), (s.edges < v).all(1)
-    mesh = replace(s, triangles=s.triangles[triangles], edges=s.edges[edges],
-                   face_counts=s.face_counts[np.concatenate([triangles, edges])], points=s.points[s.points < v], planes=s.planes[:0])  # fmt: skip
+    mesh = replace(
+        s, triangles=s.triangles[triangles], edges=s.edges[edges], points=s.points[s.points < v], planes=s.planes[:0],
+        face_counts=s.face_counts[np.concatenate([triangles, edges])],
+    )  # fmt: skip
     body = mesh.body[:v]
     mesh.origin = np.stack([np.round(mesh.x[0, body == b][0], 1) for b in range(3)])[body][None]
     mesh.origin = mesh.origin.astype(np.float32).astype(np.float64)

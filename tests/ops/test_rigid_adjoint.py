@@ -54,7 +54,7 @@ CASES = {
     # more than sixty-four: groups of three and two, and those of a stack that is too high, each alone
     "many": ((PAIRS, dv.Friction(0.4, 0.05)), {"heights": (3, MOST_COUPLED + 1, 2, 1), "scenes": 2}),
     "single": ((FLOOR, PAIRS, dv.Friction(0.4)), {"dtype": torch.float32}),
-    "held": ((FLOOR, PAIRS, dv.Friction(0.4)), {"heights": (3,), "closing": 4.0}),
+    "held": ((FLOOR, PAIRS, dv.Friction(0.4)), {"heights": (3,), "closing": 6.0}),
 }
 
 

@@ -13,7 +13,6 @@ from helpers.two_tets import COLLIDERS, DHAT, detect, moved_state, scene_of, sta
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import reference
 from diffvbd.reference import distance
 from diffvbd.reference.contact import LaggedPairForces, PairBarrier, Pairs
 from diffvbd.reference.energies import build_energies, floor_friction
@@ -60,8 +59,8 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
 
 def test_barrier_block_is_that_of_the_manual() -> None:
     """Of one pair at a time; N of its corners share the vertex's color. With E = e b, its gradient F and that s of the
-    gap, H is N h^2 times e b'' s s' of a point and a face, and where e < 0 also b' e / d (s's I - s s'); and of two edges
-    F F' / E + e (b'' - 2/3 b'^2 / b) s s'."""
+    gap, H is N h^2 times e b'' s s' of a point and a face, and where e < 0 also b' e / d (s's I - s s'); and of two
+    edges F F' / E + e (b'' - 2/3 b'^2 / b) s s'."""
     model, x, _ = setup()
     part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None])
     vertex, kappa = 4, torch.tensor(200.0, dtype=torch.float64)

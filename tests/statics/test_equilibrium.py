@@ -74,8 +74,8 @@ def test_two_blocks_pressed_together() -> None:
     points = [side.unique()[:, None] for side in sides]
     lists = []  # kind, sides, how often each pair counts; of a closed surface triangles less edges plus vertices
     for k in (0, 1):
-        lists += [(POINT_TRIANGLE, points[k], sides[1 - k], 1), (POINT_TRIANGLE, points[k], points[1 - k].expand(-1, 3), 1),
-                  (POINT_TRIANGLE, points[k], edges[1 - k][:, [0, 1, 1]], -1)]  # fmt: skip
+        faces = (sides[1 - k], 1), (edges[1 - k][:, [0, 1, 1]], -1), (points[1 - k].expand(-1, 3), 1)
+        lists += [(POINT_TRIANGLE, points[k], *face) for face in faces]
     sharp = [on_two_sides(x, edge, side) for edge, side in zip(edges, points, strict=True)]
     for a, b in itertools.product((True, False), repeat=2):
         lists += [(EDGE_EDGE, edges[0][sharp[0] == a], edges[1][sharp[1] == b], 1 if a and b else 0)]
