@@ -54,8 +54,8 @@ void require_capacity(int64_t capacity) {
 // many rows as there are pairs, and no more than the capacity. On CUDA to know their number would wait.
 DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collider_next, In rest, In radius,
                  In triangles, In edges, In points, In planes, In body, In pinned, In trust_radius,
-                 In deformation_radius, In face_counts, int64_t mesh_bodies, bool self_contact, bool between_bodies,
-                 double dhat, int64_t capacity, bool trim) {
+                 In deformation_radius, In face_counts, In point_weights, int64_t mesh_bodies, bool self_contact,
+                 bool between_bodies, double dhat, int64_t capacity, bool trim) {
   const Device device(x);
   require_capacity(capacity);
   return dispatch_float(x, [&]<class T>(T) {
@@ -66,6 +66,7 @@ DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collid
     in.trust_radius = read.like("trust_radius", trust_radius, read.b * (in.mesh_bodies + int64_t{1}));
     in.deformation_radius = read.like("deformation_radius", deformation_radius, read.b * (in.mesh_bodies + int64_t{1}));
     in.counts = read.index("face_counts", face_counts, int64_t{in.num_triangles} + in.num_edges);
+    in.weights = read.like("point_weights", point_weights, in.num_points);
     in.dhat = static_cast<T>(dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor near_corners = device.empty({b, n, contact::kNearRow}, ScalarType::Int);

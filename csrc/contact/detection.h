@@ -173,6 +173,7 @@ struct Surfaces {
   const T *rest, *radius;             // [N, 3], [N]
   const int32_t *triangles, *edges, *points, *planes, *body;
   const int32_t* counts;  // of triangles, then of edges: how often a face counts, and whether an edge is sharp; or null
+  const T* weights;       // [num_points] of the barrier of each point
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -422,7 +423,8 @@ template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
   Constants<T> out{in.dhat, offset_of(in, c), T(1), true};
   const bool one_body = is_of_one_body(in, c);
-  if (c.kind == kPointTriangle && in.counts) out.measure = T(in.counts[c.b]);
+  if (c.kind != kEdgeEdge && in.counts) out.measure = in.weights[c.a];
+  if (c.kind == kPointTriangle && in.counts) out.measure = out.measure * T(in.counts[c.b]);
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
   const auto squared_length = [&](int i, int j) {

@@ -244,9 +244,9 @@ DIFFVBD_FN Distance<Dual<R>> distance_by(int kind, int feature, const Corners<Du
   }
 }
 
-// Constants of a listed pair. measure: of a point and a face, how often that counts: 1 less the counts of the faces
-// that contain it, so that a point that is close to several faces of a surface has one barrier in all (Li et al. 2023).
-// Of two edges u and v 1e-3 |u|^2 |v|^2 at rest [m^4].
+// Constants of a listed pair. measure: of a point and a face, the point's weight times how often the face counts: 1
+// less the counts of the faces that contain it, so that a point that is close to several faces of a surface has one
+// barrier in all (Li et al. 2023). Of two edges u and v 1e-3 |u|^2 |v|^2 at rest [m^4].
 template <class T>
 struct PairConstants {
   T dhat, offset, measure;  // the first two [m]: reach of the barrier, and the radii that the gap is less than d

@@ -123,6 +123,18 @@ DIFFVBD_FN void clear_upper_halves() {
   __builtin_ia32_vzeroupper();
 #endif
 }
+// What is seldom or costly in any case: out of line and in memory, so that no register is in use across a call.
+template <class T, class F>
+DIFFVBD_FN Lanes<T> each_lane(const Lanes<T>& a, const F& f) {
+  T values[kLanes];
+  a.store(values);
+  for (int l = 0; l < kLanes; ++l) values[l] = f(values[l], l);
+  return Lanes<T>::load(values);
+}
+template <class T>
+DIFFVBD_APART Lanes<T> power_of_two(const Lanes<T>& a) {
+  return each_lane(a, [](T value, int) { return diffvbd::power_of_two(value); });
+}
 #ifndef DIFFVBD_LAW_HEADER
 template <class T>
 DIFFVBD_FN Lanes<T> natural_log(const Lanes<T>& a) {
@@ -133,15 +145,7 @@ DIFFVBD_FN Lanes<T> natural_log(const Lanes<T>& a) {
   }
   return r;
 }
-#else
-// Generated laws have many functions: out of line and in memory, so that no register is in use across a call.
-template <class T, class F>
-DIFFVBD_FN Lanes<T> each_lane(const Lanes<T>& a, const F& f) {
-  T values[kLanes];
-  a.store(values);
-  for (int l = 0; l < kLanes; ++l) values[l] = f(values[l], l);
-  return Lanes<T>::load(values);
-}
+#else  // generated laws have many functions
 template <class T>
 DIFFVBD_APART Lanes<T> natural_log(const Lanes<T>& a) {
   return each_lane(a, [](T value, int) { return std::log(value); });
@@ -153,10 +157,6 @@ DIFFVBD_APART Lanes<T> exponential(const Lanes<T>& a) {
 template <class T>
 DIFFVBD_APART Lanes<T> power(const Lanes<T>& a, const Lanes<T>& p) {
   return each_lane(a, [&](T value, int l) { return std::pow(value, p.v[l]); });
-}
-template <class T>
-DIFFVBD_APART Lanes<T> power_of_two(const Lanes<T>& a) {
-  return each_lane(a, [](T value, int) { return diffvbd::power_of_two(value); });
 }
 #endif
 

@@ -85,11 +85,11 @@ DIFFVBD_FN Vec3<R> if_small(const Vec3<R>& correction, const R& limit) {
 // The Newton step d of a block, refined. In the axes of the block, as `d`.
 template <class Set, class R, class T, class Star>
 DIFFVBD_COLD Vec3<R> refined_step(const Block<R>& b, const Star& star, const StepParameters<T>& q,
-                                  const Axes<Set, R>& axes, const Factor<R>& H, const Vec3<R>& first) {
+                                  const Axes<Set, R>& axes, const Factor<R>& H, const R& shift, const Vec3<R>& first) {
   Vec3<R> d = first;
   for (int k = 0; k < kRefinements; ++k) {
     const Both<R> now{d, axes.from(d)}, none{zero3<R>(), zero3<R>()};
-    d -= if_small(solve(H, apply<Set>(b, star, q, axes, now, none).g), dot(d, d));
+    d -= if_small(solve(H, apply<Set>(b, star, q, axes, now, none).g + shift * d), dot(d, d));
   }
   return d;
 }
@@ -131,13 +131,14 @@ DIFFVBD_COLD Vec3<R> reverse_star(const Block<R>& given, const Star& star, const
 // Copies keep what the well-conditioned path works with in registers.
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN Vec3<R> refine_step(const Block<R>& b, const Star& star, const StepParameters<T>& q,
-                               const Axes<Set, R>& axes, const Factor<R>& H, const Vec3<R>& d) {
+                               const Axes<Set, R>& axes, const Factor<R>& H, const R& shift, const Vec3<R>& d) {
   const Block<R> b_copy = b;
   const Star star_copy = star;
   const Axes<Set, R> axes_copy = axes;
   const Factor<R> H_copy = H;
   const Vec3<R> d_copy = d;
-  return refined_step<Set>(b_copy, star_copy, q, axes_copy, H_copy, d_copy);
+  const R shift_copy = shift;
+  return refined_step<Set>(b_copy, star_copy, q, axes_copy, H_copy, shift_copy, d_copy);
 }
 template <class Set, int wanted, class R, class T, class Star>
 DIFFVBD_FN Vec3<R> reverse_refined(const Block<R>& b, const Star& star, const StepParameters<T>& q,

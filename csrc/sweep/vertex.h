@@ -50,27 +50,32 @@ DIFFVBD_FN R descending_fraction(const Block<R>& b, const Star& star, const Step
   return out;
 }
 
-// A block of such a law may have negative curvature. It is then shifted by the least of some powers of two [kg] that
-// makes it positive definite: decided, and constant in the reverse, as the factored block is that of the shifted one.
+// A block of such a law, or of pairs that count negative, may have negative curvature. It is then shifted by the least
+// of some powers of two [kg] that makes it positive definite: decided, and constant in the reverse, as the factored
+// block is that of the shifted one.
 constexpr double kLeastCurvature = 1.0 / 64;  // of the vertex's own mass
 constexpr int kShifts = 8;
-template <class R>
-DIFFVBD_FN R least_minor(const Sym3<R>& a, const R& shift) {  // above 0 where it is positive definite
-  const R xx = a.xx + shift, yy = a.yy + shift, zz = a.zz + shift;
-  const R two = xx * yy - a.xy * a.xy;
-  const R all = xx * (yy * zz - a.yz * a.yz) - a.xy * (a.xy * zz - a.yz * a.xz) + a.xz * (a.xy * a.yz - yy * a.xz);
-  const R least = select(two < all, two, all);
+// Above 0 where it is positive definite, up to rounding: the least pivot. A determinant would lose what the stiffest
+// direction takes.
+template <class T, class R>
+DIFFVBD_FN R least_pivot(const Sym3<R>& a, const R& shift) {
+  const R rounding = R(16 * std::numeric_limits<T>::epsilon());
+  const R xx = a.xx + shift, first = R(1) / select(R(0) < xx, xx, R(1));
+  const R yy = a.yy + shift - first * a.xy * a.xy, t = a.yz - first * a.xy * a.xz;
+  const R zz = a.zz + shift - first * a.xz * a.xz - t * t / select(R(0) < yy, yy, R(1));
+  const R second = yy + rounding * absolute(a.yy), third = zz + rounding * absolute(a.zz);
+  const R least = select(second < third, second, third);
   return select(xx < least, xx, least);
 }
-template <class R, class Star>
+template <class T, class R, class Star>
 DIFFVBD_FN R shift_of(const Sym3<R>& H, const R& least, const Star& star) {
   R shift = R(0);
-  if (!star.any(R(0) < select(R(0) < least_minor(H, -least), R(0), R(1)))) return shift;
+  if (!star.any(R(0) < select(R(0) < least_pivot<T>(H, -least), R(0), R(1)))) return shift;
   const R size =
       absolute(H.xx) + absolute(H.yy) + absolute(H.zz) + R(2) * (absolute(H.xy) + absolute(H.xz) + absolute(H.yz));
   R trial = R(0.0625) * power_of_two(select(R(0) < size, size, least));
   for (int k = 0; k < kShifts; ++k) {
-    shift = select(R(0) < least_minor(H, shift - least), shift, trial);
+    shift = select(R(0) < least_pivot<T>(H, shift - least), shift, trial);
     trial = trial + trial;
   }
   return shift;
@@ -131,16 +136,18 @@ template <class Set, class R, class T, class Star>
 DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const System<Set, R> system = assemble<Set>(b, star, q);
   Sym3<R> block = system.H;
-  R least = system.least;
-  if constexpr (!Set::Elastic::quadratic) {
-    least = R(kLeastCurvature) * least;
-    add_diagonal(block, shift_of(block, least, star));
+  R least = system.least, shift = R(0);
+  if constexpr (!Set::Elastic::quadratic || Set::contact) {
+    const R own = least_eigenvalue(b, q), bound = R(kLeastCurvature) * own;
+    shift = shift_of<T>(block, bound, star);
+    add_diagonal(block, shift);
+    least = select(own < least, least, bound);  // turned axes round more
   }
   const Factor<R> H = factor<T>(block, least);
   Vec3<R> d = -solve(H, system.g);
   if constexpr (!Set::well_conditioned && Set::Elastic::quadratic) {
     if (star.any(is_ill_conditioned<Set>(H, shared_entries<Set>(b, system.axes))))
-      d = refine_step<Set>(b, star, q, system.axes, H, d);
+      d = refine_step<Set>(b, star, q, system.axes, H, shift, d);
   }
   return {d, system.axes.from(d), H};
 }

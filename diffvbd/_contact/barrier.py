@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from .._common.constants import CONTACT
 from ..mesh import TetMesh
 from ..mesh.tet_mesh import signed_volume
 from .colliders import mean_edges, unique_edges
+from .faces import mean_area
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
 # Defaults: dhat over the mean edge of the finest surface; and an impact that closes four fifths of it.
@@ -39,16 +41,16 @@ def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
 class PairBarrier:
     """IPC log barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) between surfaces of a Model's bodies and its colliders.
 
-    Every pair of a point and a triangle and of two edges counts once, with d their distance, whatever features are
-    closest; edges that become parallel are mollified. From a start without intersections no executed sweep lets two
-    surfaces cross, at any speed and any number of sweeps: each motion leaves a plane between the sides of every pair
-    that could meet, and no vertex goes farther than pairs were looked for. What has been truncated is lost as velocity
-    (see :func:`diffvbd.contact.status`). Two places of one body that coincide at rest (a crack, doubled vertices) are
-    never a pair: they may pass through each other.
+    A point has the barrier of its distance d to a surface, once, however many triangles are near. Where edges cross
+    without a vertex near, they have one, too, in full if both are sharp. From a start without intersections no executed
+    sweep lets two surfaces cross, at any speed and any number of sweeps: each motion leaves a plane between the sides
+    of every pair that could meet, and no vertex goes farther than pairs were looked for. What has been truncated is
+    lost as velocity (see :func:`diffvbd.contact.status`). Two places of one body that coincide at rest (a crack,
+    doubled vertices) are never a pair: they may pass through each other.
 
     Args:
-        kappa: Barrier stiffness [N/m]. None: so stiff that one side of the moving body that needs most stops it at 3
-            m/s within four fifths of dhat.
+        kappa: Barrier stiffness [N/m] of a vertex, and of two edges. None: so stiff that one side of the moving body
+            that needs most stops it at 3 m/s within four fifths of dhat.
         dhat: Activation distance [m]. Pairs of one body that are closer at rest use 0.9 of their rest distance. None: a
             tenth of the mean surface edge of the body with the finest surface.
         self_contact: Pairs within a body.
@@ -63,6 +65,9 @@ class PairBarrier:
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
             detections, relative to the motion that bodies near each other share. None: that is one mean edge of its
             body, or 8 where a single body moves.
+        kappa_per_area: Instead of kappa, the stiffness of the barrier over an area [N/m^3]. Each vertex then weighs by
+            the area that it bears for, so that the same body rests at the same gap however finely it is meshed.
+            ``kappa`` of the Model's barrier, and the input ``pair_kappa``, are those of a vertex of mean area.
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
 
@@ -71,8 +76,8 @@ class PairBarrier:
     Raises:
         ValueError, TypeError: For numbers out of range.
 
-    Source: Li et al. (2020) for the barrier; planes between sides after Chen et al. (2025) and planar division;
-    docs/method.md, section 12.
+    Source: Li et al. (2020) for the barrier, Li et al. (2023) for what counts; planes between sides after Chen et al.
+    (2025) and planar division; docs/method.md, section 12.
     """
 
     name: ClassVar[str] = "pair"
@@ -88,11 +93,16 @@ class PairBarrier:
     detections: int | None = None
     reach: float | None = None
     capacity: int | None = None
+    kappa_per_area: float | None = None
 
     def __post_init__(self) -> None:
         refuse_gradients(self)
         if self.kappa is not None:
             object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
+        if self.kappa_per_area is not None:
+            object.__setattr__(self, "kappa_per_area", check_number("kappa_per_area", self.kappa_per_area))
+            if self.kappa is not None:
+                fail("kappa_per_area", "None, or kappa None", f"{self.kappa_per_area:g} beside kappa = {self.kappa:g}")
         if self.dhat is not None:
             object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
         object.__setattr__(self, "damping", check_number("damping", self.damping))
@@ -131,9 +141,16 @@ class PairBarrier:
             finest = float(edge[edge > 0].min())
             load = float((mass / np.maximum(side, 1 / 6))[moves if moves.any() else ...].max())
         dhat = self.dhat or min(DHAT_OF_EDGE * finest, (self.reach or np.inf) / 2)
-        # m v^2 / 2 = n b of the gap that is left
-        kappa = load * IMPACT**2 / 2 / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
-        return replace(self, kappa=kappa if self.kappa is None else self.kappa, dhat=dhat)
+        if self.kappa is not None:
+            kappa = self.kappa
+        elif self.kappa_per_area is not None:
+            kappa = self.kappa_per_area * mean_area(mesh)
+        else:  # m v^2 / 2 = n b of the gap that is left
+            kappa = load * IMPACT**2 / 2 / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
+        fitted = copy(self)  # not checked again: it may have kappa beside kappa_per_area
+        object.__setattr__(fitted, "kappa", kappa)
+        object.__setattr__(fitted, "dhat", dhat)
+        return fitted
 
 
 @init_names_checked

@@ -33,8 +33,8 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
     )
     return ops_contact.contact_detect(
         x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.pinned, trust_radius,
-        deformation_radius, s.face_counts, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat,
-        capacity, not torch.compiler.is_compiling(),
+        deformation_radius, s.face_counts, s.point_weights, s.bodies, barrier.self_contact, barrier.between_bodies,
+        barrier.dhat, capacity, not torch.compiler.is_compiling(),
     )  # fmt: skip
 
 

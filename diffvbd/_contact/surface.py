@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from .._contact.barrier import PairBarrier
 from .._contact.colliders import Capsule, Collider, Obstacle, Plane, Sphere, mean_edges, unique_edges
+from .._contact.faces import faces_of, mean_area, sharp_edges, vertex_areas
 from ..mesh import TetMesh
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
@@ -23,8 +23,6 @@ MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_PINNED = 0.2, 0.3, 0.75
 # Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
 COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
-# Degrees by which a surface turns at rest along a sharp edge. Below, it lies within 3 % of an edge from its vertices.
-SHARP = 15.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +36,9 @@ class ContactSurface:
     )
     num_triangles: int  # of those
     edges: Tensor  # [E, 2] int32
-    face_counts: Tensor  # [F + E] int32: how often each face counts, and which edges are sharp (faces_of, sharp_edges)
+    face_counts: Tensor  # [F + E] int32: how often each face counts, and which edges are sharp
     points: Tensor  # [P] int32
+    point_weights: Tensor  # [P] of the barrier of each point
     planes: Tensor  # [L, 3] int32
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
     pinned: Tensor  # [N] bool: pinned, or of a collider
@@ -123,6 +122,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     if barrier.reach is not None:
         max_trust_radius = max_trust_radius_alone = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
 
+    surface_vertices = len(points[0])
+
     def index_tensor(parts: list[Any], width: int) -> Tensor:
         joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
         return torch.from_numpy(joined.astype(np.int32))
@@ -130,6 +131,11 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     triangles, edges = index_tensor(triangles, 3), index_tensor(edges, 2)
     faces, counts = faces_of(triangles.numpy(), edges.numpy())
     sharp = sharp_edges(np.concatenate(rest), triangles.numpy(), edges.numpy())
+    points = index_tensor(points, 1).reshape(-1)
+    weights = torch.ones(len(points), dtype=torch.float64)
+    if barrier.kappa_per_area is not None:
+        area = vertex_areas(np.concatenate(rest), triangles.numpy())[points.numpy()]
+        weights[area > 0] = torch.from_numpy(area[area > 0] / mean_area(mesh))
     pinned = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
     return ContactSurface(
@@ -139,7 +145,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         num_triangles=len(triangles),
         edges=edges,
         face_counts=torch.from_numpy(np.concatenate([counts, sharp]).astype(np.int32)),
-        points=index_tensor(points, 1).reshape(-1),
+        points=points,
+        point_weights=weights,
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
         pinned=pinned,
@@ -155,49 +162,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         max_trust_radius_alone=max_trust_radius_alone,
         max_deformation_radius=torch.where(pinned_bodies, MOST_EDGES_PINNED, own) * edge,
         min_deformation_radius=LEAST_EDGES_OWN * edge,
-        capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
+        capacity=barrier.capacity or CAPACITY_PER_VERTEX * surface_vertices,
     )
-
-
-def _edges_of(triangles: NDArray[Any], edges: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """All edges once, lower vertex first; the row there of each of ``edges`` [E]; and of the sides of triangles [3F]:
-    those between corners 0 and 1 of all, then 1 and 2, then 2 and 0."""
-    sides = np.concatenate([edges, triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    rows, inverse = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    return rows, inverse[: len(edges)], inverse[len(edges) :]
-
-
-def faces_of(triangles: NDArray[Any], edges: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The faces of surfaces [F, 3], (a, b, b) of edges and (a, a, a) of vertices, and how often each counts [F].
-
-    A face counts 1 less what the faces that contain it count: inclusion and exclusion. Then a point has the barrier of
-    its distance to the surface once, however many faces are as close. Faces that count 0 are left out.
-
-    Source: Li et al. (2023), Convergent incremental potential contact.
-    """
-    rows, _, of_triangles = _edges_of(triangles, edges)
-    of_edges = 1 - np.bincount(of_triangles, minlength=len(rows))
-    vertices = np.unique(rows)
-    of_vertices = np.ones(vertices.max(initial=-1) + 1, np.int64)
-    np.subtract.at(of_vertices, triangles, 1)
-    np.subtract.at(of_vertices, rows, of_edges[:, None])
-    faces = np.concatenate([triangles, rows[:, [0, 1, 1]], np.repeat(vertices[:, None], 3, 1)])
-    counts = np.concatenate([np.ones(len(triangles), np.int64), of_edges, of_vertices[vertices]])
-    return faces[counts != 0].astype(np.int32), counts[counts != 0].astype(np.int32)
-
-
-def sharp_edges(points: NDArray[np.float64], triangles: NDArray[Any], edges: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether a surface turns by more than SHARP at each edge [E]; all other edges than of two triangles are sharp."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    rows, own, of_triangles = _edges_of(triangles, edges)
-    total = np.zeros((len(rows), 3))
-    np.add.at(total, of_triangles, np.concatenate([normal] * 3))
-    flat = np.bincount(of_triangles, minlength=len(rows)) == 2
-    flat &= np.linalg.norm(total, axis=1) > 2 * np.cos(np.radians(SHARP) / 2)  # |n + m| of unit normals n and m
-    return ~flat[own]
 
 
 def units(body: Tensor, pinned_bodies: Tensor) -> Tensor:

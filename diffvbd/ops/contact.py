@@ -38,8 +38,8 @@ class Detection(NamedTuple):
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor,
-                   trust_radius: Tensor, deformation_radius: Tensor, face_counts: Tensor, mesh_bodies: int,
-                   self_contact: bool, between_bodies: bool, dhat: float, capacity: int,
+                   trust_radius: Tensor, deformation_radius: Tensor, face_counts: Tensor, point_weights: Tensor,
+                   mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float, capacity: int,
                    trim: bool = False) -> Detection:  # fmt: skip
     """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
 
@@ -65,6 +65,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
         face_counts: [F + E] how often the barrier of each of ``triangles`` counts; whether each edge is sharp (1 or 0).
             The barrier of two edges of different bodies that are not both sharp reaches ``dhat / 4``.
+        point_weights: [P] what the barrier of each of ``points`` is multiplied by.
         self_contact, between_bodies: Pairs of mesh bodies to consider.
         dhat: [m].
         capacity: Rows of the list.
@@ -74,8 +75,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     return Detection(
         *raw.contact_detect(
             x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, pinned,
-            trust_radius, deformation_radius, face_counts, mesh_bodies, self_contact, between_bodies, dhat, capacity,
-            trim,
+            trust_radius, deformation_radius, face_counts, point_weights, mesh_bodies, self_contact, between_bodies,
+            dhat, capacity, trim,
         )
     )  # fmt: skip
 

@@ -130,6 +130,7 @@ class PairBarrier:
         columns = torch.cat((force, together * stiffness))
         return self.pairs.assemble(k, self.weight * columns)
 
+    counts_negative = True  # where faces are edges: blocks may be indefinite
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
 
     def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -387,7 +387,7 @@ def _update_color(
         system = system + energy.block(k, state, x_prev)
     gradient, hessian = system.split((3, 6), -2)
     law = next((e for e in energies if isinstance(e, Law) and not e.density.quadratic), None)
-    if law is not None:
+    if law is not None or any(getattr(e, "counts_negative", False) for e in energies):
         hessian = (
             hessian + _shift(hessian, mass + model.regularization) * hessian.new_tensor([1, 0, 0, 1, 0, 1])[:, None]
         )
@@ -466,9 +466,11 @@ def _shift(hessian: Tensor, mass: Tensor) -> Tensor:
     least = LEAST_CURVATURE * mass
 
     def is_definite(shift: Tensor) -> Tensor:
-        a, b, c = xx + shift, yy + shift, zz + shift
-        whole = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
-        return (a > 0) & (a * b - xy * xy > 0) & (whole > 0)
+        a, b, c, rounding = xx + shift, yy + shift, zz + shift, 16 * torch.finfo(xx.dtype).eps
+        first = torch.where(a > 0, a, 1.0)
+        second, t = b - xy * xy / first, yz - xy * xz / first
+        third = c - xz * xz / first - t * t / torch.where(second > 0, second, 1.0)
+        return (a > 0) & (second + rounding * yy.abs() > 0) & (third + rounding * zz.abs() > 0)
 
     size = (xx.abs() + yy.abs() + zz.abs()) + 2 * (xy.abs() + xz.abs() + yz.abs())
     shift, trial = torch.zeros_like(xx), 0.0625 * torch.exp2(torch.floor(torch.log2(size)))

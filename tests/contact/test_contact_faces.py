@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd._contact.surface import faces_of, sharp_edges
+from diffvbd._contact.faces import faces_of, sharp_edges, vertex_areas
 from diffvbd.reference.distance import POINT_TRIANGLE, distance
 from diffvbd.testing import generator, tolerance
 
@@ -70,3 +70,51 @@ def test_edges_of_bodies() -> None:
     assert sharp_edges(points, triangles, edges).sum() == 36
     ball = dv.mesh.blob(20)
     assert not sharp_edges(ball.points, ball.surface, edges_of(ball.surface)).any()
+
+
+def test_a_vertex_bears_for_the_side_that_it_presses_with() -> None:
+    """Of a box: a cell of the mesh inside a side, half of one at its edge, a quarter at its corner."""
+    mesh = dv.mesh.box((5, 4, 3), (0.4, 0.6, 0.5))
+    area = vertex_areas(mesh.points, mesh.surface)
+    cell, at = (
+        np.array([0.1, 0.2, 0.25]),
+        np.stack([mesh.points - mesh.points.min(0), mesh.points.max(0) - mesh.points]),
+    )
+    ends = (np.abs(at) < 1e-9).any(0)  # [V, 3]: on a side across each axis
+    for v in np.unique(mesh.surface):
+        sides = [np.prod(np.where(ends[v], cell / 2, cell)[np.arange(3) != axis]) for axis in np.flatnonzero(ends[v])]
+        assert area[v] == pytest.approx(max(sides), rel=tolerance("formula"))
+    assert (area[np.setdiff1d(np.arange(len(area)), mesh.surface)] == 0).all()
+
+
+def test_cells_of_any_triangles_add_up_to_their_area() -> None:
+    points = generator("cells").standard_normal((40, 3))
+    for triangle in generator("corners").integers(0, 40, (30, 3)):
+        if len(set(triangle.tolist())) == 3:
+            a, b, c = points[triangle]
+            cells = vertex_areas(points, triangle[None])
+            assert cells.sum() == pytest.approx(np.linalg.norm(np.cross(b - a, c - a)) / 2, rel=1e-12)
+            assert (cells[triangle] > 0).all()
+
+
+def test_a_finer_body_rests_at_the_same_gap() -> None:
+    """On a table of tets, with a stiffness per area; with one per vertex 25 vertices rest higher than 9."""
+    gaps: dict[str, list[float]] = {"kappa": [], "kappa_per_area": []}
+    for unit, size in (("kappa", 100.0), ("kappa_per_area", 4e4)):
+        for n in (3, 5):
+            cube = dv.mesh.cube(n, size=0.1).translate((0.033, 0.008, 0.041))
+            bodies = dv.mesh.join([cube, dv.mesh.box((4, 2, 4), (0.2, 0.05, 0.2)).translate((0, -0.05, 0))])
+            barrier = dv.PairBarrier(dhat=0.01, self_contact=False, **{unit: size})
+            model = dv.Model(bodies, pinned=bodies.points[:, 1] < 1e-9, energies=(dv.StableNeoHookean(), barrier))
+            x = model.rest_points
+            end = dv.rollout(
+                model, x, 0 * x, dv.VBD(0.01, 20), steps=60, young=1e7, poisson=0.3, drag=20.0, save="last"
+            )
+            gaps[unit].append(float(end.x[-1, : n**3][cube.points[:, 1] < 0.008 + 1e-9, 1].mean()))
+    assert abs(gaps["kappa_per_area"][1] / gaps["kappa_per_area"][0] - 1) < 0.05
+    assert gaps["kappa"][1] / gaps["kappa"][0] > 1.2
+
+
+def test_one_of_two_units() -> None:
+    with pytest.raises(ValueError, match="kappa_per_area: expected None, or kappa None, got 1 beside kappa = 2"):
+        dv.PairBarrier(kappa=2.0, kappa_per_area=1.0)

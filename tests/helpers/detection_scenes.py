@@ -118,6 +118,11 @@ class Scene:
         )
 
     @property
+    def weights(self) -> np.ndarray:
+        """Of each point; any will do."""
+        return 1 + self.points % 3 / 4
+
+    @property
     def trust_radii(self) -> np.ndarray:
         """Of each body [mesh_bodies]."""
         return self.trust_radius * np.linspace(1, 0.5, self.mesh_bodies)
@@ -145,7 +150,8 @@ class Scene:
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
             index(self.body), index(self.pinned), real(trust_radius), real(self.own_fraction * trust_radius),
-            index(self.face_counts), self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
+            index(self.face_counts), real(self.weights), self.mesh_bodies, self.self_contact, self.between_bodies,
+            self.dhat, capacity,
         )  # fmt: skip
 
 
@@ -275,7 +281,7 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         if kind == EDGE_EDGE:
             measure, blunt = 1e-3 * (edges[0] * edges[2]) ** 2, (one != other) & (sharp[i] * sharp[j] == 0)
         else:
-            measure, blunt = counts[j] if kind == POINT_TRIANGLE else np.ones(len(d)), np.zeros(len(d), bool)
+            measure, blunt = s.weights[i] * (counts[j] if kind == POINT_TRIANGLE else 1), np.zeros(len(d), bool)
         dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, np.where(blunt, 0.25 * s.dhat, s.dhat))
         trust_radii = np.append(s.trust_radii, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
         trust_radii = np.where(one == other, s.own_fraction * trust_radii, trust_radii)
