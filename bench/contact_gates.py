@@ -417,8 +417,8 @@ def gaps(support: str, sizes: Sequence[int], sweeps: int, device: str) -> Row:
             colliders = ()
         tets = mesh.join(bodies)
         # soft enough for a gap of a third of dhat
-        model = model_of(tets, pairs(kappa=None, kappa_per_area=2e4), pinned=np.arange(tets.num_vertices) >= n**3, colliders=colliders,
-                         device=device)  # fmt: skip
+        model = model_of(tets, pairs(kappa=None, kappa_per_area=2e4), pinned=np.arange(tets.num_vertices) >= n**3,
+                         colliders=colliders, device=device)  # fmt: skip
         x = settled(model, steps=12, sweeps=sweeps, mu=10 * MODULUS)[: n**3]
         found.append(float(x[model.rest_points[: n**3, 1] < 0.5 * DHAT + 1e-9, 1].mean()))
     value = max(found) / min(found) - 1

@@ -172,8 +172,8 @@ struct Surfaces {
   const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
   const T *rest, *radius;             // [N, 3], [N]
   const int32_t *triangles, *edges, *points, *planes, *body;
-  const int32_t* counts;  // of triangles, then of edges: how often a face counts, and whether an edge is sharp; or null
-  const T* weights;       // [num_points] of the barrier of each point
+  const int32_t* counts;  // of triangles, then of edges: how often a face counts, and whether an edge is sharp
+  const T* weights;       // [num_points] of the barrier of each point; null: measures do not matter
   const bool* pinned;
   int64_t scenes;
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
@@ -423,8 +423,9 @@ template <class T>
 DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
   Constants<T> out{in.dhat, offset_of(in, c), T(1), true};
   const bool one_body = is_of_one_body(in, c);
-  if (c.kind != kEdgeEdge && in.counts) out.measure = in.weights[c.a];
-  if (c.kind == kPointTriangle && in.counts) out.measure = out.measure * T(in.counts[c.b]);
+  if (c.kind != kEdgeEdge && in.weights) {
+    out.measure = in.weights[c.a] * (c.kind == kPointTriangle ? T(in.counts[c.b]) : T(1));
+  }
   if (!one_body && c.kind != kEdgeEdge) return out;
   const Corners<T> rest = corners_at_rest(in, c);
   const auto squared_length = [&](int i, int j) {
@@ -433,7 +434,7 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   };
   const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
   if (c.kind == kEdgeEdge) out.measure = T(kMollified) * e * f;
-  if (c.kind == kEdgeEdge && !one_body && in.counts) {
+  if (c.kind == kEdgeEdge && !one_body && in.weights) {
     const int32_t* sharp = in.counts + in.num_triangles;
     if (!sharp[c.a] || !sharp[c.b]) out.dhat = T(kBlunt) * in.dhat;
   }

@@ -132,10 +132,10 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     faces, counts = faces_of(triangles.numpy(), edges.numpy())
     sharp = sharp_edges(np.concatenate(rest), triangles.numpy(), edges.numpy())
     points = index_tensor(points, 1).reshape(-1)
-    weights = torch.ones(len(points), dtype=torch.float64)
+    weights = np.ones(len(points))
     if barrier.kappa_per_area is not None:
         area = vertex_areas(np.concatenate(rest), triangles.numpy())[points.numpy()]
-        weights[area > 0] = torch.from_numpy(area[area > 0] / mean_area(mesh))
+        weights = np.where(area > 0, area / mean_area(mesh), 1.0)
     pinned = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
     return ContactSurface(
@@ -146,7 +146,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         edges=edges,
         face_counts=torch.from_numpy(np.concatenate([counts, sharp]).astype(np.int32)),
         points=points,
-        point_weights=weights,
+        point_weights=torch.from_numpy(weights),
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
         pinned=pinned,
