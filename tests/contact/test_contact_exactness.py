@@ -28,7 +28,9 @@ SLOW = [(1, 0), (1, 20), (4, 1)]
 LONG = [(4, 20), (20, 2)]  # in turn; `-m hours` runs both
 SHORT = {"thrown", "held_up"}  # scenes that are like the others after a few steps
 # the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
-OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}
+OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2), ("held_up", (4, 20)): (2, 20)}
+# Some edges of this one are almost parallel: their closest points round by eps / sin^2, which no order of sums shows.
+PARALLEL = {"folded": 10.0}
 HOURS = [(20, 5), (20, 20)]  # one scene runs the first of them in `make test-all`, too
 # Bounds hold every vertex back in the first step, which therefore starts without a pair closer than dhat.
 NONE_YET = {"grad_pair_damping", "grad_friction"}
@@ -47,7 +49,7 @@ def check(name: str, steps: int, sweeps: int, device: str) -> None:
     expected = unrolled(scene, steps, solver, parts)
     # one sample of rounding is at times too kind
     others = [lambda seed=seed: unrolled(scene, steps, solver, parts, seed=seed) for seed in (1, 2, 3)]
-    forward, adjoint = steps * tolerance("contact_forward"), tolerance("contact_adjoint")
+    forward, adjoint = steps * tolerance("contact_forward"), PARALLEL.get(name, 1.0) * tolerance("contact_adjoint")
     assert_near_contact(result, expected, forward, adjoint, scene.time_step, others)
     for key, value in expected.items():
         if key.startswith("grad_") and sweeps > 0 and key not in ZERO.get((name, steps), set()):
