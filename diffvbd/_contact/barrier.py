@@ -144,7 +144,7 @@ class PairBarrier:
         if self.kappa is not None:
             kappa = self.kappa
         elif self.kappa_per_area is not None:
-            kappa = self.kappa_per_area * mean_area(mesh)
+            kappa = self.kappa_per_area * (mean_area(mesh) if mesh.num_tets else 1.0)
         else:  # m v^2 / 2 = n b of the gap that is left
             kappa = load * IMPACT**2 / 2 / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
         fitted = copy(self)  # not checked again: it may have kappa beside kappa_per_area
