@@ -1,7 +1,6 @@
 // The barrier of a pair in the block of one of its corners, and the exact adjoint (docs/method.md, section 12): the
-// gradient F of E = e b(gap), and a matrix that bounds the positive part of its Hessian. `together`: the number of
-// corners that move at once, this one included; the block takes so many times the stiffness, so that together they do
-// not overshoot.
+// gradient F of E = e b(gap), and a matrix for the positive part of its Hessian. `together`: the number of corners that
+// move at once, this one included; the block takes so many times the stiffness, so that together they do not overshoot.
 #pragma once
 
 #include "../energies/log_barrier.h"
@@ -16,16 +15,16 @@ DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
 }
 DIFFVBD_FN bool is_corner(int i, int k) { return i == k; }
 
-// The matrix of corner i: F F^T / E where e varies, which holds the mixed terms of the Hessian exactly, and c w_i^2 n
-// n^T with c = e b'' less what that has of it: 2/3 b'^2 <= b b''. Where a pair counts negative, a bound of e b' Hess d
-// as well, by Hess d <= w w^T (I - n n^T) / d.
+// The matrix of corner i. Of two edges F F^T / E, which holds the mixed terms of the Hessian exactly, and what
+// c w_i^2 n n^T with c = e b'' has more than that: b'^2 <= 1.5 b b''. Of a point and a face the latter alone, with c
+// whole; where it counts negative, a bound of e b' Hess d as well, by Hess d <= w w^T (I - n n^T) / d.
 template <class R>
 struct PairStiffness {
   R e, inverse, along, along_rate, across, across_rate;  // inverse: 1 / E or 0; rates: by the gap, along's over e
   DIFFVBD_FN PairStiffness(int kind, const R& weight, const LogBarrier<R>& b, const R& d)
       : e(weight), inverse(R(0)), along(b.second), along_rate(b.third), across(R(0)), across_rate(R(0)) {
     if (kind == kEdgeEdge) {
-      const auto pushes = R(0) < e * b.value;
+      const auto pushes = R(std::numeric_limits<float>::min()) < e * b.value;  // has an inverse in any precision
       inverse = select(pushes, R(1) / (e * b.value), R(0));
       const R ratio = select(pushes, b.first / b.value, R(0)), part = R(2.0 / 3) * ratio;
       along = along - part * b.first;

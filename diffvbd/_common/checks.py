@@ -28,7 +28,7 @@ OWNERS = {  # names that are easily given to another call, and which call has th
                     "an argument of dv.rollout"),
     **dict.fromkeys(("tolerance", "max_sweeps", "check_every", "on_failure"), "an argument of dv.solve"),
     **dict.fromkeys(("errors", "energy", "contact"), "an argument of dv.Checks"),
-    **dict.fromkeys(("dhat", "detections", "reach", "capacity"), "an argument of dv.PairBarrier"),
+    **dict.fromkeys(("dhat", "detections", "reach", "capacity", "kappa_per_area"), "an argument of dv.PairBarrier"),
     **dict.fromkeys(("mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points"),
                     "an input of dv.step and dv.rollout"),
 }  # fmt: skip

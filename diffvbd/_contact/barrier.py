@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -41,7 +40,8 @@ def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
 class PairBarrier:
     """IPC log barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) between surfaces of a Model's bodies and its colliders.
 
-    A point has the barrier of its distance d to a surface, once, however many triangles are near. Where edges cross
+    A point has the barrier of its distance d to the surface of another body, once, however many triangles are near;
+    within a body every triangle that is near has one. Where edges cross
     without a vertex near, they have one, too, in full if both are sharp. From a start without intersections no executed
     sweep lets two surfaces cross, at any speed and any number of sweeps: each motion leaves a plane between the sides
     of every pair that could meet, and no vertex goes farther than pairs were looked for. What has been truncated is
@@ -65,11 +65,14 @@ class PairBarrier:
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
             detections, relative to the motion that bodies near each other share. None: that is one mean edge of its
             body, or 8 where a single body moves.
-        kappa_per_area: Instead of kappa, the stiffness of the barrier over an area [N/m^3]. Each vertex then weighs by
-            the area that it bears for, so that the same body rests at the same gap however finely it is meshed.
-            ``kappa`` of the Model's barrier, and the input ``pair_kappa``, are those of a vertex of mean area.
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
+        kappa_per_area: Instead of kappa, the stiffness of the barrier over an area [N/m^3]. Each vertex then weighs by
+            the area that it bears for, so that a body rests on a surface at the same gap however finely it is meshed
+            itself. Vertices of that surface that are near push by their own area. Spheres, capsules and pairs of edges
+            weigh as a vertex of mean area. ``kappa`` of the Model's barrier, and the input ``pair_kappa``, are those of
+            such a vertex.
+        fitted: Whether kappa follows from kappa_per_area, as in a Model.
 
     Inputs: ``pair_kappa`` and ``pair_damping`` (scalars).
 
@@ -94,6 +97,7 @@ class PairBarrier:
     reach: float | None = None
     capacity: int | None = None
     kappa_per_area: float | None = None
+    fitted: bool = False
 
     def __post_init__(self) -> None:
         refuse_gradients(self)
@@ -101,12 +105,12 @@ class PairBarrier:
             object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
         if self.kappa_per_area is not None:
             object.__setattr__(self, "kappa_per_area", check_number("kappa_per_area", self.kappa_per_area))
-            if self.kappa is not None:
+            if self.kappa is not None and not self.fitted:
                 fail("kappa_per_area", "None, or kappa None", f"{self.kappa_per_area:g} beside kappa = {self.kappa:g}")
         if self.dhat is not None:
             object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
         object.__setattr__(self, "damping", check_number("damping", self.damping))
-        for name in ("self_contact", "between_bodies"):
+        for name in ("self_contact", "between_bodies", "fitted"):
             check_bool(name, getattr(self, name))
         if self.detections is not None:
             object.__setattr__(self, "detections", check_count("detections", self.detections, 1, 1000))
@@ -129,7 +133,8 @@ class PairBarrier:
         Args:
             density: Of each tet [T] [kg/m^3].  pinned: bool [V]; a body that is pinned as a whole hits nothing.
         """
-        if self.kappa is not None and self.dhat is not None:
+        given = None if self.fitted else self.kappa
+        if given is not None and self.dhat is not None:
             return self
         finest, load = 1.0, 1.0  # [m], [kg] for each vertex of a side; any will do where nothing can touch
         if mesh.num_tets:
@@ -141,16 +146,11 @@ class PairBarrier:
             finest = float(edge[edge > 0].min())
             load = float((mass / np.maximum(side, 1 / 6))[moves if moves.any() else ...].max())
         dhat = self.dhat or min(DHAT_OF_EDGE * finest, (self.reach or np.inf) / 2)
-        if self.kappa is not None:
-            kappa = self.kappa
-        elif self.kappa_per_area is not None:
-            kappa = self.kappa_per_area * (mean_area(mesh) if mesh.num_tets else 1.0)
-        else:  # m v^2 / 2 = n b of the gap that is left
-            kappa = load * IMPACT**2 / 2 / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
-        fitted = copy(self)  # not checked again: it may have kappa beside kappa_per_area
-        object.__setattr__(fitted, "kappa", kappa)
-        object.__setattr__(fitted, "dhat", dhat)
-        return fitted
+        # m v^2 / 2 = n b of the gap that is left
+        kappa = load * IMPACT**2 / 2 / (CLOSED**2 * np.log(1 / (1 - CLOSED)) * dhat**2)
+        if self.kappa_per_area is not None:
+            kappa = self.kappa_per_area * mean_area(mesh)
+        return replace(self, kappa=kappa if given is None else given, dhat=dhat, fitted=self.kappa_per_area is not None)
 
 
 @init_names_checked

@@ -43,7 +43,7 @@ def faces_of(triangles: NDArray[Any], edges: NDArray[Any]) -> tuple[NDArray[np.i
 
 
 def sharp_edges(points: NDArray[np.float64], triangles: NDArray[Any], edges: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether a surface turns by more than SHARP at each edge [E]; all other edges than of two triangles are sharp."""
+    """Whether a surface turns by SHARP or more at each edge [E]; all other edges than of two triangles are sharp."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
@@ -87,5 +87,6 @@ def vertex_areas(points: NDArray[np.float64], triangles: NDArray[Any]) -> NDArra
 
 
 def mean_area(mesh: TetMesh) -> float:
-    """Of the surface vertices of a mesh [m^2]."""
-    return float(vertex_areas(mesh.points, mesh.surface)[np.unique(mesh.surface)].mean())
+    """Of the surface vertices of a mesh [m^2]; 1 where it has none."""
+    vertices = np.unique(mesh.surface)
+    return float(vertex_areas(mesh.points, mesh.surface)[vertices].mean()) if len(vertices) else 1.0

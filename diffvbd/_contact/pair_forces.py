@@ -157,7 +157,8 @@ def barrier_forces(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
 
 
 def barrier_stiffness(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:
-    """Trace of the barrier's part of each corner point's block [N/m], [B, N]; arguments as of barrier_forces."""
+    """Trace of e b'' grad_gap grad_gap^T of each corner point [N/m], [B, N], the scale of its stiffness; arguments as
+    of barrier_forces."""
     gap, slope, e, _ = pairs.measures(points)
     _, _, second = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
     return pairs.summed((e * second)[:, None, None] * slope.square(), points).sum(-1)  # of 3x3 blocks

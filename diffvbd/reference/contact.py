@@ -119,7 +119,7 @@ class PairBarrier:
         slope, turn = (g[torch.arange(len(pair), device=pair.device), local].T for g in (slope, turn))
         b, first, second = log_barrier(gap, self.kappa[pair], self.pairs.dhat[pair])
         force, unit = e * first * slope + b * turn, outer6(slope)
-        edges = (self.pairs.kind[pair] == EDGE_EDGE) & (e * b > 0)
+        edges = (self.pairs.kind[pair] == EDGE_EDGE) & (self.weight * e * b > torch.finfo(torch.float32).tiny)
         value, height = torch.where(edges, e * b, 1.0), torch.where(edges, b, 1.0)
         stiffness = e * (second - torch.where(edges, 2 / 3 * first**2 / height, 0.0)) * unit
         stiffness = stiffness + torch.where(edges, outer6(force) / value, 0.0)

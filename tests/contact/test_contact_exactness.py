@@ -69,9 +69,9 @@ def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps:
 @pytest.mark.parametrize(
     ("name", "steps", "sweeps"),
     [*(slow(name, *OTHERS.get((name, run), run)) for name in SCENES for run in SLOW),
-     *(pytest.param(name, *run, marks=pytest.mark.slow if (name in SHORT or i % 2) == (run == LONG[0])
-                    else pytest.mark.hours) for i, name in enumerate(SCENES)
-       for run in (LONG[:1] if name in SHORT else LONG)),
+     *(pytest.param(name, *OTHERS.get((name, run), run), marks=pytest.mark.slow
+                    if (name in SHORT or i % 2) == (run == LONG[0]) else pytest.mark.hours)
+       for i, name in enumerate(SCENES) for run in (LONG[:1] if name in SHORT else LONG)),
      slow("crossed", 20, 5),
      *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES for run in HOURS
        if (name, run) != ("crossed", HOURS[0]))],

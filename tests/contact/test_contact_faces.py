@@ -118,3 +118,32 @@ def test_a_finer_body_rests_at_the_same_gap() -> None:
 def test_one_of_two_units() -> None:
     with pytest.raises(ValueError, match="kappa_per_area: expected None, or kappa None, got 1 beside kappa = 2"):
         dv.PairBarrier(kappa=2.0, kappa_per_area=1.0)
+
+
+def test_a_fitted_barrier_goes_along() -> None:
+    """With a finer mesh it is fitted anew, and a change of another field keeps it."""
+    given = dv.PairBarrier(kappa_per_area=4e4, dhat=0.01, capacity=4)
+    models = [dv.Model(dv.mesh.cube(3, size=0.1), energies=(dv.StableNeoHookean(), given))]
+    models += [
+        dv.Model(dv.mesh.cube(5, size=0.1), energies=energies) for energies in ((given,), models[0].energies[1:])
+    ]
+    kappas = [model.contact.kappa for model in models if model.contact is not None]
+    assert kappas[1] == kappas[2] and kappas[0] > 2 * kappas[1]
+    dv.contact.reserve(models[0], 100)
+    assert models[0].contact is not None and models[0].contact.kappa == kappas[0]
+
+
+@pytest.mark.parametrize("places", [(1e-2, 3e-4), (3e-4, 3e-4)])
+def test_edges_that_cross_at_their_ends_in_float32(places: tuple[float, float]) -> None:
+    """Their energy is too small for an inverse."""
+    dhat, (a, b) = 1e-3, (5e-4 * place for place in places)
+    gap = dhat * (1 - 1e-5)
+    low = np.array([[-a, 0, 0], [0.1, 0, 0], [0.05, -0.1, 0.05], [0.05, -0.1, -0.05]])
+    high = np.array([[0, gap, -b], [0, gap, 0.1], [0.05, gap + 0.1, 0.05], [-0.05, gap + 0.1, 0.05]])
+    bodies = dv.mesh.join([dv.TetMesh(part, np.array([[0, 1, 2, 3]]), orient=True) for part in (low, high)])
+    barrier = dv.PairBarrier(kappa=1e4, dhat=dhat, self_contact=False)
+    model = dv.Model(bodies, energies=(dv.StableNeoHookean(), barrier), dtype=torch.float32)
+    x = model.rest_points.clone().requires_grad_()
+    out, _ = dv.step(model, x, 0 * x, dv.VBD(1e-3, 1, subspace=None), mu=1e4, lam=1e4)
+    (grad,) = torch.autograd.grad(out.square().sum(), x)
+    assert torch.isfinite(out).all() and torch.isfinite(grad).all() and grad.any()
