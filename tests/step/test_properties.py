@@ -94,7 +94,7 @@ def rounding(model: dv.Model, inputs: dict[str, Any], solver: dv.VBD, expected: 
     return max(e for errors in samples for e in errors.values() if np.isfinite(e))
 
 
-@pytest.mark.parametrize("examples", (10, slow(60)))
+@pytest.mark.parametrize("examples", (20, slow(60)))
 def test_finite_and_equal_to_the_reference(examples: int) -> None:
     compared = []
 
