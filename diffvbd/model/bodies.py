@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..mesh import arrays
 from ..ops.fields import CORRECTED
 
 # vertices of a body that a thread (where there are many), a part of a warp and a block of a CUDA device work on
@@ -60,17 +61,8 @@ class _Grouped(NamedTuple):
 
 
 def connected(sets: Tensor, count: int) -> Tensor:
-    """Lowest item of the connected sets that each of ``count`` items is in, int64 [count]; sets: int64 [N, n]."""
-    label, members = torch.arange(count), sets.T.contiguous()
-    while True:  # every item takes the lowest label of its sets, and that label's own: paths halve each time
-        low = label[members].amin(0)
-        new = label
-        for member in members:
-            new = new.scatter_reduce(0, member, low, "amin")
-        new = new[new]
-        if torch.equal(new, label):
-            return label
-        label = new
+    """Lowest item of the connected sets that each of ``count`` items is in, int64 [count]; sets: int64 [N, n], CPU."""
+    return torch.from_numpy(arrays.connected(sets.numpy(), count))
 
 
 def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool, floor: bool) -> tuple[Bodies, OtherBodies]:
