@@ -159,9 +159,8 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
 
 
 def damped_fraction(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
-    """Fraction of its damping that a contact has by its normal force at the start of the step [N]: below 1, and
-    negative as the force where a pair counts so."""
-    whole = force.abs() + FADE * kappa * dhat
+    """Fraction of its damping, below 1, that a contact has by its normal force at the start of the step [N]."""
+    whole = force + FADE * kappa * dhat
     some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
     return torch.where(some, force / torch.where(some, whole, 1.0), 0.0)
 

@@ -116,16 +116,21 @@ DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In pt
 
 // --- lagged values ---------------------------------------------------------------------------------------------------
 
-// Normal force, 1 where active, normal and weights of each pair [pairs, 9]; the adjoint: of corner points [B, N, 3] and
-// of kappa.
-DIFFVBD_OPERATOR(Tensor, contact_lag, In x, In origin, In collider, In kappa, In pairs, In constants, In ptr,
-                 In entry) {
+// Normal force, 1 where active, normal and weights of each pair [pairs, 9]; the force that each bears, and the pair that
+// bears its own [pairs]. The adjoint: of corner points [B, N, 3] and of kappa.
+DIFFVBD_OPERATOR(Out<3>, contact_lag, In x, In origin, In collider, In kappa, In pairs, In constants, In ptr, In entry,
+                 In body) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
-    Tensor out = device.empty({pairs.size(0), contact::kLagScalars});
-    DIFFVBD_RUN(device, pair_lag<T>, in, data<const T>(x), x.size(0), pairs.size(0), data<T>(out));
-    return out;
+    const int64_t count = pairs.size(0);
+    const int32_t* bodies = Reader<T>(x).index("body", body, in.corners);
+    Tensor lag = device.empty({count, contact::kLagScalars}), force = device.empty({count}),
+           bearer = device.empty({count}, ScalarType::Long);
+    DIFFVBD_RUN(device, pair_lag<T>, in, data<const T>(x), x.size(0), count, data<T>(lag));
+    DIFFVBD_RUN(device, pair_loads<T>, in.listed, in.corners, bodies, data<const T>(lag), x.size(0), count,
+                data<T>(force), data<int64_t>(bearer));
+    return Out<3>(lag, force, bearer);
   });
 }
 DIFFVBD_OPERATOR(Out<2>, contact_lag_backward, In bar, In x, In origin, In collider, In kappa, In pairs, In constants,

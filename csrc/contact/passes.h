@@ -68,6 +68,32 @@ struct ContactAdjoints {
   uint8_t* scattered = nullptr;
 };
 
+// The pair that bears the friction and damping of a listed one: of the faces of another body that are near a point the
+// one that presses it most, with the load of all of them; any other pair by itself. lag [pairs, kLagScalars], body [N].
+template <class T>
+struct Load {
+  int64_t bearer;
+  T force;  // 0 where another pair is the bearer
+};
+template <class T>
+DIFFVBD_FN Load<T> load_of(const PairList& listed, int64_t corners, const int32_t* body, const T* lag, int64_t pair) {
+  const auto force = [&](int64_t at) { return lag[kLagScalars * at]; };
+  const int32_t* record = listed.pairs + kPairRow * pair;
+  const int32_t point = record[0], face = body[record[1]];
+  if (record[4] != kPointTriangle || body[point] == face) return {pair, force(pair)};
+  const PairList::Entries near = listed.of(record[5] * corners + point);
+  int64_t bearer = -1;
+  T total = T(0);
+  for (int e = 0; e < near.count; ++e) {
+    const int64_t other = near.first[e] >> 2;
+    const int32_t* its = listed.pairs + kPairRow * other;
+    if (its[0] != point || its[4] != kPointTriangle || body[its[1]] != face) continue;
+    total = total + force(other);
+    if (bearer < 0 || force(bearer) < force(other)) bearer = other;
+  }
+  return {bearer, pair == bearer && T(0) < total ? total : T(0)};
+}
+
 template <class T>
 DIFFVBD_FN T length_of(const Vec3<T>& a) {
   return square_root(dot(a, a));

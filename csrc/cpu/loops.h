@@ -190,6 +190,16 @@ void pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, i
   });
 }
 template <class T>
+void pair_loads(const contact::PairList& listed, int64_t corners, const int32_t* body, const T* lag, int64_t scenes,
+                int64_t pairs, T* force, int64_t* bearer) {
+  const int64_t count = listed.ptr[scenes * corners] / 4;
+  for (int64_t pair = 0; pair < pairs; ++pair) {
+    const auto load =
+        pair < count ? contact::load_of(listed, corners, body, lag, pair) : contact::Load<T>{pair, T(0)};
+    force[pair] = load.force, bearer[pair] = load.bearer;
+  }
+}
+template <class T>
 void pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, const T* bar, T* points,
                        T* kappa) {
   std::fill_n(points, 3 * scenes * in.corners, T(0)), std::fill_n(kappa, scenes, T(0));

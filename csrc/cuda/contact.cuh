@@ -258,6 +258,16 @@ __global__ void lag_forward(const __grid_constant__ ContactInputs<T> in, const T
 }
 
 template <class T>
+__global__ void find_loads(contact::PairList listed, int64_t corners, const int32_t* body, const T* lag, int64_t scenes,
+                           int64_t pairs, T* force, int64_t* bearer) {
+  const int64_t pair = own_item();
+  if (pair >= pairs) return;
+  const bool some = pair < listed.ptr[scenes * corners] / 4;
+  const auto load = some ? contact::load_of(listed, corners, body, lag, pair) : contact::Load<T>{pair, T(0)};
+  force[pair] = load.force, bearer[pair] = load.bearer;
+}
+
+template <class T>
 __global__ void lag_reverse(const __grid_constant__ ContactInputs<T> in, const T* x, int64_t scenes, int64_t pairs,
                             const T* bar, T* slots) {
   const int64_t pair = own_item();
@@ -352,6 +362,12 @@ template <class T>
 cudaError_t pair_lag(const ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
                      cudaStream_t stream) {
   return launch_contact(lag_forward<T>, pairs, stream, in, x, scenes, pairs, values);
+}
+
+template <class T>
+cudaError_t pair_loads(const contact::PairList& listed, int64_t corners, const int32_t* body, const T* lag,
+                       int64_t scenes, int64_t pairs, T* force, int64_t* bearer, cudaStream_t stream) {
+  return launch_contact(find_loads<T>, pairs, stream, listed, corners, body, lag, scenes, pairs, force, bearer);
 }
 
 template <class T>

@@ -30,6 +30,9 @@ template <class T>
 cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
                      cudaStream_t stream);
 template <class T>
+cudaError_t pair_loads(const contact::PairList& listed, int64_t corners, const int32_t* body, const T* lag,
+                       int64_t scenes, int64_t pairs, T* force, int64_t* bearer, cudaStream_t stream);
+template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
                               const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
 // Bytes of workspace.

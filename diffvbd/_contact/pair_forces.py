@@ -17,6 +17,7 @@ from .._contact.barrier import PairBarrier
 from .._contact.detection import detect
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
 from ..energies import damped_fraction
+from ..reference.contact import loads
 from ..reference.distance import EDGE_EDGE, distance, log_barrier, weight, with_gradient
 from ..reference.energies import smoothed
 
@@ -176,13 +177,13 @@ class Lag(NamedTuple):
     slope: Tensor  # [Q, 4, 3] weights times normal
 
 
-def lag_of(pairs: NearPairs, start: Tensor, kappa: Tensor) -> Lag:
-    """pairs: near at the start, where corner points are ``start`` [B, N, 3]; kappa: [1 | B] [N/m]."""
+def lag_of(pairs: NearPairs, start: Tensor, kappa: Tensor, body: Tensor) -> Lag:
+    """pairs: near at the start, where corner points are ``start`` [B, N, 3]; kappa: [1 | B] [N/m]; body: [N]."""
     gap, slope, e, _ = pairs.measures(start)
     _, first, _ = log_barrier(gap, pairs.of_scene(kappa), pairs.dhat)
     normal = pairs.of_first(slope)  # weights of the first side sum to 1
     weights = (slope * normal[:, None]).sum(-1)
-    size = -e * first
+    size = loads(-e * first, pairs.corners, pairs.kind, pairs.scene, body)
     return Lag(pairs, start, size, normal, damped_fraction(size, pairs.of_scene(kappa), pairs.dhat), weights, slope)
 
 

@@ -74,26 +74,19 @@ def of_scene(value: Tensor, listed: Pairs) -> Tensor:
     return _of_scene(value, listed)
 
 
-def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed: Pairs) -> Tensor:
-    """[pairs, 9]: normal force [N], 1 where closer than dhat, normal (3), weights (4); differentiable in three.
-
-    Args:
-        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  origin: [B, V, 3] or empty.
-    """
-    return ops_contact.pair_lag(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, *listed)
-
-
 def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor | None, damping: Tensor | None,
                  origin: Tensor, body: Tensor, listed: Pairs) -> Tensor:  # fmt: skip
     """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_fraction), normal (3),
-    weights (4). Differentiable in the first five.
+    weights (4). Differentiable in the first five. Of the faces of another body near a point, the one that presses it
+    most has the normal force of all, and the others have none.
 
     Args:
         x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa, damping: [1 | B].  origin: [B, V, 3] or empty.
         friction: [1 | B], or [1 | B, n, n] of each two bodies and colliders.  body: [N], of the corner points.
     """
-    state, scenes = pair_lag(x, collider, kappa, origin, listed), x.shape[0]
-    force, load, rate = state[:, 0], state.new_zeros((len(state),)), state.new_zeros((len(state),))
+    scenes, inputs = x.shape[0], (x.contiguous(), collider.contiguous(), kappa.contiguous())
+    state, force, _ = ops_contact.pair_lag(*inputs, origin, *listed, body)
+    load, rate = torch.zeros_like(force), torch.zeros_like(force)
     if friction is not None:
         load = force * coefficients(friction, listed, body, scenes)
     if damping is not None:
@@ -174,7 +167,7 @@ class StepContact:
         if x_prev is not None and self.start is not None and surface is not None and barrier is not None:
             first = before + (colliders - before) / (barrier.detections or 1)
             near = near_pairs(x_prev, origin, before, first, surface, barrier)
-            self.lag = lag_of(near, self.start, self._number("pair_kappa"))
+            self.lag = lag_of(near, self.start, self._number("pair_kappa"), surface.body.long())
 
     def _number(self, name: str) -> Tensor:
         """A parameter [1 | B]; zero where its energy is absent."""

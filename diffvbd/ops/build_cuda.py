@@ -28,7 +28,7 @@ TEMPLATES = {  # by header of csrc/cuda, each for both scalars T
     ],
     "contact": [
         "struct ContactPasses<T>",
-        *(f"{name}<T>" for name in ("sum_lag", "pair_lag", "pair_lag_backward")),
+        *(f"{name}<T>" for name in ("sum_lag", "pair_lag", "pair_loads", "pair_lag_backward")),
     ],
     "forward": ["forward_kernel<T>"],
     "run": ["workspace_bytes<T>", "run_forward<T>", "run_reverse<T>"],

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .coarse import Coarse
 from .couplings import Bounds, energies_of_sweeps
-from .distance import EDGE_EDGE, distance, log_barrier, weight, with_gradient
+from .distance import EDGE_EDGE, POINT_TRIANGLE, distance, log_barrier, weight, with_gradient
 from .energies import FADE, floor_friction, smoothed, tangential6
 from .rigid_contact import Correction
 from .scene import Scene, build_layout, build_scene, outer6
@@ -152,6 +152,24 @@ class PairBarrier:
         return self.weight * p.total(torch.where(gap > 0, weight(p.kind, corners, p.dhat, p.measure) * b, torch.inf))
 
 
+def loads(force: Tensor, corners: Tensor, kind: Tensor, scene: Tensor, body: Tensor) -> Tensor:
+    """Normal force that friction and damping of each pair have [Q] [N]: of the faces of another body near a point the
+    one that presses it most has the forces of all of them, and the others none. Other pairs have their own.
+
+    Args:
+        force, kind, scene: [Q] of each pair.  corners: [Q, 4] corner points.  body: [N] of the corner points.
+    """
+    point, face, rows = corners[:, 0], body[corners[:, 1]], torch.arange(len(force), device=force.device)
+    alone = (kind != POINT_TRIANGLE) | (body[point] == face)
+    key = torch.stack([scene, point, face, torch.where(alone, rows, -1)], 1)
+    groups, group = torch.unique(key, dim=0, return_inverse=True)
+    total, size = force.new_zeros(len(groups)).index_add(0, group, force), force.detach()
+    most = torch.full_like(total, -torch.inf).detach().scatter_reduce(0, group, size, "amax")
+    bearers = torch.where(size == most[group], rows, len(rows))
+    bearer = rows.new_full((len(groups),), len(rows)).scatter_reduce(0, group, bearers, "amin")
+    return torch.where(bearer[group] == rows, total[group].clamp(min=0), 0.0)
+
+
 class LaggedPairForces:
     """Damping of approach and friction of pairs, with gap, normal, weights and force of the start of the step.
 
@@ -167,14 +185,14 @@ class LaggedPairForces:
         self.normal = self.slope[:, 0] + torch.where(both, self.slope[:, 1], 0.0)
         kappa = pairs.per_pair(scene.parameter(model.contact, "kappa"))
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
-        force = -e * first
-        whole = force.abs() + FADE * kappa * pairs.dhat
+        force = loads(-e * first, pairs.corners, pairs.kind, pairs.batch, model.surface_of_contact.body.long())
+        whole = force + FADE * kappa * pairs.dhat
         fraction = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
         self.damping = fraction * pairs.per_pair(scene.parameter(model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
-            self.largest = -pairs.of_two(scene.parameter(friction, "coefficient"), model) * e * first
+            self.largest = pairs.of_two(scene.parameter(friction, "coefficient"), model) * force
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:

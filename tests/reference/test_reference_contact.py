@@ -102,6 +102,7 @@ def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
     )
     x = x_prev + travel * torch.as_tensor(generator("travel").standard_normal((8, 3)))
     start = torch.cat((x_prev, COLLIDERS))[None]
+    model.surface_of_contact = SimpleNamespace(body=torch.zeros(start.shape[1]))  # of one body: no sums
     now = COLLIDERS + travel * 0.3
     friction = LaggedPairForces(scene_of(model, x), pairs, start, now[None])
     corners = start[0][pairs.corners].requires_grad_()
