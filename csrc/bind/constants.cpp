@@ -37,10 +37,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(diffvbd, m) {
       {"near_values", contact::kNearValues},
       {"counts", contact::kCounts},
       {"crossing_row", contact::kCrossingRow},
-      {"unknowns", contact::kUnknowns},         // of a body: a turn and a shift
-      {"few", contact::kFew},                   // bodies of scenes that are one group
-      {"most_coupled", contact::kMostCoupled},  // bodies of a group,
-      {"group_memory", contact::kGroupMemory},  // of which there are at most so many over the bodies of the scene
+      {"most_coupled", contact::kMostCoupled},  // bodies of a group of those that touch
       {"start_inertia", start::kInertia},
       {"start_predictor", start::kPredictor},
       {"start_lower", start::kLower},

@@ -1,7 +1,6 @@
 // Operators of the coarse correction of bodies that touch.
 #include "../subspace/contact_coarse.h"
 
-#include "../core/parts.h"
 #include "touching.h"
 
 namespace diffvbd {
@@ -10,9 +9,9 @@ namespace {
 // free: the bodies of the mesh that have a vertex to move.
 template <class T>
 contact::CoarseInputs<T> coarse_inputs(const TouchingFields& f, const SpaceFields& s, const TouchingSettings& q,
-                                       const T* move, const Tensor& none) {
+                                       const T* move) {
   contact::CoarseInputs<T> c{};
-  c.in = touching_inputs<T>(f, q, move, none);
+  c.in = touching_inputs<T>(f, q, move);
   c.in.bends = true;
   const Reader<T> read(f.x);
   const int64_t entries = s.function.numel(), functions = s.function_ptr.numel() - 1, tets = s.tets.size(0);
@@ -36,19 +35,6 @@ contact::CoarseInputs<T> coarse_inputs(const TouchingFields& f, const SpaceField
   return c;
 }
 
-// Memory for what parts(take) takes; lives as long as the result.
-template <class F>
-Tensor workspace(const Device& device, const F& parts) {
-  Parts<> sizes(nullptr);
-  parts(sizes);
-  const Tensor out = device.empty({static_cast<int64_t>(sizes.bytes)}, ScalarType::Byte);
-  Parts<> places(out.data_ptr());
-  parts(places);
-  return out;
-}
-
-int64_t lagged_pairs(const TouchingFields& f) { return f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0; }
-
 // P' g [scenes, F, 3] and the matrices [scenes, 3F, 3F], float64. packed [1 | scenes, 9 cells]: those of all bodies
 // without vertex energies and pairs.
 DIFFVBD_OPERATOR(Out<2>, contact_coarse_system, DIFFVBD_PARAMETERS(TOUCHING) DIFFVBD_PARAMETERS(SPACE) In packed,
@@ -57,7 +43,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_system, DIFFVBD_PARAMETERS(TOUCHING) DIF
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr);
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, n = c.size();
     contact::SystemMemory memory{f.pairs.size(0), lagged_pairs(f)};
@@ -80,7 +66,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_move, DIFFVBD_PARAMETERS(TOUCHING) DIFFV
   return dispatch_float(x, [&]<class T>(T) {
     const Tensor move = device.like_x();
     const auto c =
-        coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move), device.empty({0}));
+        coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move));
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, n = c.in.bodies();
     const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double);
@@ -99,7 +85,7 @@ DIFFVBD_OPERATOR(Tensor, contact_coarse_restrict, DIFFVBD_PARAMETERS(TOUCHING) D
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr);
     const Reader<T> read(x);
     const Tensor out = device.empty({read.b, c.size() / 3, 3}, ScalarType::Double);
     DIFFVBD_RUN(device, contact_coarse_restrict<T>, c, read.vectors("x_bar", x_bar),
@@ -119,7 +105,7 @@ DIFFVBD_OPERATOR(Out<14>, contact_coarse_reverse, DIFFVBD_PARAMETERS(TOUCHING) D
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr, device.empty({0}));
+    auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr);
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, corners = c.in.gate.corners, tets_listed = c.num_tets,
                   cells = packed.dim() == 2 ? packed.size(1) / 9 : 0;
@@ -143,9 +129,9 @@ DIFFVBD_OPERATOR(Out<14>, contact_coarse_reverse, DIFFVBD_PARAMETERS(TOUCHING) D
     const double *own_a = read.doubles("a", a, b * c.size()), *own_l = read.doubles("l", l, b * c.size()),
                  *own_fraction = read.doubles("fraction", fraction, b * c.in.bodies());
     const contact::VirtualMotions<T> given{data<T>(p), data<T>(q)};
-    DIFFVBD_ON_CUDA(const Tensor pushing = device.empty({1 + f.pairs.size(0)}, ScalarType::Int);)
     DIFFVBD_RUN(device, contact_coarse_motions<T>, c, own_a, own_l, own_fraction, data<T>(p), data<T>(q));
-    DIFFVBD_RUN(device, rigid_backward<T>, c.in, given, work, sums DIFFVBD_ON_CUDA(, data<int32_t>(pushing)));
+    const contact::WorkStep<T> pair_work{c.in, given, work, sums};
+    DIFFVBD_RUN(device, work_of_pairs<T>, pair_work);
     DIFFVBD_RUN(device, contact_coarse_reverse<T>, c, own_a, own_l, own_fraction, read.vectors("x_bar", x_bar), given,
                 sums, out);
     return Out<14>(bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_out, collider_out,

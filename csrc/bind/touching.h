@@ -1,8 +1,8 @@
 // Bodies that touch, as the operators of their corrections take them.
 #pragma once
 
-#include "../subspace/contact_rigid.h"
-#include "../subspace/contact_rigid_reverse.h"
+#include "../core/parts.h"
+#include "../subspace/rigid_step.h"
 #include "body.h"
 #include "contact.h"
 
@@ -13,11 +13,10 @@ struct TouchingSettings {
   double time_step, friction_eps;
 };
 
-// move: what is tried, memory of the operator, or null. groups [B, 4, bodies]: as contact/groups.h has them; empty
-// where they do not matter, or all bodies are one.
+// move: what is tried, memory of the operator, or null.
 template <class T>
-contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q, const T* move,
-                                        const Tensor& groups) {
+contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q,
+                                        const T* move) {
   const Reader<T> read(t.x);
   const int64_t b = read.b, v = read.v, colliders = read.colliders(t.collider), corners = v + colliders;
   contact::RigidInputs<T> in{};
@@ -47,11 +46,22 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
     in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = read.batch("floor_lag", t.floor_lag, v * in.planes * contact::kFloorLag);
   }
-  if (groups.numel() > 0) in.groups = read.index("groups", groups, contact::kGroupRows * b * bodies);
-  in.capacity = contact::most_grouped(bodies);
   in.has_friction = 0 < q.friction_eps;
   in.friction_eps = in.has_friction ? q.friction_eps : 1;
   return in;
+}
+
+inline int64_t lagged_pairs(const TouchingFields& f) { return f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0; }
+
+// Memory for what parts(take) takes; lives as long as the result.
+template <class F>
+Tensor workspace(const Device& device, const F& parts) {
+  Parts<> sizes(nullptr);
+  parts(sizes);
+  const Tensor out = device.empty({static_cast<int64_t>(sizes.bytes)}, ScalarType::Byte);
+  Parts<> places(out.data_ptr());
+  parts(places);
+  return out;
 }
 
 // The work of pairs in two virtual motions, and the rows that it goes through.
@@ -59,7 +69,7 @@ struct WorkTensors {
   Tensor barrier, pushes, friction, by_x, by_p, by_q, since, by_kappa, lag_bar;
   WorkTensors(const TouchingFields& f, const Device& device) {
     const int64_t b = f.x.size(0), corners = f.body.size(0), listed = f.pairs.size(0),
-                  lagged = f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0;
+                  lagged = lagged_pairs(f);
     barrier = device.empty({listed, 4, contact::kWorkScalars});
     pushes = device.empty({listed}, ScalarType::Byte);
     friction = device.empty({lagged, 4, contact::kWorkScalars});

@@ -130,7 +130,7 @@ template <class T>
 DIFFVBD_FN bool force_of_lagged(const RigidInputs<T>& in, int64_t pair, CornerForce& out) {
   PairForce a;
   if (pair >= in.first_lagged(in.scene.scenes)) return false;
-  if (!lagged_force(in, pair, CornerPoints<T>{in, false}, BodyMotions{}, a, -1)) return false;
+  if (!lagged_force(in, pair, CornerPoints<T>{in, false}, a)) return false;
   const Lag<T> lag(in.lag + kLagScalars * pair);
   out.force = a.force, out.stiffness = a.stiffness;
   for (int k = 0; k < 4; ++k) out.w[k] = lag.w[k], out.pull[k] = Vector{};
@@ -174,7 +174,7 @@ DIFFVBD_FN void add_vertex_energies(const CoarseInputs<T>& c, const Body<T>& b, 
   const VertexState<double> s = b.state(v, b.position(v));
   b.energies(v,
              [&](auto energy, int, const double* data, int count) { decltype(energy)::block(s, data, count, g, H); });
-  add_floor_friction(c.in, b, v, Vector{}, g, H);
+  add_floor_friction(c.in, b, v, g, H);
 }
 
 template <class T>
@@ -302,40 +302,8 @@ template <class T>
 DIFFVBD_FN double value_of_pair(const RigidInputs<T>& in, int64_t pair, bool listed, bool moved) {
   const CornerPoints<T> at{in, moved};
   PairForce a;
-  const bool acts = listed ? barrier_force(in, pair, at, a) : lagged_force(in, pair, at, BodyMotions{}, a, -1);
+  const bool acts = listed ? barrier_force(in, pair, at, a) : lagged_force(in, pair, at, a);
   return acts ? a.value : 0;
-}
-
-// The change of the energies of a vertex and of its friction on planes by a displacement; infinite where an energy does
-// not admit it. Adds the sizes of the terms.
-template <class T>
-DIFFVBD_FN double change_of_vertex(const RigidInputs<T>& in, const Body<T>& b, int32_t v, const Vector& displacement,
-                                   double& size) {
-  const VertexState<double> before = b.state(v, b.position(v));
-  VertexState<double> after = before;
-  after.x += displacement;
-  double change = 0;
-  bool admitted = true;
-  b.energies(v, [&](auto energy, int, const double* data, int count) {
-    using E = decltype(energy);
-    if constexpr (E::has_filter) {
-      admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastGapFraction);
-      change += E::change(before, displacement, data, count, size);
-    } else {
-      const double now = E::value(before, data, count), then = E::value(after, data, count);
-      change += then - now, size += absolute(now) + absolute(then);
-    }
-  });
-  for (int k = 0; k < in.planes; ++k) {
-    if (!bears(in, b, v, k)) continue;
-    const auto value = [&](const Vector& moved) {
-      const FloorFriction a = floor_friction(in, b, v, k, moved);
-      return a.size * friction_value(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
-    };
-    const double now = value(Vector{}), then = value(displacement);
-    change += then - now, size += absolute(now) + absolute(then);
-  }
-  return admitted ? change : std::numeric_limits<double>::infinity();
 }
 
 // The part of a vertex of the change by the displacement, a polynomial in s: inertia, and the tets that it is first in.

@@ -1,8 +1,7 @@
 // The rigid correction of bodies that touch (docs/method.md, section 18): groups, the gradient and the matrix of the
-// incremental potential over a turn and a shift of every body, friction along a step, and the trial fractions of the
-// Newton step. In double precision.
+// incremental potential over a turn and a shift of every body, and how it changes along a step. In double precision.
 // Groups of bodies are solved for together: those that touch, unless they are too many; then each is a group by itself.
-// Scenes of few bodies are one group.
+// The loops are those of rigid_step.h.
 #pragma once
 
 #include <cstdint>
@@ -15,7 +14,6 @@
 namespace diffvbd::contact {
 
 constexpr int kUnknowns = 6;                // of a body: a turn and a shift
-constexpr int kFew = 3;                     // bodies of scenes that are one group
 constexpr int kMostCoupled = 64;            // bodies of a group
 constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: memory of matrices
 constexpr int kGroupRows = 4;               // member, first, rank and count
@@ -28,26 +26,22 @@ DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
   return most < 1 ? 1 : most < bodies ? most : bodies;
 }
 
-// The groups of a scene. Bodies have places, those of a group in a row: up to kFew in the order of their numbers, more
-// in the order of elimination.
+// The groups of a scene. Bodies have places, those of a group in a row, in the order of their numbers.
 struct Groups {
   int32_t bodies;
-  int64_t capacity;     // bodies of a group that fit the memory of its matrix: larger groups do not move
-  const int32_t* rows;  // [4, bodies], or null: all are one group
+  int64_t capacity;  // bodies of a group
+  int32_t* rows;     // [4, bodies]
 
-  DIFFVBD_FN int32_t member(int32_t place) const { return rows ? rows[place] : place; }
-  DIFFVBD_FN int32_t first(int32_t body) const { return rows ? rows[bodies + body] : 0; }
-  DIFFVBD_FN int32_t rank(int32_t body) const { return rows ? rows[2 * bodies + body] : body; }
+  DIFFVBD_FN int32_t& member(int32_t place) const { return rows[place]; }
+  DIFFVBD_FN int32_t& first(int32_t body) const { return rows[bodies + body]; }
+  DIFFVBD_FN int32_t& rank(int32_t body) const { return rows[2 * bodies + body]; }
+  DIFFVBD_FN int32_t& size(int32_t place) const { return rows[3 * bodies + place]; }
+  DIFFVBD_FN int32_t place(int32_t body) const { return first(body) + rank(body); }
   // The size of the group that begins at a place, or 0.
-  DIFFVBD_FN int32_t count(int32_t place) const {
-    if (!rows) return place == 0 ? bodies : 0;
-    return is_left(place) ? 1 : rows[3 * bodies + place];
-  }
-  // Whether the body there is alone because those that touch are too many.
-  DIFFVBD_FN bool is_left(int32_t place) const { return rows && rows[3 * bodies + place] == kLeft; }
+  DIFFVBD_FN int32_t count(int32_t place) const { return size(place) == kLeft ? 1 : size(place); }
   DIFFVBD_FN bool joined(int32_t a, int32_t b) const { return first(a) == first(b); }
   // The offset of the matrix of the group that begins at a place.
-  DIFFVBD_FN int64_t matrix(int32_t place) const { return rows ? kUnknowns * kUnknowns * capacity * place : 0; }
+  DIFFVBD_FN int64_t matrix(int32_t place) const { return kUnknowns * kUnknowns * capacity * place; }
 };
 
 using rigid::Vector;
@@ -63,47 +57,28 @@ struct RigidInputs {
   const T* collider_prev;             // [B, Vc, 3]
   Batched<const T> kappa, floor_lag;  // floor_lag [1 | B, V, planes, 4]
   const bool* free;                   // [bodies]: nothing of it is pinned
-  const int32_t* groups;              // [B, 4, bodies], or null: one group, or not needed
-  int64_t capacity;                   // bodies of a group that fit the memory of its matrix
+  int32_t* groups;                    // [B, 4, bodies], or null: all are one
   const bool* moving;                 // [B, bodies], or null: all move
   int32_t planes;
   double friction_eps;
   bool has_friction;
-  bool bends;  // bodies do not move rigidly (contact_coarse.h): pairs within one act, too; friction is linear at x
+  bool bends;  // bodies do not move rigidly (contact_coarse.h): pairs within one act, too
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
-  // Lists are of all scenes, but what a scene does must not depend on others.
-  DIFFVBD_FN bool has_friction_in(int64_t s) const {
-    return has_friction && (planes > 0 || first_lagged(s) < first_lagged(s + 1));
-  }
-  // Whether all bodies of a scene are one group.
-  DIFFVBD_FN bool together() const { return scene.bodies <= kFew; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {
-    return {scene.bodies, capacity, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
+    return {scene.bodies, most_grouped(scene.bodies), groups + kGroupRows * scene.bodies * s};
   }
-  // Whether the group that begins at a place moves: some body of it is to, and its matrix fits.
+  // Whether the group that begins at a place moves: some body of it is to.
   DIFFVBD_FN bool moves(int64_t s, const Groups& g, int32_t place) const {
-    const int32_t count = g.count(place);
     bool any = !moving;
-    for (int32_t i = 0; i < count && !any; ++i) any = moving[s * scene.bodies + g.member(place + i)];
-    return any && count <= capacity;
+    for (int32_t i = 0; i < g.count(place) && !any; ++i) any = moving[s * scene.bodies + g.member(place + i)];
+    return any;
   }
   // Scalars of the matrices of a scene.
-  DIFFVBD_FN int64_t matrix_size() const { return kUnknowns * kUnknowns * scene.bodies * capacity; }
+  DIFFVBD_FN int64_t matrix_size() const { return kUnknowns * kUnknowns * scene.bodies * most_grouped(scene.bodies); }
   DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
 };
-
-// The bodies of a scene of few that are to move, and those that touch them, directly or not. touching [n, n]: of two,
-// either order.
-DIFFVBD_FN void find_moving(int32_t n, const bool* moving, const uint8_t* touching, bool* out) {
-  for (int32_t k = 0; k < n; ++k) out[k] = moving[k];
-  for (int32_t round = 1; round < n; ++round) {
-    for (int32_t i = 0; i < n * n; ++i) {
-      if (touching[i] && (out[i / n] || out[i % n])) out[i / n] = out[i % n] = true;
-    }
-  }
-}
 
 // The body that a corner point moves with, or -1.
 template <class T>
@@ -153,9 +128,6 @@ struct PairForce {
   double weight[2];
   Vector at[2], pull[2], torque[2];
   double value;
-  Vector tangential;     // tangential displacement that friction is linear about
-  double friction_load;  // h^2 times its load [N], over `doubled`
-  double doubled;        // 2 where sides are not of one group: each takes twice its body's motion; else 1
 
   // The item of a side, by comparison: an index unknown at compile time would move the arrays from registers to memory.
   static DIFFVBD_FN double of(int side, const double (&a)[2]) { return side == 0 ? a[0] : a[1]; }
@@ -168,45 +140,15 @@ struct PairForce {
     const Vector e = {double(k % 3 == 0), double(k % 3 == 1), double(k % 3 == 2)};
     return k < 3 ? cross(e, arm(side, center)) : of(side, weight) * e;
   }
-  // The motion by all of its unknowns.
-  DIFFVBD_FN Vector moved(int side, const Vector& center, const double* motion) const {
-    const Vector turn = {motion[0], motion[1], motion[2]}, shift = {motion[3], motion[4], motion[5]};
-    return cross(turn, arm(side, center)) + of(side, weight) * shift;
-  }
   DIFFVBD_FN double gradient(int side, int k, const Vector& center) const {
     const Vector by_shift = of(side, pull), own = k < 3 ? of(side, torque) - cross(center, by_shift) : by_shift;
     return dot(map(side, k, center), force) + (k % 3 == 0 ? own.x : k % 3 == 1 ? own.y : own.z);
   }
 };
-constexpr int kForceDoubles = 29;  // of a PairForce without its bodies, its value and its friction
-
-DIFFVBD_FN void store_force(const PairForce& a, double* to) {
-  int i = 0;
-  const auto put = [&](const Vector& v) { to[i] = v.x, to[i + 1] = v.y, to[i + 2] = v.z, i += 3; };
-  put(a.force);
-  const Sym3<double>& s = a.stiffness;
-  const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz, a.weight[0], a.weight[1]};
-  for (const double entry : entries) to[i++] = entry;
-  for (int side = 0; side < 2; ++side) put(a.at[side]), put(a.pull[side]), put(a.torque[side]);
-}
-DIFFVBD_FN PairForce load_force(const double* from, const int32_t* body) {
-  PairForce a;
-  int i = 0;
-  const auto get = [&] { return i += 3, Vector{from[i - 3], from[i - 2], from[i - 1]}; };
-  a.body[0] = body[0], a.body[1] = body[1];
-  a.force = get();
-  a.stiffness = {from[3], from[4], from[5], from[6], from[7], from[8]};
-  a.weight[0] = from[9], a.weight[1] = from[10];
-  i = 11;
-  for (int side = 0; side < 2; ++side) a.at[side] = get(), a.pull[side] = get(), a.torque[side] = get();
-  a.value = 0;
-  return a;
-}
-
 // Whether both sides of a pair move, but not as one group.
 template <class T>
 DIFFVBD_FN bool is_apart(const RigidInputs<T>& in, int64_t scene, const PairForce& a) {
-  return a.body[0] >= 0 && a.body[1] >= 0 && !in.groups_of(scene).joined(a.body[0], a.body[1]);
+  return in.groups && a.body[0] >= 0 && a.body[1] >= 0 && !in.groups_of(scene).joined(a.body[0], a.body[1]);
 }
 // Then each side has twice the stiffness: no step is too long.
 template <class T>
@@ -222,7 +164,6 @@ DIFFVBD_FN void sides_of(const RigidInputs<T>& in, const int32_t* record, PairFo
     out.weight[side] = 0;
     out.at[side] = out.pull[side] = out.torque[side] = Vector{};
   }
-  out.friction_load = 0;
 }
 
 // Calls f(side, k) for the corners of a pair whose first side has `first`; as each_across().
@@ -329,46 +270,51 @@ DIFFVBD_FN FloorFriction floor_friction(const RigidInputs<T>& in, const rigid::B
   return {n, travel - dot(n, travel) * n, h * h * double(lag[0])};
 }
 
-// Adds friction on a plane, linear about the position after `displacement`.
+// Adds friction on all planes.
 template <class T>
-DIFFVBD_FN void add_plane_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
-                                   const Vector& displacement, Vector& g, Sym3<double>& H) {
-  const FloorFriction a = floor_friction(in, b, v, plane, displacement);
-  const FrictionRate<double> f(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
-  const Vector along = displacement - dot(a.n, displacement) * a.n;
-  g += a.size * (f.value * (a.tangential - along) - (f.curvature * dot(a.tangential, along)) * a.tangential);
-  add_diagonal(H, a.size * f.value);
-  add_outer(H, -a.size * f.value, a.n);
-  add_outer(H, a.size * f.curvature, a.tangential);
-}
-// The same on all planes.
-template <class T>
-DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v,
-                                   const Vector& displacement, Vector& g, Sym3<double>& H) {
-  for (int k = 0; k < in.planes; ++k) {
-    if (bears(in, b, v, k)) add_plane_friction(in, b, v, k, displacement, g, H);
-  }
-}
-
-// Roundings of its position by which a vertex may leave its target before its potential counts as increased: in free
-// flight the potential is nothing else.
-constexpr double kValueUlps = 8;
-
-// The potential of a vertex, now or after the trial displacement, less its rounding.
-template <class T>
-DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, bool moved) {
-  const Vector x = CornerPoints<T>{in, moved}.relative(b.scene, v), off = x - b.target(v);
-  const VertexState<double> s = b.state(v, x);
-  double value = 0.5 * b.mass(v) * dot(off, off);
-  b.energies(
-      v, [&](auto energy, int, const double* data, int count) { value += decltype(energy)::value(s, data, count); });
+DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, Vector& g,
+                                   Sym3<double>& H) {
   for (int k = 0; k < in.planes; ++k) {
     if (!bears(in, b, v, k)) continue;
-    const FloorFriction a = floor_friction(in, b, v, k, x - b.position(v));
-    value += a.size * friction_value(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
+    const FloorFriction a = floor_friction(in, b, v, k, Vector{});
+    const FrictionRate<double> f(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
+    g += (a.size * f.value) * a.tangential;
+    add_diagonal(H, a.size * f.value);
+    add_outer(H, -a.size * f.value, a.n);
+    add_outer(H, a.size * f.curvature, a.tangential);
   }
-  const double rounding = kValueUlps * std::numeric_limits<T>::epsilon() * size_of(x);
-  return moved ? value - b.mass(v) * rounding * rounding : value;
+}
+
+// The change of the energies of a vertex and of its friction on planes by a displacement; infinite where an energy does
+// not admit it. Adds the sizes of the terms.
+template <class T>
+DIFFVBD_FN double change_of_vertex(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v,
+                                   const Vector& displacement, double& size) {
+  const VertexState<double> before = b.state(v, b.position(v));
+  VertexState<double> after = before;
+  after.x += displacement;
+  double change = 0;
+  bool admitted = true;
+  b.energies(v, [&](auto energy, int, const double* data, int count) {
+    using E = decltype(energy);
+    if constexpr (E::has_filter) {
+      admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastGapFraction);
+      change += E::change(before, displacement, data, count, size);
+    } else {
+      const double now = E::value(before, data, count), then = E::value(after, data, count);
+      change += then - now, size += absolute(now) + absolute(then);
+    }
+  });
+  for (int k = 0; k < in.planes; ++k) {
+    if (!bears(in, b, v, k)) continue;
+    const auto value = [&](const Vector& moved) {
+      const FloorFriction a = floor_friction(in, b, v, k, moved);
+      return a.size * friction_value(square_root(dot(a.tangential, a.tangential)), in.friction_eps);
+    };
+    const double now = value(Vector{}), then = value(displacement);
+    change += then - now, size += absolute(now) + absolute(then);
+  }
+  return admitted ? change : std::numeric_limits<double>::infinity();
 }
 
 // The displacement of a point at r from the center by a turn and a shift.
@@ -376,14 +322,6 @@ DIFFVBD_FN Vector displaced(const double* motion, double fraction, const Vector&
   const Vector w = fraction * vector_at(motion), turned = cross(w, r);
   const rigid::Angles s(w);
   return s.a * turned + s.b * cross(w, turned) + fraction * vector_at(motion + 3);
-}
-
-// The Newton step of a body from the solution for its gradient; zero where the matrix was not positive definite.
-DIFFVBD_FN void keep_finite(double* solution) {
-  bool finite = true;
-  for (int i = 0; i < kUnknowns; ++i)
-    finite = finite && absolute(solution[i]) < std::numeric_limits<double>::infinity();
-  for (int i = 0; i < kUnknowns; ++i) solution[i] = finite ? -solution[i] : 0.0;
 }
 
 // --- lagged friction and damping of pairs
@@ -396,48 +334,20 @@ DIFFVBD_FN Vector before(const RigidInputs<T>& in, int64_t scene, int32_t v) {
                           : in.collider_prev + 3 * (scene * (in.gate.corners - mesh) + v - mesh));
 }
 
-// Motions of all bodies of a scene, about which friction is linear; null: no motion.
-struct BodyMotions {
-  const double *center, *motion;  // [bodies, 3], [bodies, 6]
-};
-
-// The relative displacement of the sides of a lagged pair by such motions.
-DIFFVBD_FN Vector displacement_of(const PairForce& a, const BodyMotions& motions) {
-  Vector displacement{};
-  for (int side = 0; side < 2; ++side) {
-    const int32_t body = a.body[side];
-    if (body < 0) continue;
-    displacement += a.doubled * a.moved(side, wide_at(motions.center + 3 * body), motions.motion + kUnknowns * body);
-  }
-  return displacement;
-}
-
-// The part of lagged friction and damping that does not depend on the motions.
-struct LaggedFriction {
-  Vector n, u;                     // u: tangential displacement since the start of the step
-  double size, damping, approach;  // h^2 times the normal force [N]; h times the coefficient; approach of the sides
-};
-
-// The sides of a lagged pair and its state; false where it does not act. It acts along a gap, and so turns even a body
-// by itself. Where the sides are of two groups, `alone` selects one: it has half of the potential at twice its motion,
-// and the potential is convex, so that lowering both halves lowers the whole. alone = -1: both.
+// The friction and damping of a lagged pair, linear at x; false where it does not act. It acts along a gap, and so
+// turns even a body by itself.
 template <class T, class At>
-DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& at, int alone, PairForce& out,
-                             LaggedFriction& lagged_state) {
+DIFFVBD_FN bool lagged_force(const RigidInputs<T>& in, int64_t pair, const At& at, PairForce& out) {
   const int32_t* record = in.lagged.pairs + kPairRow * pair;
   const Lag<T> lag(in.lag + kLagScalars * pair);
   if (!lag.active()) return false;
   const int64_t scene = record[5];
-  const int first = sides(record[4]);
   sides_of(in, record, out);
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   const bool within = out.body[0] == out.body[1];
   if (within) out.body[1] = -1;
-  const bool halves = alone >= 0 && is_apart(in, scene, out);
-  if (halves) out.body[1 - alone] = -1;
-  out.doubled = halves ? 2 : 1;
   Vector m{};
-  each_corner(within ? 4 : first, [&](int side, int k) {
+  each_corner(within ? 4 : sides(record[4]), [&](int side, int k) {
     const int32_t v = record[k];
     const Vector x = at.relative(scene, v);
     m += double(lag.w[k]) * (x - before(in, scene, v));
@@ -445,160 +355,31 @@ DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& a
     out.weight[side] += lag.w[k];
     out.at[side] += double(lag.w[k]) * x;
   });
-  lagged_state.n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
-  const double h = in.scene.time_step, along = dot(lagged_state.n, m);
-  lagged_state.u = m - along * lagged_state.n;
-  lagged_state.size = h * h * double(lag.friction), lagged_state.damping = h * double(lag.damping);
-  lagged_state.approach = along < 0 ? along : 0;
-  return true;
-}
-
-// Its force. Gradient and matrix are exact after the relative displacement.
-DIFFVBD_FN void lagged_friction_force(const LaggedFriction& a, const Vector& displacement, double eps, PairForce& out) {
-  out.tangential = a.u + (displacement - dot(a.n, displacement) * a.n);
-  const double length = square_root(dot(out.tangential, out.tangential));
-  const FrictionRate<double> f(length, eps);
-  out.friction_load = a.size / out.doubled;
-  out.value = a.size * friction_value(length, eps) + 0.5 * a.damping * a.approach * a.approach;
-  out.force = a.size * (f.value * a.u - (f.curvature * dot(out.tangential, displacement)) * out.tangential) +
-              (a.damping * a.approach) * a.n;
-  const double borne = out.doubled;
-  out.stiffness = diagonal(borne * a.size * f.value);
-  add_outer(out.stiffness, borne * (a.damping - a.size * f.value), a.n);
-  add_outer(out.stiffness, borne * a.size * f.curvature, out.tangential);
-}
-
-// Both, about the given motions.
-template <class T, class At>
-DIFFVBD_FN bool lagged_force(const RigidInputs<T>& in, int64_t pair, const At& at, const BodyMotions& motions,
-                             PairForce& out, int alone) {
-  LaggedFriction lagged_state;
-  if (!lagged_sides(in, pair, at, alone, out, lagged_state)) return false;
-  lagged_friction_force(lagged_state, motions.motion ? displacement_of(out, motions) : Vector{}, in.friction_eps, out);
-  return true;
-}
-
-// --- friction along a step. All else is linear in the motions of bodies. Newton's method iterates on friction, with
-// shorter steps where a full one would reverse a tangential displacement.
-
-constexpr int kFrictionIterations = 200;  // of Newton's method at most; most systems need 10 to 30
-constexpr int kHalvings = 40;             // in the search for the length of a step, at most
-constexpr double kOvershoot = 0.1;        // slope at the end of a step over that at its start that counts as small
-constexpr double kSettled = 1e-9;         // of the whole motion: one more step follows
-
-// FrictionRate's value for the square of a length, without the divisions that take most of the time of a search.
-DIFFVBD_FN double friction_rate(double square, double eps) {
-  if (!(0 < square)) return 2 / eps;
-#ifdef __CUDA_ARCH__
-  const double inverse = rsqrt(square);
-#else
-  const double inverse = 1 / square_root(square);
-#endif
-  if (!(square < eps * eps)) return inverse;
-  const double over = 1 / eps;
-  return (2 - square * inverse * over) * over;
-}
-
-// A tangential displacement u along a step c of Newton's method, as far as friction depends on it.
-struct FrictionLine {
-  double start, along, step_square;  // u u, u c and c c
-  double size, rate, bend;           // linear model of friction: f1(|u|) / |u| at the start, and its derivative
-
-  FrictionLine() = default;
-  DIFFVBD_FN FrictionLine(const Vector& tangential, const Vector& change, double load, double eps)
-      : start(dot(tangential, tangential)),
-        along(dot(tangential, change)),
-        step_square(dot(change, change)),
-        size(load) {
-    const FrictionRate<double> first(square_root(start), eps);
-    rate = first.value, bend = first.curvature * along;
-  }
-
-  // The slope of the potential after a fraction of the step, beyond that of the linear model.
-  DIFFVBD_FN double excess(double fraction, double eps) const {
-    const double toward = along + fraction * step_square, square = start + fraction * (along + toward);
-    return size * ((friction_rate(square, eps) - rate) * toward - fraction * bend * along);
-  }
-};
-
-// The line of a lagged pair, from its force.
-template <class T>
-DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, int64_t pair, const PairForce& a, const double* center,
-                                      const double* step) {
-  const Lag<T> lag(in.lag + kLagScalars * pair);
   const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
-  const Vector displacement = displacement_of(a, {center, step});
-  return {a.tangential, displacement - dot(n, displacement) * n, a.friction_load, in.friction_eps};
+  const double h = in.scene.time_step, along = dot(n, m), approach = along < 0 ? along : 0;
+  const double load = h * h * double(lag.friction), damping = h * double(lag.damping), eps = in.friction_eps;
+  const Vector u = m - along * n;
+  const double length = square_root(dot(u, u));
+  const FrictionRate<double> f(length, eps);
+  out.value = load * friction_value(length, eps) + 0.5 * damping * approach * approach;
+  out.force = (load * f.value) * u + (damping * approach) * n;
+  out.stiffness = diagonal(load * f.value);
+  add_outer(out.stiffness, damping - load * f.value, n);
+  add_outer(out.stiffness, load * f.curvature, u);
+  return true;
 }
 
-// The line of a vertex at r from its body's center on one plane of a floor, with that body's motion so far and its
-// step.
-template <class T>
-DIFFVBD_FN FrictionLine friction_line(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
-                                      const Vector& r, const double* motion, const double* step) {
-  const FloorFriction a = floor_friction(in, b, v, plane, moved_by(motion, r));
-  const Vector displacement = moved_by(step, r);
-  return {a.tangential, displacement - dot(a.n, displacement) * a.n, a.size, in.friction_eps};
-}
+// --- trial fractions of the rigid motions: halved until no body is blocked and the potential does not increase. Bodies
+// decide together with those that they may touch, and with no others.
 
-// The fraction of a step after which the slope of the potential is small or negative. decrease: twice the decrease of
-// the linear model along the step; excess(fraction): the sum over all lines.
-template <class Excess>
-DIFFVBD_FN double friction_fraction(double decrease, const Excess& excess) {
-  if (!(kOvershoot * decrease < excess(1.0))) return 1;
-  double low = 0, high = 1;
-  for (int i = 0; i < kHalvings; ++i) {
-    const double middle = 0.5 * (low + high), slope = excess(middle) - decrease * (1 - middle);
-    if (absolute(slope) <= kOvershoot * decrease) return middle;
-    (slope < 0 ? low : high) = middle;
-  }
-  return high;
-}
-
-// State of a system: iterating, at the settled motion but without its matrix there, and done.
-enum Settling : uint8_t { kIterating, kSettledAt, kDone };
-
-// The fraction of a step. decrease, whole: twice the potential of the step and of the motion after it.
-template <class Fraction>
-DIFFVBD_FN double settle(Settling& state, bool has_friction, double decrease, double whole, const Fraction& fraction) {
-  if (!has_friction || state == kSettledAt) {
-    state = kDone;
-    return 1;
-  }
-  if (decrease <= kSettled * kSettled * whole) {
-    state = kSettledAt;
-    return 1;
-  }
-  return fraction(decrease);
-}
-
-// --- trial fractions of the rigid motions: reduced until no body is blocked and the potential does not increase.
-// Bodies decide together with those that they may touch, and with no others.
-
-constexpr int kTrials = 6;           // of motions, each reduced for some bodies
-constexpr int kShorter = 3;          // of these: reductions of a blocked body before it stays
-constexpr int kSpreads = 4;          // how often a reduction spreads to touching bodies
-constexpr double kIncrease = 1e-12;  // of the potential: counts as no increase
-constexpr double kRounded = 1e-6;    // of a length, that rounding cannot reach
+constexpr int kTrials = 5;          // fractions 1, 1/2, ... before 0
+constexpr double kRounded = 1e-6;  // of a length, that rounding cannot reach
 
 // The body that a pair counts for: the first of those that it moves with, or -1.
 template <class T>
 DIFFVBD_FN int32_t owner_of(const RigidInputs<T>& in, const int32_t* record) {
   const int32_t first = moving_body(in, record[0]);
   return 0 <= first ? first : moving_body(in, record[sides(record[4])]);
-}
-
-// Whether the energies of a vertex admit its trial.
-template <class T>
-DIFFVBD_FN bool admitted(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v) {
-  const VertexState<double> s = b.state(v, CornerPoints<T>{in, true}.relative(b.scene, v));
-  bool out = true;
-  b.energies(v, [&](auto energy, int, const double* data, int count) {
-    using E = decltype(energy);
-    if constexpr (E::has_filter)
-      out = out && E::template admits<T>(s, b.position(v), data, count, rigid::kLeastGapFraction);
-  });
-  return out;
 }
 
 // Bounds for any fraction of the motion of a vertex's body: its displacement since gaps were taken, and the size of its
@@ -620,28 +401,17 @@ DIFFVBD_FN Farthest farthest_of(const RigidInputs<T>& in, const rigid::Body<T>& 
 }
 
 // Whether a listed pair may come within reach of its barrier for any fractions: a gap shrinks by no more than its sides
-// have moved. displacement, size [bodies]: the largest of their vertices.
+// have moved. reach [bodies, 2]: the largest displacement and size of their vertices.
 template <class T>
-DIFFVBD_FN bool may_touch(const RigidInputs<T>& in, int64_t pair, const double* displacement, const double* size) {
+DIFFVBD_FN bool may_touch(const RigidInputs<T>& in, int64_t pair, const double* reach) {
   if (!is_between(in, pair)) return false;
   const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
   const T* constants = in.gate.constants + kConstants * pair;
   const int32_t a = in.gate.body[record[0]], b = in.gate.body[record[sides(record[4])]];
   if (a >= in.bodies() || b >= in.bodies()) return true;  // its gap may be older
   const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
-  const T larger = static_cast<T>(size[a] < size[b] ? size[b] : size[a]);
-  return !(displacement[a] + displacement[b] < (1 - kRounded) * (gap - guard_of_size(larger)));  // as stays_far()
-}
-
-// Whether a trial is accepted: all bodies fit, and their potential does not increase.
-DIFFVBD_FN bool is_safe(double before, double after, bool fits) {
-  return fits && after <= before + kIncrease * absolute(before);
-}
-// The factor of the next trial of a body, before reductions spread.
-DIFFVBD_FN double shortened(bool blocked, bool fits, int attempt) {
-  if (fits) return 0.5;  // the potential increases: all are halved
-  if (!blocked) return 1.0;
-  return attempt == 0 ? 0.5 : attempt < kShorter ? 0.25 : 0.0;
+  const T size = static_cast<T>(larger(reach[2 * a + 1], reach[2 * b + 1]));
+  return !(reach[2 * a] + reach[2 * b] < (1 - kRounded) * (gap - guard_of_size(size)));  // as stays_far()
 }
 
 // The result of the trials, of each body [B, bodies].
@@ -651,7 +421,8 @@ struct RigidOutcome {
   bool* moved;       // whether it has a motion
   // whether it was blocked, in a scene in which some blocked bodies have moved: others may move on now
   bool* blocked;
-  T* left;  // the rest of its shift [m]
+  bool* alone;  // whether it is solved for alone, since too many touch
+  T* left;      // the rest of its shift [m]
 };
 // Ends the trials of a body; returns whether it was blocked after a part of its motion.
 template <class T>
@@ -661,7 +432,7 @@ DIFFVBD_FN bool finish_trials(const RigidInputs<T>& in, const double* motions, i
   bool moved = false;
   for (int i = 0; i < kUnknowns; ++i) moved = moved || motion[i] != 0;
   double& fraction = out.fraction[unit];
-  if (in.moving && !moved) fraction = 0;  // it passes no adjoint on
+  if (!moved) fraction = 0;  // it passes no adjoint on
   const Vector shift = wide_at(motion + 3);
   out.moved[unit] = moved, out.blocked[unit] = moved && fraction < 1;
   out.left[unit] = T((1 - fraction) * square_root(dot(shift, shift)));

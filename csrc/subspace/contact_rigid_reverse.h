@@ -36,23 +36,6 @@ struct PointWork {
 };
 constexpr int kPointScalars = kWorkScalars + 3;
 
-// Adds the derivatives of every `stride`-th pair of a corner point from `first` on: by x, p, q and since.
-template <class T>
-DIFFVBD_FN void add_at_point(const RigidInputs<T>& in, const RigidWork<T>& work, int64_t point, int first, int stride,
-                             double* sum) {
-  const auto add = [&](const PairList& list, const T* rows, const uint8_t* pushes) {
-    const PairList::Entries all = list.of(point);
-    for (int e = first; e < all.count; e += stride) {
-      const int64_t entry = all.first[e];
-      if (pushes && !pushes[entry >> 2]) continue;
-      const T* row = rows + kWorkScalars * entry;
-      for (int i = 0; i < kWorkScalars; ++i) sum[i] += row[i];
-      for (int i = 0; !pushes && i < 3; ++i) sum[kWorkScalars + i] += row[i];
-    }
-  };
-  if (work.listed > 0) add(in.gate.listed, work.barrier, work.pushes);
-  if (work.lagged > 0) add(in.lagged, work.friction, nullptr);
-}
 template <class T>
 DIFFVBD_FN void store_at_point(const double* sum, int64_t point, const PointWork<T>& out) {
   T* const to[] = {out.x, out.p, out.q, out.since};
@@ -89,7 +72,7 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   }
   out.first = sides(record[4]);
   const int32_t one = moving_body(in, record[0]), two = moving_body(in, record[out.first]);
-  const bool apart = one >= 0 && two >= 0 && !in.groups_of(record[5]).joined(one, two);
+  const bool apart = in.groups && one >= 0 && two >= 0 && !in.groups_of(record[5]).joined(one, two);
   out.sides = apart ? 2 : 1, out.fraction = apart ? 2 : 1;
   return out;
 }
@@ -214,12 +197,10 @@ DIFFVBD_FN FrictionRate<R> friction_rate_of(const Vec3<R>& u, double eps) {
 }
 
 // The virtual work by P of friction with a load of 1 after a motion Q. d: the motion since the start of the step, of
-// which u is tangential to n. Force and stiffness at u, times Q; where it is not `linear`, the force after Q.
+// which u is tangential to n. Force and stiffness at u, times Q.
 template <class R>
-DIFFVBD_FN R friction_work(const Vec3<R>& n, const Vec3<R>& d, const Vec3<R>& P, const Vec3<R>& Q, double eps,
-                           bool linear) {
+DIFFVBD_FN R friction_work(const Vec3<R>& n, const Vec3<R>& d, const Vec3<R>& P, const Vec3<R>& Q, double eps) {
   const Vec3<R> u = d - dot(n, d) * n, slip = Q - dot(n, Q) * n;
-  if (!linear) return friction_rate_of(u + slip, eps).value * dot(u + slip, P);
   const FrictionRate<R> f = friction_rate_of(u, eps);
   return f.value * dot(u + slip, P) + f.curvature * dot(u, P) * dot(u, Q);
 }
@@ -240,15 +221,13 @@ struct LaggedWork {
   PairMotions m;
   Vector since[4], n, d;  // since: how each corner has moved
   double w[4], load, damping, h, eps;
-  bool linear;
 
   DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
       : acts(pair < in.first_lagged(in.scene.scenes)),
         m{},
         d{},
         h(in.scene.time_step),
-        eps(in.friction_eps),
-        linear(in.bends) {
+        eps(in.friction_eps) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force: above dhat, or by a coefficient of zero
@@ -275,7 +254,7 @@ struct LaggedWork {
     const R along = dot(by_n, by_d), approach = along < R(0) ? along : R(0), fraction = R(m.fraction);
     const R damped = R(A) * (approach + fraction * dot(by_n, Q)) * dot(by_n, P);
     if (L == 0) return damped;
-    return damped + R(L) * friction_work(by_n, by_d, P, fraction * Q, eps, linear);
+    return damped + R(L) * friction_work(by_n, by_d, P, fraction * Q, eps);
   }
 
   // Stores the rows of the corners [4, 9], and adds to lag_bar [9].
@@ -340,15 +319,14 @@ DIFFVBD_FN void motion_adjoint(const double* motion, double fraction, const Vect
 // Of friction on one plane of a floor, the derivatives of the work by the travel since the start of the step, and by
 // what is lagged [4]: load [N] and normal.
 DIFFVBD_FN Vector friction_adjoint(const double* lag, const Vector& travel, const Vector& P, const Vector& Q, double h2,
-                                   double eps, bool linear, double* by_lag) {
+                                   double eps, double* by_lag) {
   const Vector n = vector_at(lag + 1);
   const auto derived = [&](int direction) {
     return h2 * lag[0] *
-           friction_work(dual_of(n, direction - 3), dual_of(travel, direction), dual_of(P, -1), dual_of(Q, -1), eps,
-                         linear)
+           friction_work(dual_of(n, direction - 3), dual_of(travel, direction), dual_of(P, -1), dual_of(Q, -1), eps)
                .derivative;
   };
-  by_lag[0] = h2 * friction_work(n, travel, P, Q, eps, linear);
+  by_lag[0] = h2 * friction_work(n, travel, P, Q, eps);
   for (int i = 0; i < 3; ++i) by_lag[1 + i] = derived(3 + i);
   return {derived(0), derived(1), derived(2)};
 }
@@ -368,7 +346,7 @@ DIFFVBD_FN void add_friction_adjoint(const RigidInputs<T>& in, const rigid::Body
     const T* given = contact::floor_lag(in, b, v, k);
     double lag[kFloorLag], by_lag[kFloorLag];
     for (int i = 0; i < kFloorLag; ++i) lag[i] = given[i];
-    const Vector by_travel = friction_adjoint(lag, travel, P, Q, h2, in.friction_eps, in.bends, by_lag);
+    const Vector by_travel = friction_adjoint(lag, travel, P, Q, h2, in.friction_eps, by_lag);
     out.x -= by_travel, out.x_prev += by_travel;
     for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
   }
@@ -386,7 +364,7 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
   Vector g;
   Sym3<double> H;
   vertex_force(in, b, v, g, H);
-  add_floor_friction(in, b, v, Q, g, H);
+  add_floor_friction(in, b, v, g, H);
   VertexAdjoint out{-mass * P, Vector{}, mass * P, Vector{}, -dot(P, x - b.target(v) + Q)};
   b.energies(v, [&](auto energy, int, const double* data, int count) {
     vertex_energy_vjp<decltype(energy)>(s, data, count, P, Q, out.x, out.x_prev);

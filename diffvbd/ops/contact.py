@@ -248,70 +248,26 @@ def compact(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------
 
 
-def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
-                 moving: Tensor | None = None, alone: bool = False
-                 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Rigid motion of each body to the minimum of the step's potential, float64: centers of mass [B, bodies, 3] [m],
-    motion [B, bodies, 6] (rotation, translation), Cholesky factors of groups of touching bodies
-    [B, bodies, 6, 6 most_grouped()], and groups int32 [B, 4, bodies] (csrc/contact/islands.h). With at most FEW bodies:
-    one factor [B, 6 bodies, 6 bodies], and no groups.
-
-    friction_eps: [m], 0 without friction.  moving: bool [B, bodies]: these move, and their groups; without groups, the
-    bodies that touch one.  alone: With more than FEW bodies, only groups of one move; factors [B, bodies, 6, 6].
-    """
-    moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
-    return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, moving, alone)
-
-
-def left_alone(groups: Tensor) -> Tensor:
-    """Bodies [B, bodies] of groups that are too large to be corrected together; groups are not empty."""
-    return groups[:, 3].gather(1, groups[:, 1].long()) < 0
-
-
-class Moved(NamedTuple):
-    """Result of :func:`rigid_move`."""
+class Corrected(NamedTuple):
+    """Result of :func:`rigid_correct`."""
 
     x: Tensor  # [B, V, 3]
-    fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; with `moving`, zero where there is none
+    fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; zero where there is none
     moved: Tensor  # bool [B, bodies]: the body has a motion
     blocked: Tensor  # bool [B, bodies]: the body was blocked, in a scene where some blocked body has moved on
+    alone: Tensor  # bool [B, bodies]: the body was solved for alone, since too many touch
     remaining: Tensor  # [B, bodies]: translation that was not taken [m]
 
 
-def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
-               friction_eps: float, moving: Tensor | None = None) -> Moved:  # fmt: skip
-    """State after the admissible fraction of each motion [B, bodies, 6]. moving: As for :func:`rigid_system`."""
+def rigid_correct(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
+                  moving: Tensor | None = None) -> Corrected:  # fmt: skip
+    """State after the admissible fraction of one Newton step of the step's potential over a turn and a shift of every
+    body (csrc/subspace/rigid_step.h).
+
+    friction_eps: [m], 0 without friction.  moving: bool [B, bodies]: these move, and those that touch them; or None.
+    """
     moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
-    return Moved(*raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps, moving))
-
-
-class PairWork(NamedTuple):
-    """Result of :func:`rigid_backward`."""
-
-    by_x: Tensor  # [B, N, 3]: derivative by the corner points
-    by_p: Tensor  # by p, without pairs of which no corner moves by p
-    by_q: Tensor  # by q
-    since: Tensor  # by_x of lagged pairs alone, by the motion since the start of the step; or empty
-    by_kappa: Tensor  # [pairs], of each listed pair
-    lag_bar: Tensor  # [lagged, 9]: minus the derivatives by lagged values
-
-
-def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor, data_count: Sequence[int],
-                   time_step: float, friction_eps: float) -> PairWork:  # fmt: skip
-    """Contributions of pairs to the derivatives of p . (gradient + matrix q) of the Newton step. p, q: motions of all
-    corner points [B, N, 3].  groups: Those of the step."""
-    return PairWork(*raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), groups, data_count, time_step,
-                                                friction_eps))  # fmt: skip
-
-
-class Made(NamedTuple):
-    """Corrections in their order."""
-
-    x: Sequence[Tensor]  # positions before each [B, V, 3]
-    motion: Sequence[Tensor]
-    fraction: Sequence[Tensor]
-    factor: Sequence[Tensor]
-    groups: Sequence[Tensor]
+    return Corrected(*raw.contact_rigid_correct(*fields, data_count, time_step, friction_eps, moving))
 
 
 class RigidAdjoints(NamedTuple):
@@ -329,12 +285,12 @@ class RigidAdjoints(NamedTuple):
     lag: Tensor  # [lagged, 9]
 
 
-def rigid_reverse(fields: TouchingFields, made: Made, x_bar: Tensor, data_count: Sequence[int], time_step: float,
-                  friction_eps: float, wants_data: bool) -> RigidAdjoints:  # fmt: skip
-    """Adjoint of corrections, from x_bar [B, V, 3] of the state after the last one: of the displacements, and of
-    -p . (gradient + matrix q), where p moves points by the adjoint of a motion and q by the motion. fields: Of all
-    corrections, but for x."""
-    out = raw.contact_rigid_reverse(*fields, *(list(each) for each in made), x_bar.contiguous(), data_count, time_step,
+def rigid_reverse(fields: TouchingFields, at: Sequence[Tensor], fraction: Sequence[Tensor], x_bar: Tensor,
+                  data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
+                  ) -> RigidAdjoints:  # fmt: skip
+    """Adjoint of corrections, each from ``at`` [B, V, 3] by its fraction, of the state x_bar [B, V, 3] after the last
+    one. fields: Of all corrections, but for x."""
+    out = raw.contact_rigid_reverse(*fields, list(at), list(fraction), x_bar.contiguous(), data_count, time_step,
                                     friction_eps, wants_data)  # fmt: skip
     return adjoints_of(out, data_count, wants_data)
 

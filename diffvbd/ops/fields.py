@@ -19,9 +19,6 @@ LAG_SCALARS, PLANE_SCALARS = _C["lag_scalars"], _C["plane_scalars"]
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS, CROSSING_ROW = (
     _C[name] for name in ("pair_row", "pair_constants", "near_row", "near_values", "counts", "crossing_row")
 )
-UNKNOWNS, FEW, MOST_COUPLED, GROUP_MEMORY = (
-    _C[name] for name in ("unknowns", "few", "most_coupled", "group_memory")
-)  # of bodies that touch
 STARTS = {"inertia": _C["start_inertia"], "predictor": _C["start_predictor"], "auto": _C["start_lower"]}
 START_LOWER = STARTS["auto"]
 CORRECTED, TILE, NO_MOVE, WORKSPACE_BUDGET, ROUNDINGS = (
@@ -269,8 +266,3 @@ def tape_shape(x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, laun
     """Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape."""
     shape = [sweeps, tape_rows(policy, energies), sizes[0]]
     return [*shape, x.shape[0]] if tuple(launch[:1]) == (THREAD,) else [x.shape[0], *shape]
-
-
-def most_grouped(bodies: int) -> int:
-    """Bodies at most of a group of those that touch."""
-    return min(max(GROUP_MEMORY // max(bodies, 1), 1), MOST_COUPLED, bodies)

@@ -19,7 +19,6 @@ from .fields import (
     COUNTS,
     CROSSING_ROW,
     DISPLACEMENTS,
-    FEW,
     LAG_SCALARS,
     LANES,
     NEAR_ROW,
@@ -29,10 +28,8 @@ from .fields import (
     REST_SCALARS,
     START_LOWER,
     SWEEP_ADJOINTS,
-    UNKNOWNS,
     CoarseSizes,
     corrections_shape,
-    most_grouped,
     tape_shape,
 )
 from .load import raw
@@ -175,27 +172,13 @@ def _contact_trust_radii(a: Any) -> Any:
     return new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1)
 
 
-def _contact_rigid_system(a: Any) -> Any:
-    b, n = a.x.shape[0], a.free.shape[0]
-    six, together = UNKNOWNS, n <= FEW
-    factor = (b, six * n, six * n) if together else (b, n, six, six * (1 if a.alone else most_grouped(n)))
-    doubles = (new(a.x, *shape, dtype=DOUBLE) for shape in ((b, n, 3), (b, n, six), factor))
-    return *doubles, new(a.x, *((0,) if together else (b, 4, n)), dtype=INT)
-
-
-def _contact_rigid_move(a: Any) -> Any:
+def _contact_rigid_correct(a: Any) -> Any:
     size = a.x.shape[0], a.free.shape[0]
-    return torch.empty_like(a.x), *(new(a.x, *size, dtype=dtype) for dtype in (DOUBLE, BOOL, BOOL, a.x.dtype))
+    return torch.empty_like(a.x), *(new(a.x, *size, dtype=dtype) for dtype in (DOUBLE, BOOL, BOOL, BOOL, a.x.dtype))
 
 
 def _pairs(a: Any) -> tuple[int, int]:
     return a.pairs.shape[0], a.lag_pairs.shape[0] if a.lag.numel() else 0
-
-
-def _contact_rigid_backward(a: Any) -> Any:
-    (listed, lagged), b, n = _pairs(a), a.x.shape[0], a.body.shape[0]
-    shapes = (*[(b, n, 3)] * 3, (b if lagged else 0, n, 3), (listed,), (lagged, LAG_SCALARS))
-    return tuple(new(a.x, *shape) for shape in shapes)
 
 
 def _contact_rigid_reverse(a: Any) -> Any:
@@ -259,9 +242,7 @@ TABLE: dict[str, Row] = {
     "contact_lag": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), new(a.x, a.pairs.shape[0]),
                               new(a.x, a.pairs.shape[0], dtype=LONG)),
     "contact_lag_backward": lambda a: (_points(a.x, a.collider), new(a.x, a.x.shape[0])),
-    "contact_rigid_system": _contact_rigid_system,
-    "contact_rigid_move": _contact_rigid_move,
-    "contact_rigid_backward": _contact_rigid_backward,
+    "contact_rigid_correct": _contact_rigid_correct,
     "contact_rigid_reverse": _contact_rigid_reverse,
     "contact_coarse_system": _contact_coarse_system,
     "contact_coarse_move": lambda a: (torch.empty_like(a.x), new(a.x, a.x.shape[0], a.free.shape[0], dtype=DOUBLE)),

@@ -222,23 +222,16 @@ class LaggedPairForces:
 
     def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """As those of the barrier, of friction exactly."""
-        damping, friction = self.damping_on_corners(x), self.friction_on_corners(x)
-        return damping[0] + friction[0], damping[1] + friction[1]
-
-    def damping_on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        along, _, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
+        along, slip, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
         rate, n = self.h * self.damping, self.normal
-        return self._at_corners(weights, (rate * along)[:, None] * n, rate[:, None, None] * n[:, :, None] * n[:, None])
-
-    def friction_on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        _, slip, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
-        load, n = self.h**2 * (0.0 * self.damping if self.largest is None else self.largest), self.normal
-        _, rate, bend = smoothed(slip, self.reach or 1.0)
-        u, rate, bend = slip.T, (load * rate)[:, None, None], (load * bend)[:, None, None]
-        across = torch.eye(3).to(x) - n[:, :, None] * n[:, None]
-        return self._at_corners(weights, rate[..., 0] * u, rate * across + bend * u[:, :, None] * u[:, None])
-
-    def _at_corners(self, weights: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Tensor, Tensor]:
+        force, outer = (rate * along)[:, None] * n, n[:, :, None] * n[:, None]
+        stiffness = rate[:, None, None] * outer
+        if self.largest is not None:
+            load, u = self.h**2 * self.largest, slip.T
+            _, first, bend = smoothed(slip, self.reach)
+            force = force + (load * first)[:, None] * u
+            stiffness = stiffness + (load * first)[:, None, None] * (torch.eye(3).to(x) - outer)
+            stiffness = stiffness + (load * bend)[:, None, None] * u[:, :, None] * u[:, None]
         both = weights[:, :, None, None, None] * weights[:, None, :, None, None]
         return weights[..., None] * force[:, None], both * stiffness[:, None, None]
 

@@ -1,6 +1,5 @@
-"""The rigid correction of bodies that touch, in plain torch; the twin of diffvbd/step/rigid_contact.py."""
+"""The rigid correction of bodies that touch, in plain torch; the twin of csrc/subspace/rigid_step.h."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,14 +10,12 @@ from .energies import FloorFriction, StableNeoHookean
 from .scene import Scene
 
 LEAST_INERTIA = 1e-11  # of its sum of m r^2, that keeps the turn of a body definite
-ITERATIONS, HALVINGS = 200, 40  # at most, of Newton's method, and of its steps
-SETTLED = 1e-9  # a step over the whole motion, which the next one squares
 
 
 class Correction:
-    """The rigid correction of bodies that touch: turn and shift of every body without pinned vertices, all of a scene
-    together, to where a potential is least that is quadratic but for friction. Of the quadratic part the gradient is
-    autograd's and the blocks are those of vertex updates."""
+    """The rigid correction of bodies that touch: one Newton step of the potential over a turn and a shift of every body
+    without pinned vertices, all of a scene together. Of inertia and vertex energies the gradient is autograd's and the
+    blocks are those of vertex updates."""
 
     def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
         """forces: terms of pairs, each with its `on_corners`."""
@@ -52,36 +49,20 @@ class Correction:
         matrix = x.new_zeros(len(fraction), self.count, self.count, 6, 6)
         matrix = matrix.index_put((_scenes(len(fraction), at), at, at), blocks, accumulate=True)
         for term in self.forces:
-            lagged = term.turns_its_body
-            force, stiffness = term.damping_on_corners(x) if lagged else term.on_corners(x)
-            g, matrix = self._add(term.pairs, lagged, force, stiffness, jacobian, g, matrix)
-        spread = torch.zeros_like(total).index_add(1, self.body, mass * arm.square().sum(-1))
-        least = torch.stack([spread] * 3 + [torch.zeros_like(total)] * 3, -1)  # turn, shift
-
-        def system(motion: Tensor) -> tuple[Tensor, Tensor]:
-            """Gradient and matrix [B, bodies 6, bodies 6] after a motion [B, bodies, 6]."""
-            moved = rows + (jacobian @ motion[:, self.body, :, None])[..., 0]
-            turning = g + torch.einsum("bnmij,bmj->bni", matrix, motion) + LEAST_INERTIA * least * motion
-            turning, stiff = self._with_friction(moved.transpose(-1, -2).reshape(x.shape), jacobian, turning, matrix)
-            return self._of_free(turning, stiff, least)
-
-        return state(fraction.to(x)[..., None] * _least(system, z))
-
-    def _with_friction(self, x: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        """With friction at x."""
-        for term in self.forces:
-            if term.turns_its_body:
-                force, stiffness = term.friction_on_corners(x)
-                g, matrix = self._add(term.pairs, True, force, stiffness, jacobian, g, matrix)
-        at = torch.arange(self.count, device=x.device)
+            g, matrix = self._add(term.pairs, term.turns_its_body, *term.on_corners(x), jacobian, g, matrix)
         for floor in self.floors:
             force, stiffness = floor.on_vertices(x, self.x_prev)
             pull = jacobian.mT @ force.transpose(-1, -2).reshape(*jacobian.shape[:2], 3, 1)
             g = g.index_add(1, self.body, pull[..., 0])
-            blocks = jacobian.mT @ _full(stiffness).reshape(*jacobian.shape[:2], 3, 3) @ jacobian
-            own = blocks.new_zeros(len(g), self.count, 6, 6).index_add(1, self.body, blocks)
+            pressed = jacobian.mT @ _full(stiffness).reshape(*jacobian.shape[:2], 3, 3) @ jacobian
+            own = pressed.new_zeros(len(g), self.count, 6, 6).index_add(1, self.body, pressed)
             matrix = matrix.index_put((_scenes(len(g), at), at, at), own, accumulate=True)
-        return g, matrix
+        spread = torch.zeros_like(total).index_add(1, self.body, mass * arm.square().sum(-1))
+        least = torch.stack([spread] * 3 + [torch.zeros_like(total)] * 3, -1)  # turn, shift
+        g, matrix = self._of_free(g, matrix, least)
+        motion = -torch.linalg.solve(matrix, g).reshape(z.shape)
+        moves = (fraction != 0)[..., None]  # the others may have no motion: their matrix may be indefinite
+        return state(fraction.to(x)[..., None] * torch.where(moves, motion, 0.0))
 
     def _of_free(self, g: Tensor, matrix: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
         """Entries of others are zero, and their part of the matrix is the identity."""
@@ -126,32 +107,6 @@ class Correction:
         pressed = maps.mT[:, :, None] @ stiffness @ maps[:, None]  # [Q, 4, 4, 6, 6]
         rows = (scene[:, :, None].expand(-1, 4, 4), body[:, :, None].expand(-1, 4, 4), body[:, None].expand(-1, 4, 4))
         return g, matrix.index_put(rows, pressed, accumulate=True)
-
-
-def _least(system: Callable[[Tensor], tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
-    """Zero of the gradient: by Newton's method, of which the last step, of no length, carries the derivative."""
-
-    def newton(motion: Tensor) -> tuple[Tensor, Tensor]:
-        g, matrix = system(motion)
-        return g, -torch.linalg.solve(matrix, g)
-
-    def slope(motion: Tensor, step: Tensor) -> Tensor:
-        return (system(motion)[0] * step).sum((-2, -1))
-
-    with torch.no_grad():
-        for _ in range(ITERATIONS):
-            g, step = newton(motion)
-            decrease, low, high = -(g * step).sum((-2, -1)), torch.zeros(len(g)).to(g), torch.ones(len(g)).to(g)
-            displacement = step.reshape(motion.shape)
-            over = slope(motion + displacement, step) > 0.1 * decrease
-            for _ in range(HALVINGS if over.any() else 0):
-                middle = (low + high) / 2
-                descends = slope(motion + middle[:, None, None] * displacement, step) < 0
-                low, high = torch.where(descends, middle, low), torch.where(descends, high, middle)
-            motion = motion + torch.where(over, high, 1.0)[:, None, None] * displacement
-            if displacement.abs().amax() <= SETTLED * motion.abs().amax():
-                break
-    return motion + newton(motion)[1].reshape(motion.shape)
 
 
 def _full(six: Tensor) -> Tensor:

@@ -14,16 +14,14 @@ from .._common.context import is_captured, replaced
 from .._contact.start import SubstepStart
 from ..adjoint.contact import Pairs, sum_of_scenes
 from ..model.system import System
-from ..ops import contact as ops_rigid
-from ..ops.contact import Moved, left_alone
-from ..ops.fields import most_grouped
+from ..ops.contact import Corrected, rigid_correct, rigid_reverse
 
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------
 
 _FIELDS = len(ops.TouchingFields._fields)
 
 
-class Corrected(NamedTuple):
+class Corrections(NamedTuple):
     """State after corrections; all but x is index data."""
 
     x: Tensor  # [B, V, 3]
@@ -31,37 +29,25 @@ class Corrected(NamedTuple):
     back: Tensor  # translation that each did not take of its last motion [B, bodies] [m]
 
 
-class Which(NamedTuple):
-    """Bodies that a correction moves; see ops.contact.rigid_system."""
-
-    moving: Tensor | None = None  # bool [B, bodies]; None: all
-    alone: bool = False
-
-
-# more(count, moved, groups): bodies of the next correction, after `count` of them, from the results of the last one;
-# None ends them.
-More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
+# more(count, end): bool [B, bodies] of the bodies that the next correction moves, after `count` of them, or EVERY; END
+# ends them.
+EVERY, END = None, False
+More = Callable[[int, Corrected], Tensor | None | bool]
 
 
-def once(*_: Any) -> None:
+def once(*_: Any) -> bool:
     """Ends the corrections after the first."""
+    return END
 
 
 def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float,
-            more: More = once) -> Corrected:  # fmt: skip
+            more: More = once) -> Corrections:  # fmt: skip
     """State after the rigid correction of every free body, by an admissible step fraction, and after those that
     ``more`` adds. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*[t.contiguous() for t in fields])
     kept = torch.is_grad_enabled() and any([t.requires_grad for t in fields])
-    x, back, *rest = _correct(*fields, model, time_step, friction_eps, more, kept)
-    fractions = _made(fields.x, rest).fraction if kept else rest
-    return Corrected(x, [fraction.to(x.dtype) for fraction in fractions], back)
-
-
-def _made(x: Tensor, flat: Sequence[Tensor]) -> ops_rigid.Made:
-    """Corrections from the saved list: motion, fraction, factor and groups of each, and between two of them the state
-    before the second. x: State before the first."""
-    return ops_rigid.Made([x, *flat[4::5]], *(flat[k::5] for k in range(4)))
+    x, back, *made = _correct(*fields, model, time_step, friction_eps, more, kept)
+    return Corrections(x, [fraction.to(x.dtype) for fraction in (made[::2] if kept else made)], back)
 
 
 def bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -82,31 +68,24 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
     fields, (model, time_step, friction_eps, more, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
-    options, made, count, back = (model._data_count, time_step, friction_eps), [], 0, fields.x
-    which: Which | None = Which()
-    while which is not None:
+    made, count, back, moving = [], 0, fields.x, EVERY
+    while moving is not END:
         if count and kept:
             made.append(fields.x)
-        centers, motion, factor, groups = ops_rigid.rigid_system(fields, *options, which.moving, which.alone)
-        end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
-        made.extend([motion, end.fraction, factor, groups] if kept else [end.fraction])
-        back = end.remaining if which.moving is None else torch.where(end.moved, end.remaining, back)
+        end = rigid_correct(fields, model._data_count, time_step, friction_eps, moving)
+        made.append(end.fraction)
+        back = end.remaining if moving is EVERY else torch.where(end.moved, end.remaining, back)
         count, fields = count + 1, replaced(fields, x=end.x)
-        which = more(count, end, groups)
+        moving = more(count, end)
     return fields.x, back, *made
 
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
-    f = ops.TouchingFields(*saved[:_FIELDS])
-    return _adjoints(f, bars[0], _made(f.x, saved[_FIELDS:]), needs, *rest)
-
-
-def _adjoints(f: ops.TouchingFields, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool], model: System,
-              time_step: float, friction_eps: float) -> list[Tensor | None]:  # fmt: skip
-    """Adjoints of the fields."""
+    """Adjoints of the fields. saved: These, and of each correction its fraction, between two of them the state."""
+    f, made, (model, time_step, friction_eps) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
     wants = dict(zip(f._fields, needs, strict=True))
-    own = ops_rigid.rigid_reverse(f, made, x_bar, model._data_count, time_step, friction_eps,
-                                  wants["energy_data"])._asdict()  # fmt: skip
+    own = rigid_reverse(f, [f.x, *made[1::2]], made[::2], bars[0], model._data_count, time_step, friction_eps,
+                        wants["energy_data"])._asdict()  # fmt: skip
     by_kappa = own.pop("by_kappa")
     if wants["kappa"]:
         own["kappa"] = -sum_of_scenes(by_kappa, listed_of(f), f.x.shape[0])
@@ -127,17 +106,16 @@ def listed_of(f: ops.TouchingFields) -> Pairs:
 
 # --- rigid corrections of a substep -----------------------------------------------------------------------------------
 
-# Rigid corrections after the last sweeps while bodies are blocked: they first approach the blocking bodies, then push
-# them. A row of four cubes that meet at 3 m/s lost 14 % of its momentum with one correction and none with three; at
-# 10 m/s that takes five.
-BLOCKED_CORRECTIONS = 5
-# The same where touching bodies are too many to be corrected together. In stacks of two with friction the upper body
-# creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.
-LEFT_CORRECTIONS = 8
+# Rigid corrections after the last sweeps while bodies are blocked, which first approach the blocking bodies and then
+# push them, or are solved for alone. A row of four cubes that meet at 3 m/s lost 14 % of its momentum with one
+# correction and none with three; at 10 m/s that takes five. In stacks of two with friction, each body alone, the upper
+# one creeps at 2.0 mm/s with 4 and 1.1 with 6; stacks of four fell with 6.
+MOST_CORRECTIONS = 8
 BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
 
-def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, more: More = once) -> Corrected:
+def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, more: More = once
+              ) -> Corrections:  # fmt: skip
     """State after the rigid correction of all free bodies, and after those that ``more`` adds."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
@@ -154,26 +132,19 @@ def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: 
     )  # fmt: skip
 
 
-def corrected_after(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, last: bool) -> Corrected:
+def corrected_after(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, last: bool
+                    ) -> Corrections:  # fmt: skip
     """State after the corrections that follow the sweeps of a substep. last: Whether these are the last sweeps."""
     # coarse sweeps leave a stiff body rotated; after one Newton step a free body still gained spin
-    least = 1 if of.prepared.coarse is None else 2
-    bodies = len(bodies_of(of.model)[2])
-    grouped, captured = bodies <= most_grouped(bodies), is_captured(x)
+    least, captured = 1 if of.prepared.coarse is None else 2, is_captured(x)
 
-    def more(count: int, end: Moved, groups: Tensor) -> Which | None:
+    def more(count: int, end: Corrected) -> Tensor | None | bool:
         if count < least:
-            return Which()
-        if not last or of.barrier is None or count >= (BLOCKED_CORRECTIONS if grouped else LEFT_CORRECTIONS):
-            return None
-        alone = count >= BLOCKED_CORRECTIONS
-        left = None if grouped else left_alone(groups)
-        if not captured:
-            some_blocked = not alone and bool(end.blocked.any())
-            if not some_blocked and (left is None or not bool(left.any())):
-                return None
-            alone = not some_blocked
-        return Which(end.blocked if left is None else left if alone else end.blocked | left, alone)
+            return EVERY
+        if not last or of.barrier is None or count >= MOST_CORRECTIONS:
+            return END
+        moving = end.blocked | end.alone
+        return moving if captured or bool(moving.any()) else END
 
     return corrected(of, x, collider, start, listed, more)
 
