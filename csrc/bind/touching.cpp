@@ -25,8 +25,8 @@ struct Correcting {
 };
 
 // One correction of the bodies of a mask, or, if that is empty, of all; and of those that touch them. The state after
-// the admissible fraction of each motion [scenes, V, 3]; that fraction [scenes, bodies], zero where a body has no
-// motion; whether it has one; whether it was blocked, in a scene where some blocked body has moved on; whether it was
+// the admissible fraction of each motion [scenes, V, 3]; that fraction [scenes, bodies], zero where none was sought
+// or found; whether a body has a motion; whether it was blocked, in a scene where some blocked body has moved on; whether it was
 // solved for alone, since too many touch; and the translation that it did not take [m].
 DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
                  double friction_eps, In moving) {
@@ -44,7 +44,7 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Int
                  alone = device.empty({b, n}, ScalarType::Bool), remaining = device.empty({b, n});
     s.out = {data<double>(fraction), data<bool>(moved), data<bool>(blocked), data<bool>(alone), data<T>(remaining)};
     s.x_end = data<T>(end);
-    if (b * n > 0) DIFFVBD_RUN(device, rigid_correct<T>, s);
+    if (b * n > 0) DIFFVBD_RUN(device, contact_rigid_correct<T>, s);
     return Out<6>(end, fraction, moved, blocked, alone, remaining);
   });
 }
@@ -88,7 +88,7 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
       const T* from = read.vectors("at", at[k]);
       r.step.in.scene.x = r.step.in.gate.x = r.work.in.scene.x = r.work.in.gate.x = from;
       r.fraction = read.doubles("fraction", fraction[k], b * n);
-      if (b * n > 0) DIFFVBD_RUN(device, rigid_reverse<T>, r);
+      if (b * n > 0) DIFFVBD_RUN(device, contact_rigid_reverse<T>, r);
       r.end_bar = r.out.vertices.x;
     }
     return Out<11>(bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_out, collider_out,

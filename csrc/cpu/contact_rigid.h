@@ -6,16 +6,16 @@
 namespace diffvbd {
 
 template <class T>
-void rigid_correct(const contact::RigidStep<T>& s) {
-  contact::rigid_correct(Loops(), s);
+void contact_rigid_correct(const contact::RigidStep<T>& s) {
+  contact::correct_bodies(Loops(), s);
 }
 template <class T>
-void rigid_reverse(const contact::RigidReverse<T>& r) {
-  contact::rigid_reverse(Loops(), r);
+void contact_rigid_reverse(const contact::RigidReverse<T>& r) {
+  contact::reverse_bodies(Loops(), r);
 }
 template <class T>
 void work_of_pairs(const contact::WorkStep<T>& s) {
-  contact::work_of_pairs(Loops(), s);
+  contact::sum_work(Loops(), s);
 }
 
 }  // namespace diffvbd

@@ -426,13 +426,11 @@ struct RigidOutcome {
 };
 // Ends the trials of a body; returns whether it was blocked after a part of its motion.
 template <class T>
-DIFFVBD_FN bool finish_trials(const RigidInputs<T>& in, const double* motions, int64_t unit,
-                              const RigidOutcome<T>& out) {
+DIFFVBD_FN bool finish_trials(const double* motions, int64_t unit, const RigidOutcome<T>& out) {
   const double* motion = motions + kUnknowns * unit;
   bool moved = false;
   for (int i = 0; i < kUnknowns; ++i) moved = moved || motion[i] != 0;
-  double& fraction = out.fraction[unit];
-  if (!moved) fraction = 0;  // it passes no adjoint on
+  const double fraction = out.fraction[unit];
   const Vector shift = wide_at(motion + 3);
   out.moved[unit] = moved, out.blocked[unit] = moved && fraction < 1;
   out.left[unit] = T((1 - fraction) * square_root(dot(shift, shift)));

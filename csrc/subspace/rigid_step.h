@@ -17,6 +17,13 @@
 #include "contact_rigid.h"
 #include "contact_rigid_reverse.h"
 
+// Of functions that run where their Run does.
+#ifdef __CUDACC__
+#define DIFFVBD_RUNS _Pragma("nv_exec_check_disable")
+#else
+#define DIFFVBD_RUNS
+#endif
+
 namespace diffvbd::contact {
 
 using rigid::Body;
@@ -33,7 +40,7 @@ struct RigidMemory {
   int32_t *label, *groups;               // by body; [B, 4, bodies]
   // of the trials
   double *reach, *sum, *own, *after;     // by body [2]: farthest_of(); by body and vertex [2]: change, size; by row
-  uint8_t *decided, *joined;             // by body
+  uint8_t *decided, *joined, *solved;    // by body
   T* move;                               // by vertex [3]
   AdvanceState<T> state;
   Motion<T>* motions;                    // by vertex, that of `state`
@@ -46,7 +53,7 @@ struct RigidMemory {
     take(center, 3 * units), take(motion, kUnknowns * units), take(solution, kUnknowns * units);
     take(matrix, scenes * size), take(blocks, units), take(label, units), take(groups, kGroupRows * units);
     take(reach, 2 * units), take(sum, 2 * units), take(own, 2 * vertices), take(after, rows);
-    take(decided, units), take(joined, units), take(move, 3 * vertices), take(motions, vertices);
+    take(decided, units), take(joined, units), take(solved, units), take(move, 3 * vertices), take(motions, vertices);
     take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
     take(state.failed, scenes);
   }
@@ -276,15 +283,17 @@ struct Solve {  // groups
     team.meet();
     team.each(size, [&](int32_t i) {
       const double own = finite ? solution[i] : 0;
-      if (is_new) motion[kUnknowns * g.member(place + i / kUnknowns) + i % kUnknowns] = own;
+      const int32_t body = g.member(place + i / kUnknowns);
+      if (is_new) motion[kUnknowns * body + i % kUnknowns] = own, s.m.solved[s.unit(scene, body)] = finite;
       solution[i] = own;
     });
     team.meet();
   }
 };
 
+DIFFVBD_RUNS
 template <class Run, class T>
-DIFFVBD_FN void rigid_system(const Run& run, const RigidStep<T>& s) {
+DIFFVBD_FN void system_of_bodies(const Run& run, const RigidStep<T>& s) {
   const int64_t n = s.in.bodies();
   run.each(Begin{}, s, 1);
   run.each(BeginBody{}, s, n);
@@ -442,7 +451,9 @@ struct EndVertex {  // each vertex
 struct EndBody {  // each body
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
-    if (finish_trials(s.in, s.m.motion, s.unit(scene, k), s.out)) mark(s.m.some + scene);
+    const int64_t unit = s.unit(scene, k);
+    if (!s.m.solved[unit]) s.out.fraction[unit] = 0;  // it passes no adjoint on
+    if (finish_trials(s.m.motion, unit, s.out)) mark(s.m.some + scene);
   }
 };
 struct EndBlocked {  // each body
@@ -452,10 +463,11 @@ struct EndBlocked {  // each body
   }
 };
 
+DIFFVBD_RUNS
 template <class Run, class T>
-DIFFVBD_FN void rigid_correct(const Run& run, const RigidStep<T>& s) {
+DIFFVBD_FN void correct_bodies(const Run& run, const RigidStep<T>& s) {
   const int64_t n = s.in.bodies(), vertices = s.in.scene.vertices;
-  rigid_system(run, s);
+  system_of_bodies(run, s);
   run.bodies(FindReach{}, s);
   run.rows(Near<Run>{}, s);
   run.each(Flatten<Run>{}, s, n);
@@ -523,8 +535,9 @@ struct SumPoint {  // points
   }
 };
 
+DIFFVBD_RUNS
 template <class Run, class T>
-DIFFVBD_FN void work_of_pairs(const Run& run, const WorkStep<T>& s) {
+DIFFVBD_FN void sum_work(const Run& run, const WorkStep<T>& s) {
   run.rows(FindWork{}, s);
   run.parts(StoreWork{}, s, kWorkParts);
   run.points(SumPoint{}, s);
@@ -582,15 +595,16 @@ struct ReverseCollider {  // each point of a collider
   }
 };
 
+DIFFVBD_RUNS
 template <class Run, class T>
-DIFFVBD_FN void rigid_reverse(const Run& run, const RigidReverse<T>& r) {
+DIFFVBD_FN void reverse_bodies(const Run& run, const RigidReverse<T>& r) {
   const AdvanceInputs<T>& gate = r.step.in.gate;
   run.each(FindMoving{}, r, r.step.in.bodies());
-  rigid_system(run, r.step);
+  system_of_bodies(run, r.step);
   run.bodies(ReverseEnd{}, r);
   run.groups(Solve<false>{}, r.step);
   run.bodies(Virtual{}, r);
-  work_of_pairs(run, r.work);
+  sum_work(run, r.work);
   run.bodies(ReverseVertices{}, r);
   run.each(ReverseCollider{}, r, gate.corners - gate.vertices);
 }

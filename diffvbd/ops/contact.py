@@ -252,7 +252,7 @@ class Corrected(NamedTuple):
     """Result of :func:`rigid_correct`."""
 
     x: Tensor  # [B, V, 3]
-    fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; zero where there is none
+    fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; zero where none was sought or found
     moved: Tensor  # bool [B, bodies]: the body has a motion
     blocked: Tensor  # bool [B, bodies]: the body was blocked, in a scene where some blocked body has moved on
     alone: Tensor  # bool [B, bodies]: the body was solved for alone, since too many touch

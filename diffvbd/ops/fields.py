@@ -19,6 +19,7 @@ LAG_SCALARS, PLANE_SCALARS = _C["lag_scalars"], _C["plane_scalars"]
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS, CROSSING_ROW = (
     _C[name] for name in ("pair_row", "pair_constants", "near_row", "near_values", "counts", "crossing_row")
 )
+MOST_COUPLED = _C["most_coupled"]  # bodies of a group that is corrected together
 STARTS = {"inertia": _C["start_inertia"], "predictor": _C["start_predictor"], "auto": _C["start_lower"]}
 START_LOWER = STARTS["auto"]
 CORRECTED, TILE, NO_MOVE, WORKSPACE_BUDGET, ROUNDINGS = (

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import mesh, ops
-from diffvbd.ops import contact as contact_rigid
-from diffvbd.ops.fields import FEW, MOST_COUPLED
+from diffvbd import mesh
+from diffvbd.ops.fields import MOST_COUPLED
 from diffvbd.testing import relative_error, tolerance
 
 corrections = importlib.import_module("diffvbd.step.contact_rigid")
@@ -32,15 +31,6 @@ def stacks(heights: list[int], device: str) -> dv.Model:
     return dv.Model(tets, energies=ENERGIES, device=device)
 
 
-def wall(wide: int, high: int, device: str) -> dv.Model:
-    """Cubes of which each second row is shifted, and stands on two."""
-    cube = mesh.cube(2, size=0.1)
-    cube = cube.translate((0.0, -float(cube.points[:, 1].min()), 0.0))
-    tets = mesh.join([cube.translate((0.102 * i + 0.02 * (k % 2), (0.1 + 2 * HALF_GAP) * k, 0.0))
-                      for i in range(wide) for k in range(high)])  # fmt: skip
-    return dv.Model(tets, energies=ENERGIES, device=device)
-
-
 def run(model: dv.Model, steps: int, sweeps: int, **options: Any) -> tuple[Tensor, Tensor]:
     x = model.rest_points
     out = dv.rollout(model, x, torch.zeros_like(x), dv.VBD(0.01, sweeps), steps=steps, mu=1e6, lam=1e6,
@@ -48,46 +38,19 @@ def run(model: dv.Model, steps: int, sweeps: int, **options: Any) -> tuple[Tenso
     return out.x[-1], out.v[-1]
 
 
-def groups_of(model: dv.Model, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    """[1, 4, bodies] of the first correction of a step, or empty."""
-    seen: list[Tensor] = []
-
-    def correct(model: dv.Model, fields: ops.TouchingFields, *options: Any) -> Any:
-        detached = ops.TouchingFields(*(t.detach().contiguous() for t in fields))
-        seen.append(contact_rigid.rigid_system(detached, model._data_count, *options[:2])[3])
-        return original(model, fields, *options)
-
-    original = corrections.correct
-    with monkeypatch.context() as patch:
-        patch.setattr(corrections, "correct", correct)
-        run(model, 1, 1)
-    return seen[0].cpu()
-
-
-def test_groups_are_those_that_touch(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_bodies_of_large_groups_are_solved_for_alone(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     heights = [2, MOST_COUPLED, 1, MOST_COUPLED + 1, 3]
-    member, first, rank, count = groups_of(stacks(heights, device), monkeypatch)[0]
-    expected, bodies = [], 0
-    for high in heights:
-        own = list(range(bodies, bodies + high))
-        expected += [own] if high <= MOST_COUPLED else [[body] for body in own]
-        bodies += high
-    places = count.nonzero()[:, 0].tolist()
-    found = [member[p : p + abs(int(count[p]))].tolist() for p in places]
-    assert [sorted(group) for group in found] == expected
-    left = {body for body in range(bodies) if int(count[first[body]]) == -1}
-    assert left == set(range(2 + MOST_COUPLED + 1, bodies - 3))
-    for place, group in zip(places, expected, strict=True):
-        assert first[group].tolist() == [place] * len(group)
-        assert member[[place + int(rank[body]) for body in group]].tolist() == group
+    model, seen = stacks(heights, device), []
+    original = corrections.rigid_correct
 
+    def correct(*arguments: Any) -> Any:
+        seen.append(original(*arguments))
+        return seen[-1]
 
-def test_the_order_of_elimination_is_the_same_on_all_devices(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a wall, in which bodies touch several others."""
-    found = [groups_of(wall(7, 6, where), monkeypatch) for where in ("cpu", device)]
-    assert torch.equal(*found)
-    assert int(found[0][0, 3].max()) > FEW
-    assert not torch.equal(found[0][0, 0], torch.arange(42))
+    monkeypatch.setattr(corrections, "rigid_correct", correct)
+    run(model, 1, 1)
+    alone = seen[0].alone.cpu()[0].nonzero()[:, 0].tolist()
+    assert alone == list(range(2 + MOST_COUPLED + 1, sum(heights) - 3))
 
 
 def test_a_group_moves_and_is_differentiated_as_alone(device: str) -> None:
