@@ -99,4 +99,6 @@ def test_adjoint_is_that_of_central_differences(name: str, device: str, monkeypa
         by_size = [(along(s) - along(-s)) / (2 * s) for s in (size, size / 2)]
         expected = (4 * by_size[1] - by_size[0]) / 3
         assert abs(slope) > 0, key
-        assert abs(slope - expected) <= tolerance("finite_difference") * abs(expected), (key, slope, by_size)
+        apart = abs(by_size[0] - by_size[1])  # of differences of two sizes: a smooth place
+        assert apart <= 0.03 * abs(slope), (key, by_size)
+        assert abs(slope - expected) <= tolerance("finite_difference") * abs(expected) + 0.1 * apart, (key, by_size)
