@@ -3,7 +3,7 @@
 //
 //     (J' H J) d = -J' g,        x <- x moved by s d,
 //
-// where s is the first of 1, 1/2, ... that raises no potential and that nothing blocks, for each island of bodies; and
+// where s is the first of 1, 1/4, ... that raises no potential and that nothing blocks, for each island of bodies; and
 // its transpose. In double precision.
 //
 // A Run makes the loops over the items of scenes: run.each(phase, step, n) calls phase(step, scene, i) for i < n,
@@ -38,6 +38,7 @@ struct RigidMemory {
   double *solution, *matrix;             // by place: six; and as Groups::matrix() says
   uint64_t* blocks;                      // by place
   int32_t *label, *groups;               // by body; [B, 4, bodies]
+  int32_t *list, *count;                 // [4 rows]; by vertex [2]: see RigidStep::list()
   // of the trials
   double *reach, *sum, *own, *after;     // by body [2]: farthest_of(); by body and vertex [2]: change, size; by row
   uint8_t *decided, *joined, *solved;    // by body
@@ -52,7 +53,7 @@ struct RigidMemory {
     take(forces, rows), take(near, rows), take(active, scenes), take(some, scenes);
     take(center, 3 * units), take(motion, kUnknowns * units), take(solution, kUnknowns * units);
     take(matrix, scenes * size), take(blocks, units), take(label, units), take(groups, kGroupRows * units);
-    take(reach, 2 * units), take(sum, 2 * units), take(own, 2 * vertices), take(after, rows);
+    take(list, 4 * rows), take(count, 2 * vertices), take(reach, 2 * units), take(sum, 2 * units), take(own, 2 * vertices), take(after, rows);
     take(decided, units), take(joined, units), take(solved, units), take(move, 3 * vertices), take(motions, vertices);
     take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
     take(state.failed, scenes);
@@ -90,20 +91,36 @@ struct RigidStep {
     const int32_t body = owner_of(in, of);
     return body < 0 ? -1 : unit(of[5], body);
   }
-  // Calls f(force, side) for the rows that act on a body, each at the vertex that is the first of its side.
-  template <class F>
-  DIFFVBD_FN void each_force(int64_t scene, int32_t v, const F& f) const {
-    for (int list = 0; list < 2; ++list) {
-      if ((list == 0 ? m.listed : m.lagged) == 0) continue;
-      const PairList& pairs = list == 0 ? in.gate.listed : in.lagged;
-      const PairList::Entries all = pairs.of(scene * in.gate.corners + v);
+  // Lists the rows of a vertex that is the first of a side of theirs, where keep(row, side).
+  template <class Keep>
+  DIFFVBD_FN void list(int64_t scene, int64_t v, const Keep& keep) const {
+    for (int which = 0; which < 2; ++which) {
+      int32_t& found = m.count[2 * (scene * in.scene.vertices + v) + which];
+      found = 0;
+      if ((which == 0 ? m.listed : m.lagged) == 0) continue;
+      const PairList& pairs = which == 0 ? in.gate.listed : in.lagged;
+      const int64_t point = scene * in.gate.corners + v, first = which == 0 ? 0 : m.listed;
+      const PairList::Entries all = pairs.of(point);
       for (int e = 0; e < all.count; ++e) {
         const int64_t pair = all.first[e] >> 2;
         const int corner = all.first[e] & 3, side = corner == 0 ? 0 : 1;
         if (side == 1 && corner != sides(pairs.pairs[kPairRow * pair + 4])) continue;
-        const PairForce& a = m.forces[(list == 0 ? 0 : m.listed) + pair];
-        if (a.body[side] >= 0) f(a, side);
+        if (keep(first + pair, side)) {
+          m.list[4 * first + pairs.ptr[point] + found++] = static_cast<int32_t>(2 * pair) + side;
+        }
       }
+    }
+  }
+  // Calls f(row, side) for them.
+  template <class F>
+  DIFFVBD_FN void each_listed(int64_t scene, int64_t v, const F& f) const {
+    for (int which = 0; which < 2; ++which) {
+      const int32_t count = m.count[2 * (scene * in.scene.vertices + v) + which];
+      if (count == 0) continue;
+      const PairList& pairs = which == 0 ? in.gate.listed : in.lagged;
+      const int64_t first = which == 0 ? 0 : m.listed;
+      const int32_t* own = m.list + 4 * first + pairs.ptr[scene * in.gate.corners + v];
+      for (int32_t i = 0; i < count; ++i) f(first + (own[i] >> 1), own[i] & 1);
     }
   }
 };
@@ -189,6 +206,12 @@ struct Touch {  // rows
   }
 };
 
+struct ListForces {  // each vertex
+  template <class T>
+  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t v) const {
+    s.list(scene, v, [&](int64_t row, int side) { return s.m.forces[row].body[side] >= 0; });
+  }
+};
 struct Assemble {  // bodies
   template <class T, class Team>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, const Body<T>& b, const Team& team) const {
@@ -211,7 +234,8 @@ struct Assemble {  // bodies
       add_floor_friction(in, b, v, force, H);
       rigid::add_vertex(arm, force, H, to, to + kUnknowns);
       to[kOwn] += b.mass(v) * dot(arm, arm);
-      s.each_force(b.scene, v, [&](const PairForce& a, int side) {
+      s.each_listed(b.scene, v, [&](int64_t row, int side) {
+        const PairForce& a = s.m.forces[row];
         const double share = borne(in, b.scene, a);
         for (int j = 0; j < kUnknowns; ++j) {
           to[j] += a.gradient(side, j, whole.center);
@@ -244,7 +268,8 @@ struct Assemble {  // bodies
       for (int half = 0; half < 2; ++half) {
         double block[kHalf];
         team.template sum<kHalf>(b.size(), block, [&](int32_t i, double* to) {
-          s.each_force(b.scene, b.vertex(i), [&](const PairForce& a, int side) {
+          s.each_listed(b.scene, b.vertex(i), [&](int64_t row, int side) {
+            const PairForce& a = s.m.forces[row];
             if ((side == 0 ? a.body[1] : a.body[0]) != number) return;
             for (int j = 0; j < kUnknowns; ++j) {
               const Vector along = a.stiffness * a.map(1 - side, j, beside.center);
@@ -302,6 +327,7 @@ DIFFVBD_FN void system_of_bodies(const Run& run, const RigidStep<T>& s) {
   run.each(Flatten<Run>{}, s, n);
   run.each(FindPlace{}, s, n);
   run.rows(Touch<Run>{}, s);
+  run.each(ListForces{}, s, s.in.scene.vertices);
   run.bodies(Assemble{}, s);
   run.groups(Solve<true>{}, s);
 }
@@ -343,6 +369,14 @@ struct Near {  // rows
     if (a < 0 || b < 0 || a == b) return;
     Run::unite(s.m.label + first, a, b);
     mark(s.m.joined + first + a), mark(s.m.joined + first + b);
+  }
+};
+struct ListNear {  // each vertex, of the rows that its body owns
+  template <class T>
+  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t v) const {
+    s.list(scene, v, [&](int64_t row, int side) {
+      return s.m.near[row] && (side == 0 || moving_body(s.in, s.record(row)[0]) < 0);
+    });
   }
 };
 struct MoveVertex {  // each vertex
@@ -387,19 +421,10 @@ struct SumBody {  // bodies
     team.template sum<2>(b.size(), sum, [&](int32_t i, double* to) {
       const int32_t v = b.vertex(i);
       to[0] += s.m.own[2 * b.row(v)], to[1] += s.m.own[2 * b.row(v) + 1];
-      for (int list = 0; list < 2; ++list) {  // the rows that it owns
-        if ((list == 0 ? s.m.listed : s.m.lagged) == 0) continue;
-        const PairList& pairs = list == 0 ? s.in.gate.listed : s.in.lagged;
-        const PairList::Entries all = pairs.of(b.scene * s.in.gate.corners + v);
-        for (int e = 0; e < all.count; ++e) {
-          const int64_t row = (list == 0 ? 0 : s.m.listed) + (all.first[e] >> 2);
-          const int32_t* record = s.record(row);
-          const int corner = all.first[e] & 3;
-          if (corner != 0 && (corner != sides(record[4]) || moving_body(s.in, record[0]) >= 0)) continue;
-          const double before = s.m.forces[row].value, after = s.m.after[row];
-          to[0] += after - before, to[1] += absolute(after) + absolute(before);
-        }
-      }
+      s.each_listed(b.scene, v, [&](int64_t row, int) {
+        const double before = s.m.forces[row].value, after = s.m.after[row];
+        to[0] += after - before, to[1] += absolute(after) + absolute(before);
+      });
     });
     if (team.leads()) s.m.sum[2 * unit] = sum[0], s.m.sum[2 * unit + 1] = sum[1];
   }
@@ -471,11 +496,13 @@ DIFFVBD_FN void correct_bodies(const Run& run, const RigidStep<T>& s) {
   run.bodies(FindReach{}, s);
   run.rows(Near<Run>{}, s);
   run.each(Flatten<Run>{}, s, n);
+  run.each(ListNear{}, s, vertices);
   for (int trial = 0; trial < kTrials; ++trial) {
-    run.each(MoveVertex{fraction_of(trial)}, s, vertices);
+    const double fraction = fraction_of(kHalvings * trial);
+    run.each(MoveVertex{fraction}, s, vertices);
     run.rows(MoveRow{}, s);
     run.bodies(SumBody{}, s);
-    run.each(Decide{fraction_of(trial)}, s, n);
+    run.each(Decide{fraction}, s, n);
     if (run.is_done(s.m.decided, s.in.scene.scenes * n)) break;
   }
   run.each(EndVertex{}, s, vertices);
