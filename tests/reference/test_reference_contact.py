@@ -40,6 +40,12 @@ def setup(**changes: Any) -> tuple[Any, Tensor, Pairs]:
     return model, x, Pairs(scene_of(model, x), part, None)
 
 
+def lagged(model: Any, x: Tensor, pairs: Pairs, start: Tensor, now: Tensor) -> LaggedPairForces:
+    """Of one body, so that no face bears the load of others."""
+    model.surface_of_contact = SimpleNamespace(body=torch.zeros(start.shape[1]))
+    return LaggedPairForces(scene_of(model, x), pairs, start, now)
+
+
 @pytest.mark.parametrize("mollified", (False, True))
 def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
     model, x, pairs = setup()
@@ -102,9 +108,8 @@ def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
     )
     x = x_prev + travel * torch.as_tensor(generator("travel").standard_normal((8, 3)))
     start = torch.cat((x_prev, COLLIDERS))[None]
-    model.surface_of_contact = SimpleNamespace(body=torch.zeros(start.shape[1]))  # of one body: no sums
     now = COLLIDERS + travel * 0.3
-    friction = LaggedPairForces(scene_of(model, x), pairs, start, now[None])
+    friction = lagged(model, x, pairs, start, now[None])
     corners = start[0][pairs.corners].requires_grad_()
     d = distance.distance(pairs.kind, corners)
     (slope,) = torch.autograd.grad(d.sum(), corners)
@@ -138,7 +143,7 @@ def test_damping_opposes_approach_alone() -> None:
     model, x_prev, pairs = setup(friction=None)
     start = torch.cat((x_prev, COLLIDERS))[None]
     x = x_prev + 1e-3 * torch.as_tensor(generator("approach").standard_normal((8, 3)))
-    damping = LaggedPairForces(scene_of(model, x), pairs, start, COLLIDERS[None])
+    damping = lagged(model, x, pairs, start, COLLIDERS[None])
 
     corners = start[0][pairs.corners].requires_grad_()
     (slope,) = torch.autograd.grad(distance.distance(pairs.kind, corners).sum(), corners)

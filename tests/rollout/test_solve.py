@@ -198,7 +198,7 @@ def test_a_step_that_bounds_cut_short_does_not_converge_and_says_so() -> None:
         dv.solve(scene.model, scene.x, scene.v, dv.VBD(0.01, 1), **options)
     with pytest.warns(RuntimeWarning, match="larger reach"):
         done = dv.solve(scene.model, scene.x, scene.v, dv.VBD(0.01, 1), on_failure="warn", **options)
-    assert not done.converged and done.sweeps == 60 and done.residual > 0.1
+    assert not done.converged and done.sweeps == 60 and done.residual > 0.05
 
 
 def test_too_few_sweeps_for_friction_say_so() -> None:
