@@ -49,7 +49,8 @@ class Correction:
         matrix = x.new_zeros(len(fraction), self.count, self.count, 6, 6)
         matrix = matrix.index_put((_scenes(len(fraction), at), at, at), blocks, accumulate=True)
         for term in self.forces:
-            g, matrix = self._add(term.pairs, term.turns_its_body, *term.on_corners(x), jacobian, g, matrix)
+            force, stiffness = term.on_corners(x)
+            g, matrix = self._add(term.pairs, term.turns_its_body, force, stiffness, jacobian, g, matrix)
         for floor in self.floors:
             force, stiffness = floor.on_vertices(x, self.x_prev)
             pull = jacobian.mT @ force.transpose(-1, -2).reshape(*jacobian.shape[:2], 3, 1)
