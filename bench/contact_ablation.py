@@ -85,8 +85,7 @@ RULES: dict[str, Callable[[], Any]] = {
         IncreaseInputs, increases_potential=lambda self, x, to: torch.zeros(x.shape[:2], dtype=torch.bool,
                                                                             device=x.device)),
     "rigid correction before the sweeps": no_first_correction,
-    "more rigid corrections after the sweeps": lambda: numbers(contact_rigid, BLOCKED_CORRECTIONS=1,
-                                                               LEFT_CORRECTIONS=1),
+    "more rigid corrections after the sweeps": lambda: numbers(contact_rigid, MOST_CORRECTIONS=1),
     "more substeps while vertices are truncated": lambda: numbers(contact, MOST_DETECTIONS=0),
     "substeps that invert a tet are taken back": lambda: numbers(contact.ContactStep, _inverted=lambda self, x: (
         torch.zeros(len(x), dtype=torch.bool, device=x.device))),

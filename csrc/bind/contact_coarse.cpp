@@ -65,8 +65,7 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_move, DIFFVBD_PARAMETERS(TOUCHING) DIFFV
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Tensor move = device.like_x();
-    const auto c =
-        coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move));
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move));
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, n = c.in.bodies();
     const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double);

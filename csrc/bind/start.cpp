@@ -116,8 +116,8 @@ DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In pt
 
 // --- lagged values ---------------------------------------------------------------------------------------------------
 
-// Normal force, 1 where active, normal and weights of each pair [pairs, 9]; the force that each bears, and the pair that
-// bears its own [pairs]. The adjoint: of corner points [B, N, 3] and of kappa.
+// Normal force, 1 where active, normal and weights of each pair [pairs, 9]; the force that each bears, and the pair
+// that bears its own [pairs]. The adjoint: of corner points [B, N, 3] and of kappa.
 DIFFVBD_OPERATOR(Out<3>, contact_lag, In x, In origin, In collider, In kappa, In pairs, In constants, In ptr, In entry,
                  In body) {
   const Device device(x);

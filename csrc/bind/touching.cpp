@@ -16,9 +16,8 @@ struct Correcting {
     m.listed = f.pairs.size(0), m.lagged = lagged_pairs(f);
     const int64_t b = f.x.size(0);
     const auto& in = step.in;
-    memory = workspace(device, [&](auto& take) {
-      m.parts(take, b, b * in.scene.vertices, b * in.bodies(), in.matrix_size());
-    });
+    memory = workspace(device,
+                       [&](auto& take) { m.parts(take, b, b * in.scene.vertices, b * in.bodies(), in.matrix_size()); });
     step.in.groups = m.groups, step.in.gate.move = m.move;
     m.state.motion = m.motions, m.state.first = false;
   }
@@ -26,8 +25,8 @@ struct Correcting {
 
 // One correction of the bodies of a mask, or, if that is empty, of all; and of those that touch them. The state after
 // the admissible fraction of each motion [scenes, V, 3]; that fraction [scenes, bodies], zero where none was sought
-// or found; whether a body has a motion; whether it was blocked, in a scene where some blocked body has moved on; whether it was
-// solved for alone, since too many touch; and the translation that it did not take [m].
+// or found; whether a body has a motion; whether it was blocked, in a scene where some blocked body has moved on;
+// whether it was solved for alone, since too many touch; and the translation that it did not take [m].
 DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
                  double friction_eps, In moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};

@@ -15,8 +15,7 @@ struct TouchingSettings {
 
 // move: what is tried, memory of the operator, or null.
 template <class T>
-contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q,
-                                        const T* move) {
+contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q, const T* move) {
   const Reader<T> read(t.x);
   const int64_t b = read.b, v = read.v, colliders = read.colliders(t.collider), corners = v + colliders;
   contact::RigidInputs<T> in{};
@@ -68,8 +67,7 @@ Tensor workspace(const Device& device, const F& parts) {
 struct WorkTensors {
   Tensor barrier, pushes, friction, by_x, by_p, by_q, since, by_kappa, lag_bar;
   WorkTensors(const TouchingFields& f, const Device& device) {
-    const int64_t b = f.x.size(0), corners = f.body.size(0), listed = f.pairs.size(0),
-                  lagged = lagged_pairs(f);
+    const int64_t b = f.x.size(0), corners = f.body.size(0), listed = f.pairs.size(0), lagged = lagged_pairs(f);
     barrier = device.empty({listed, 4, contact::kWorkScalars});
     pushes = device.empty({listed}, ScalarType::Byte);
     friction = device.empty({lagged, 4, contact::kWorkScalars});

@@ -194,8 +194,7 @@ void pair_loads(const contact::PairList& listed, int64_t corners, const int32_t*
                 int64_t pairs, T* force, int64_t* bearer) {
   const int64_t count = listed.ptr[scenes * corners] / 4;
   for (int64_t pair = 0; pair < pairs; ++pair) {
-    const auto load =
-        pair < count ? contact::load_of(listed, corners, body, lag, pair) : contact::Load<T>{pair, T(0)};
+    const auto load = pair < count ? contact::load_of(listed, corners, body, lag, pair) : contact::Load<T>{pair, T(0)};
     force[pair] = load.force, bearer[pair] = load.bearer;
   }
 }

@@ -1,5 +1,4 @@
 #include "contact_coarse.h"
-
 #include "runs.cuh"
 
 namespace diffvbd::cuda {

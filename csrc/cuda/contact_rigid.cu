@@ -1,6 +1,5 @@
-#include "contact_rigid.h"
-
 #include "cluster.cuh"
+#include "contact_rigid.h"
 #include "runs.cuh"
 
 namespace diffvbd::cuda {
@@ -20,8 +19,7 @@ __global__ void __launch_bounds__(kThreads) reverse_kernel(const __grid_constant
 // Whether scenes are so small, or so many, that a block each takes less time than a launch for each loop.
 template <class T>
 bool is_small(const RigidStep<T>& s) {
-  return s.in.bodies() <= kMostCoupled &&
-         has_block_each(s.in.gate.corners, s.in.scene.scenes, s.listed() + s.lagged());
+  return s.in.bodies() <= kMostCoupled && has_block_each(s.in.gate.corners, s.in.scene.scenes, s.listed() + s.lagged());
 }
 
 }  // namespace

@@ -228,9 +228,7 @@ struct InBlock : Sets {
   __device__ void bodies(const Phase& phase, const Step& s) const {
     const auto& in = s.inputs();
     using Scene = std::decay_t<decltype(in.scene)>;
-    const auto body = [&](int64_t k) {
-      return Body<typename Scene::Scalar>{in.scene, scene, static_cast<int32_t>(k)};
-    };
+    const auto body = [&](int64_t k) { return Body<typename Scene::Scalar>{in.scene, scene, static_cast<int32_t>(k)}; };
     if (int64_t{in.scene.vertices} > int64_t{kOfWarp} * in.bodies()) {
       for (int64_t k = 0; k < in.bodies(); ++k) {
         phase(s, body(k), team);

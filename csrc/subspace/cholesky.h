@@ -69,9 +69,8 @@ DIFFVBD_FN void factor(const Team& team, int32_t count, double* a, uint64_t* blo
     const uint64_t below = blocks[k];
     const int32_t rows = count_bits(below);
     const auto row_of = [&](int32_t i) { return a + size * kBlock * nth_bit(below, i); };
-    team.each(kBlock * rows, [&](int32_t i) {
-      over_pivot(size, pivot, row_of(i / kBlock) + size * (i % kBlock) + kBlock * k);
-    });
+    team.each(kBlock * rows,
+              [&](int32_t i) { over_pivot(size, pivot, row_of(i / kBlock) + size * (i % kBlock) + kBlock * k); });
     team.meet();
     team.each(rows * rows * kBlock, [&](int32_t i) {
       const int32_t r = i / kBlock / rows, c = i / kBlock % rows, own = i % kBlock;

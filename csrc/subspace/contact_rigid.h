@@ -369,11 +369,11 @@ DIFFVBD_FN bool lagged_force(const RigidInputs<T>& in, int64_t pair, const At& a
   return true;
 }
 
-// --- trial fractions of the rigid motions: shortened until no body is blocked and the potential does not increase. Bodies
-// decide together with those that they may touch, and with no others.
+// --- trial fractions of the rigid motions: shortened until no body is blocked and the potential does not increase.
+// Bodies decide together with those that they may touch, and with no others.
 
 constexpr int kTrials = 3, kHalvings = 2;  // fractions 1, 1/4, 1/16 before 0
-constexpr double kRounded = 1e-6;  // of a length, that rounding cannot reach
+constexpr double kRounded = 1e-6;          // of a length, that rounding cannot reach
 
 // The body that a pair counts for: the first of those that it moves with, or -1.
 template <class T>

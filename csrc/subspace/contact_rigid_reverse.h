@@ -223,11 +223,7 @@ struct LaggedWork {
   double w[4], load, damping, h, eps;
 
   DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : acts(pair < in.first_lagged(in.scene.scenes)),
-        m{},
-        d{},
-        h(in.scene.time_step),
-        eps(in.friction_eps) {
+      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, d{}, h(in.scene.time_step), eps(in.friction_eps) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force: above dhat, or by a coefficient of zero

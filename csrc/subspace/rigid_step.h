@@ -8,9 +8,9 @@
 //
 // A Run makes the loops over the items of scenes: run.each(phase, step, n) calls phase(step, scene, i) for i < n,
 // run.rows() phase(step, row) for listed and then lagged pairs, run.parts() phase(step, row, part) for the former,
-// run.bodies() phase(step, body, team), run.groups() phase(step, scene, place, team), and run.points() phase(step, point,
-// team) for corner points. What a loop wrote the next one may read. run.is_done(flags, n): whether n flags are set,
-// where that can be told.
+// run.bodies() phase(step, body, team), run.groups() phase(step, scene, place, team), and run.points() phase(step,
+// point, team) for corner points. What a loop wrote the next one may read. run.is_done(flags, n): whether n flags are
+// set, where that can be told.
 #pragma once
 
 #include "cholesky.h"
@@ -31,20 +31,20 @@ using rigid::Body;
 // Memory of a correction, by body [B, bodies], place [B, bodies], vertex [B, V] and row.
 template <class T>
 struct RigidMemory {
-  int64_t listed, lagged;  // rows of the lists
-  PairForce* forces;       // by row, of bodies that it acts on, or -1
-  uint8_t *near, *active, *some;         // by row: whether it may act after the motion; by scene [B] twice
-  double *center, *motion;               // by body [3], [6]
-  double *solution, *matrix;             // by place: six; and as Groups::matrix() says
-  uint64_t* blocks;                      // by place
-  int32_t *label, *groups;               // by body; [B, 4, bodies]
-  int32_t *list, *count;                 // [4 rows]; by vertex [2]: see RigidStep::list()
+  int64_t listed, lagged;         // rows of the lists
+  PairForce* forces;              // by row, of bodies that it acts on, or -1
+  uint8_t *near, *active, *some;  // by row: whether it may act after the motion; by scene [B] twice
+  double *center, *motion;        // by body [3], [6]
+  double *solution, *matrix;      // by place: six; and as Groups::matrix() says
+  uint64_t* blocks;               // by place
+  int32_t *label, *groups;        // by body; [B, 4, bodies]
+  int32_t *list, *count;          // [4 rows]; by vertex [2]: see RigidStep::list()
   // of the trials
-  double *reach, *sum, *own, *after;     // by body [2]: farthest_of(); by body and vertex [2]: change, size; by row
-  uint8_t *decided, *joined, *solved;    // by body
-  T* move;                               // by vertex [3]
+  double *reach, *sum, *own, *after;   // by body [2]: farthest_of(); by body and vertex [2]: change, size; by row
+  uint8_t *decided, *joined, *solved;  // by body
+  T* move;                             // by vertex [3]
   AdvanceState<T> state;
-  Motion<T>* motions;                    // by vertex, that of `state`
+  Motion<T>* motions;  // by vertex, that of `state`
 
   // take(pointer, items), for so many scenes, and vertices and bodies of all of them; size: of the matrices of a scene
   template <class Take>
@@ -53,7 +53,8 @@ struct RigidMemory {
     take(forces, rows), take(near, rows), take(active, scenes), take(some, scenes);
     take(center, 3 * units), take(motion, kUnknowns * units), take(solution, kUnknowns * units);
     take(matrix, scenes * size), take(blocks, units), take(label, units), take(groups, kGroupRows * units);
-    take(list, 4 * rows), take(count, 2 * vertices), take(reach, 2 * units), take(sum, 2 * units), take(own, 2 * vertices), take(after, rows);
+    take(list, 4 * rows), take(count, 2 * vertices), take(reach, 2 * units), take(sum, 2 * units),
+        take(own, 2 * vertices), take(after, rows);
     take(decided, units), take(joined, units), take(solved, units), take(move, 3 * vertices), take(motions, vertices);
     take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
     take(state.failed, scenes);
@@ -240,7 +241,8 @@ struct Assemble {  // bodies
         for (int j = 0; j < kUnknowns; ++j) {
           to[j] += a.gradient(side, j, whole.center);
           const Vector along = share * (a.stiffness * a.map(side, j, whole.center));
-          for (int k = j; k < kUnknowns; ++k) to[kUnknowns + rigid::at6(k, j)] += dot(a.map(side, k, whole.center), along);
+          for (int k = j; k < kUnknowns; ++k)
+            to[kUnknowns + rigid::at6(k, j)] += dot(a.map(side, k, whole.center), along);
         }
       });
     });
@@ -252,9 +254,8 @@ struct Assemble {  // bodies
         total[kUnknowns + rigid::at6(i, i)] += !free ? 1 : i < 3 ? kLeastInertia * total[kOwn] : 0;
       }
     }
-    team.each(kUnknowns * kUnknowns * rank, [&](int32_t i) {
-      rows[i / (kUnknowns * rank) * size + i % (kUnknowns * rank)] = 0;
-    });
+    team.each(kUnknowns * kUnknowns * rank,
+              [&](int32_t i) { rows[i / (kUnknowns * rank) * size + i % (kUnknowns * rank)] = 0; });
     team.meet();
     if (team.leads()) {
       for (int i = 0; i < kUnknowns; ++i) {
@@ -296,7 +297,8 @@ struct Solve {  // groups
     const int32_t count = g.count(place), size = kUnknowns * count;
     if (count == 0) return;
     double *matrix = s.m.matrix + s.in.matrix_size() * scene + g.matrix(place),
-           *solution = s.m.solution + kUnknowns * s.unit(scene, place), *motion = s.m.motion + kUnknowns * s.unit(scene, 0);
+           *solution = s.m.solution + kUnknowns * s.unit(scene, place),
+           *motion = s.m.motion + kUnknowns * s.unit(scene, 0);
     uint64_t* blocks = s.m.blocks + s.unit(scene, place);
     const bool moves = s.m.active[scene] && s.in.moves(scene, g, place);
     if (moves && is_new) cholesky::factor(team, count, matrix, blocks);
@@ -574,16 +576,14 @@ template <class T>
 struct RigidReverse {
   RigidStep<T> step;
   WorkStep<T> work;
-  const double* fraction;  // [B, bodies]
-  bool* moving;            // of the step: bodies with a fraction
-  const T* end_bar;        // [B, V, 3]; may be out.vertices.x
+  const double* fraction;   // [B, bodies]
+  bool* moving;             // of the step: bodies with a fraction
+  const T* end_bar;         // [B, V, 3]; may be out.vertices.x
   T *p, *q, *displacement;  // as of virtual_motion() and reverse_end()
   CorrectionAdjoints<T> out;
 
   DIFFVBD_FN const RigidInputs<T>& inputs() const { return step.in; }
-  DIFFVBD_FN double* motion(const Body<T>& b) const {
-    return step.m.motion + kUnknowns * step.unit(b.scene, b.body);
-  }
+  DIFFVBD_FN double* motion(const Body<T>& b) const { return step.m.motion + kUnknowns * step.unit(b.scene, b.body); }
   DIFFVBD_FN double* solution(const Body<T>& b) const {
     return step.m.solution + kUnknowns * step.unit(b.scene, step.in.groups_of(b.scene).place(b.body));
   }
