@@ -10,14 +10,15 @@ struct Correcting {
   contact::RigidStep<T> step;
   Tensor memory;
 
-  Correcting(const TouchingFields& f, const TouchingSettings& settings, const Device& device) {
+  Correcting(const TouchingFields& f, const TouchingSettings& settings, const Device& device, bool trials) {
     contact::RigidMemory<T>& m = step.m;
     step.in = touching_inputs<T>(f, settings, nullptr);
     m.listed = f.pairs.size(0), m.lagged = lagged_pairs(f);
     const int64_t b = f.x.size(0);
     const auto& in = step.in;
-    memory = workspace(device,
-                       [&](auto& take) { m.parts(take, b, b * in.scene.vertices, b * in.bodies(), in.matrix_size()); });
+    memory = workspace(device, [&](auto& take) {
+      m.parts(take, b, b * in.scene.vertices, b * in.bodies(), in.matrix_size(), trials);
+    });
     step.in.groups = m.groups, step.in.gate.move = m.move;
     m.state.motion = m.motions, m.state.first = false;
   }
@@ -32,7 +33,7 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Int
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    Correcting<T> work(f, {data_count, time_step, friction_eps}, device);
+    Correcting<T> work(f, {data_count, time_step, friction_eps}, device, true);
     contact::RigidStep<T>& s = work.step;
     const int64_t b = x.size(0), n = s.in.bodies();
     const bool all = moving.dim() == 1 && moving.size(0) == 0;
@@ -60,7 +61,7 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
           "diffvbd::contact_rigid_reverse: expected as many at as fraction, one at least");
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    Correcting<T> memory(f, {data_count, time_step, friction_eps}, device);
+    Correcting<T> memory(f, {data_count, time_step, friction_eps}, device, false);
     contact::RigidStep<T>& s = memory.step;
     const int64_t b = read.b, v = read.v, corners = s.in.gate.corners, n = s.in.bodies();
     const WorkTensors pairs_out(f, device);

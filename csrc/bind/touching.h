@@ -45,8 +45,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
     in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = read.batch("floor_lag", t.floor_lag, v * in.planes * contact::kFloorLag);
   }
-  in.has_friction = 0 < q.friction_eps;
-  in.friction_eps = in.has_friction ? q.friction_eps : 1;
+  in.friction_eps = 0 < q.friction_eps ? q.friction_eps : 1;
   return in;
 }
 

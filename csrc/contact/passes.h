@@ -80,6 +80,7 @@ DIFFVBD_FN Load<T> load_of(const PairList& listed, int64_t corners, const int32_
   const auto force = [&](int64_t at) { return lag[kLagScalars * at]; };
   const int32_t* record = listed.pairs + kPairRow * pair;
   const int32_t point = record[0], face = body[record[1]];
+  if (lag[kLagScalars * pair + 1] == T(0)) return {pair, T(0)};  // beyond dhat, as most are
   if (record[4] != kPointTriangle || body[point] == face) return {pair, force(pair)};
   const PairList::Entries near = listed.of(record[5] * corners + point);
   int64_t bearer = -1;

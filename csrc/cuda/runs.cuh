@@ -87,9 +87,9 @@ __global__ void __launch_bounds__(kItems) small_bodies_kernel(Phase phase, const
   const auto& in = s.inputs();
   const int64_t unit = own_item(kItems) / 32, n = in.bodies();
   using Scene = std::decay_t<decltype(in.scene)>;
-  if (unit < in.scene.scenes * n) {
-    phase(s, Body<typename Scene::Scalar>{in.scene, unit / n, static_cast<int32_t>(unit % n)}, Tile<32>());
-  }
+  if (unit >= in.scene.scenes * n) return;
+  const Body<typename Scene::Scalar> body{in.scene, unit / n, static_cast<int32_t>(unit % n)};
+  if (body.size() <= kOfWarp) phase(s, body, Tile<32>());
 }
 template <class Phase, class Step>
 __global__ void __launch_bounds__(kThreads) large_bodies_kernel(Phase phase, const __grid_constant__ Step s) {
@@ -97,7 +97,8 @@ __global__ void __launch_bounds__(kThreads) large_bodies_kernel(Phase phase, con
   const auto& in = s.inputs();
   const int64_t unit = blockIdx.x, n = in.bodies();
   using Scene = std::decay_t<decltype(in.scene)>;
-  phase(s, Body<typename Scene::Scalar>{in.scene, unit / n, static_cast<int32_t>(unit % n)}, BlockTeam{part});
+  const Body<typename Scene::Scalar> body{in.scene, unit / n, static_cast<int32_t>(unit % n)};
+  if (body.size() > kOfWarp) phase(s, body, BlockTeam{part});
 }
 template <class Phase, class Step>
 __global__ void __launch_bounds__(kItems) small_groups_kernel(Phase phase, const __grid_constant__ Step s) {
@@ -160,10 +161,9 @@ struct Launches : Sets {
   void bodies(const Phase& phase, const Step& s) const {
     const auto& in = s.inputs();
     const int64_t units = in.scene.scenes * in.bodies();
-    if (int64_t{in.scene.vertices} > int64_t{kOfWarp} * in.bodies()) {
+    small_bodies_kernel<<<blocks_for(32 * units, kItems), kItems, 0, stream>>>(phase, s);
+    if (in.scene.vertices > kOfWarp) {
       large_bodies_kernel<<<static_cast<unsigned>(units), kThreads, 0, stream>>>(phase, s);
-    } else {
-      small_bodies_kernel<<<blocks_for(32 * units, kItems), kItems, 0, stream>>>(phase, s);
     }
   }
   template <class Phase, class Step>
@@ -229,13 +229,13 @@ struct InBlock : Sets {
     const auto& in = s.inputs();
     using Scene = std::decay_t<decltype(in.scene)>;
     const auto body = [&](int64_t k) { return Body<typename Scene::Scalar>{in.scene, scene, static_cast<int32_t>(k)}; };
-    if (int64_t{in.scene.vertices} > int64_t{kOfWarp} * in.bodies()) {
-      for (int64_t k = 0; k < in.bodies(); ++k) {
-        phase(s, body(k), team);
-        __syncthreads();
-      }
-    } else {
-      by_warp(in.bodies(), [&](int64_t k) { phase(s, body(k), Tile<32>()); });
+    by_warp(in.bodies(), [&](int64_t k) {
+      if (body(k).size() <= kOfWarp) phase(s, body(k), Tile<32>());
+    });
+    if (in.scene.vertices <= kOfWarp) return;
+    for (int64_t k = 0; k < in.bodies(); ++k) {
+      if (body(k).size() > kOfWarp) phase(s, body(k), team);
+      __syncthreads();
     }
   }
   template <class Phase, class Step>

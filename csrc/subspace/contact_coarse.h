@@ -431,7 +431,7 @@ void coarse_move(const Run& run, const CoarseInputs<T>& c, const double* a, cons
                 const int64_t pair = all.first[e] >> 2, row = first + pair;
                 const int32_t* record = list.pairs + kPairRow * pair;
                 const int at = all.first[e] & 3;
-                if (at != 0 && !(at == sides(record[4]) && moving_body(c.in, record[0]) < 0)) continue;
+                if (at != (0 <= moving_body(c.in, record[0]) ? 0 : sides(record[4]))) continue;
                 to[0] += m.after[row] - m.before[row], to[1] += absolute(m.after[row]) + absolute(m.before[row]);
               }
             };

@@ -61,7 +61,6 @@ struct RigidInputs {
   const bool* moving;                 // [B, bodies], or null: all move
   int32_t planes;
   double friction_eps;
-  bool has_friction;
   bool bends;  // bodies do not move rigidly (contact_coarse.h): pairs within one act, too
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }

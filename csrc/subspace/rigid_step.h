@@ -46,18 +46,19 @@ struct RigidMemory {
   AdvanceState<T> state;
   Motion<T>* motions;  // by vertex, that of `state`
 
-  // take(pointer, items), for so many scenes, and vertices and bodies of all of them; size: of the matrices of a scene
+  // take(pointer, items), for so many scenes, and vertices and bodies of all of them; size: of the matrices of a scene;
+  // trials: whether these follow
   template <class Take>
-  void parts(Take& take, int64_t scenes, int64_t vertices, int64_t units, int64_t size) {
+  void parts(Take& take, int64_t scenes, int64_t vertices, int64_t units, int64_t size, bool trials) {
     const int64_t rows = listed + lagged;
-    take(forces, rows), take(near, rows), take(active, scenes), take(some, scenes);
+    take(forces, rows), take(list, 4 * rows), take(count, 2 * vertices);
+    take(active, scenes), take(some, scenes), take(solved, units), take(blocks, units), take(label, units);
     take(center, 3 * units), take(motion, kUnknowns * units), take(solution, kUnknowns * units);
-    take(matrix, scenes * size), take(blocks, units), take(label, units), take(groups, kGroupRows * units);
-    take(list, 4 * rows), take(count, 2 * vertices), take(reach, 2 * units), take(sum, 2 * units),
-        take(own, 2 * vertices), take(after, rows);
-    take(decided, units), take(joined, units), take(solved, units), take(move, 3 * vertices), take(motions, vertices);
+    take(matrix, scenes * size), take(groups, kGroupRows * units);
+    if (!trials) return;
+    take(near, rows), take(after, rows), take(reach, 2 * units), take(sum, 2 * units), take(own, 2 * vertices);
+    take(decided, units), take(joined, units), take(move, 3 * vertices), take(motions, vertices);
     take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
-    take(state.failed, scenes);
   }
 };
 
@@ -377,7 +378,7 @@ struct ListNear {  // each vertex, of the rows that its body owns
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t v) const {
     s.list(scene, v, [&](int64_t row, int side) {
-      return s.m.near[row] && (side == 0 || moving_body(s.in, s.record(row)[0]) < 0);
+      return s.m.near[row] && (side == 0) == (0 <= moving_body(s.in, s.record(row)[0]));
     });
   }
 };
@@ -479,7 +480,7 @@ struct EndBody {  // each body
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
     const int64_t unit = s.unit(scene, k);
-    if (!s.m.solved[unit]) s.out.fraction[unit] = 0;  // it passes no adjoint on
+    if (!s.m.solved[unit] || !s.in.free[k]) s.out.fraction[unit] = 0;  // it passes no adjoint on
     if (finish_trials(s.m.motion, unit, s.out)) mark(s.m.some + scene);
   }
 };

@@ -369,18 +369,20 @@ def _split(points: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    x, collider, kappa, origin, bearer = saved
+    x, collider, kappa, origin, force, bearer = saved
     by_state, by_load = bars
-    assert by_state is not None and by_load is not None  # friction_lag() takes both
-    bar = torch.cat([by_load[bearer][:, None], by_state[:, 1:]], 1)
+    if by_state is None or by_load is None:  # of neither friction nor damping
+        return [None] * 3
+    own = torch.where(force > 0, by_load, 0.0)[bearer]  # faces whose forces sum to less than nothing bear nothing
+    bar = torch.cat([own[:, None], by_state[:, 1:]], 1)
     points, by_kappa = raw.contact_lag_backward(bar, x, origin, collider, kappa, *rest)
     return *_split(points, x), by_kappa
 
 
-# Of each pair: activity, normal and weights in [pairs, 9], the normal force that it bears, and the pair that bears its
-# own [pairs]; of x, collider, kappa, origin; pairs, constants, ptr, entry, body.
+# Of each pair: activity, normal and weights in [pairs, 9], whose first column is not differentiable; the normal force
+# that it bears, and the pair that bears its own [pairs]; of x, collider, kappa, origin; pairs, constants, ptr, entry, body.
 pair_lag = Differentiable(
     lambda x, collider, kappa, origin, *listed: raw.contact_lag(x, origin, collider, kappa, *listed), _lag_reverse,
-    arguments=9, inputs=3, outputs=2, saved=lambda inputs, made: (*inputs[:4], made[2]),
+    arguments=9, inputs=3, outputs=2, saved=lambda inputs, made: (*inputs[:4], *made[1:]),
     rest=lambda inputs: inputs[4:8],
 )  # fmt: skip
