@@ -9,7 +9,7 @@ import pytest
 import torch
 from conftest import DEVICES
 from helpers.marks import quick_and_slow, slow
-from helpers.spreads import assert_near_contact
+from helpers.spreads import PARALLEL, assert_near_contact
 from helpers.touching import TIME_STEP, pressed, stack
 from torch import Tensor
 
@@ -25,14 +25,14 @@ def scene_of(name: str) -> Scene:
     return SCENES[name]()
 
 
-def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
-    """Lengths of all corrections."""
+def check(scene: Scene, steps: int, sweeps: int, device: str, rounding: float = 1.0) -> Tensor:
+    """Lengths of all corrections. rounding: Of gradients, over that of most scenes."""
     solver = scene.solver(sweeps, subspace=SPACE, tape="full")
     result, parts = compiled(scene, steps, solver, scene.model.to(device))
     expected = unrolled(scene, steps, solver, parts)
     others = [lambda: unrolled(scene, steps, solver, parts, seed=1)]
     forward, adjoint = (steps * tolerance(name) for name in ("contact_forward", "contact_adjoint"))
-    assert_near_contact(result, expected, forward, adjoint, scene.time_step, others)
+    assert_near_contact(result, expected, forward, rounding * adjoint, scene.time_step, others)
     for key in ("grad_x", "grad_v", "grad_mu", "grad_density"):
         assert expected[key].abs().max() > 0, key
     return torch.cat([part.lengths.reshape(-1) for own in parts for part in own if part.lengths is not None])
@@ -42,7 +42,7 @@ def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
 @pytest.mark.parametrize(("steps", "sweeps"), [(1, 7), slow(2, 6)])
 @pytest.mark.parametrize("name", quick_and_slow(("obstacles", "batched", "thrown"), SCENES))
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, device: str) -> None:
-    lengths = check(scene_of(name), steps, sweeps, device)
+    lengths = check(scene_of(name), steps, sweeps, device, PARALLEL.get(name, 1.0))
     assert (lengths == 1).any() or name in ("fast", "thrown")
 
 
