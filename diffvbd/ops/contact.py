@@ -380,7 +380,8 @@ def _lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[
 
 
 # Of each pair: activity, normal and weights in [pairs, 9], whose first column is not differentiable; the normal force
-# that it bears, and the pair that bears its own [pairs]; of x, collider, kappa, origin; pairs, constants, ptr, entry, body.
+# that it bears, and the pair that bears its own [pairs]; of x, collider, kappa, origin; pairs, constants, ptr, entry,
+# body.
 pair_lag = Differentiable(
     lambda x, collider, kappa, origin, *listed: raw.contact_lag(x, origin, collider, kappa, *listed), _lag_reverse,
     arguments=9, inputs=3, outputs=2, saved=lambda inputs, made: (*inputs[:4], *made[1:]),

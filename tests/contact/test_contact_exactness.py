@@ -29,6 +29,7 @@ LONG = [(4, 20), (20, 2)]  # in turn; `-m hours` runs both
 SHORT = {"thrown", "held_up"}  # scenes that are like the others after a few steps
 # the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
 OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}
+HOURS = [(20, 5), (20, 20)]  # one scene runs the first of them in `make test-all`, too
 # Bounds hold every vertex back in the first step, which therefore starts without a pair closer than dhat.
 NONE_YET = {"grad_pair_damping", "grad_friction"}
 ZERO = {("fast", 1): NONE_YET, ("held_up", 1): NONE_YET}
