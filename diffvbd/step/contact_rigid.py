@@ -108,9 +108,8 @@ def listed_of(f: ops.TouchingFields) -> Pairs:
 
 # Rigid corrections after the last sweeps while bodies are blocked, which first approach the blocking bodies and then
 # push them, or are solved for alone. A row of four cubes that meet at 3 m/s lost 14 % of its momentum with one
-# correction and none with three; at 10 m/s that takes five. In stacks of two with friction, each body alone, the upper
-# one creeps at 2.0 mm/s with 4 and 1.1 with 6; stacks of four fell with 6.
-MOST_CORRECTIONS = 8
+# correction and none with three; at 10 m/s that takes five.
+MOST_CORRECTIONS = 5
 BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
 
