@@ -37,8 +37,8 @@
   ADJOINT(x) ADJOINT(x_prev) ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
   INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other)
 
-// The rigid correction of bodies that touch (subspace/rigid_step.h): vertices by body; free [bodies] bool: nothing of it is
-// pinned; pinned and body of all corner points; contact as of the sweeps.
+// The rigid correction of bodies that touch (subspace/rigid_step.h): vertices by body; free [bodies] bool: nothing of it
+// is pinned; pinned and body of all corner points; contact as of the sweeps.
 #define DIFFVBD_TOUCHING_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x) ADJOINT(x_prev) ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
   INDEX(order) INDEX(ptr) INDEX(free) INDEX(pinned) INDEX(body) \

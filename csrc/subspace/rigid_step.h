@@ -266,7 +266,7 @@ struct Assemble {  // bodies
     for (int32_t other = 0; other < rank; ++other) {
       const int32_t place = first + other, number = g.member(place);
       if (!(s.m.blocks[s.unit(b.scene, place)] >> rank & 1)) continue;
-      const Whole beside = whole_of(Body<T>{in.scene, b.scene, number}, team);
+      const Whole other_whole = whole_of(Body<T>{in.scene, b.scene, number}, team);
       for (int half = 0; half < 2; ++half) {
         double block[kHalf];
         team.template sum<kHalf>(b.size(), block, [&](int32_t i, double* to) {
@@ -274,7 +274,7 @@ struct Assemble {  // bodies
             const PairForce& a = s.m.forces[row];
             if ((side == 0 ? a.body[1] : a.body[0]) != number) return;
             for (int j = 0; j < kUnknowns; ++j) {
-              const Vector along = a.stiffness * a.map(1 - side, j, beside.center);
+              const Vector along = a.stiffness * a.map(1 - side, j, other_whole.center);
               for (int k = 0; k < 3; ++k) to[kUnknowns * k + j] += dot(a.map(side, 3 * half + k, whole.center), along);
             }
           });
