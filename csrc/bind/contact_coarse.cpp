@@ -8,10 +8,9 @@ namespace {
 
 // free: the bodies of the mesh that have a vertex to move.
 template <class T>
-contact::CoarseInputs<T> coarse_inputs(const TouchingFields& f, const SpaceFields& s, const TouchingSettings& q,
-                                       const T* move) {
+contact::CoarseInputs<T> coarse_inputs(const TouchingFields& f, const SpaceFields& s, const TouchingSettings& q) {
   contact::CoarseInputs<T> c{};
-  c.in = touching_inputs<T>(f, q, move);
+  c.in = touching_inputs<T>(f, q);
   c.in.bends = true;
   const Reader<T> read(f.x);
   const int64_t entries = s.function.numel(), functions = s.function_ptr.numel() - 1, tets = s.tets.size(0);
@@ -43,15 +42,19 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_system, DIFFVBD_PARAMETERS(TOUCHING) DIF
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr);
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps});
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, n = c.size();
-    contact::SystemMemory memory{f.pairs.size(0), lagged_pairs(f)};
-    const Tensor work = workspace(device, [&](auto& take) { memory.parts(take, b * v); });
+    contact::RowMemory rows{f.pairs.size(0), lagged_pairs(f)};
+    contact::SystemMemory memory;
+    const Tensor work = workspace(device, [&](auto& take) {
+      rows.parts(take, b * v);
+      memory.parts(take, rows.rows(), b * v);
+    });
     const Tensor r = device.empty({b, n / 3, 3}, ScalarType::Double),
                  matrix = device.empty({b, n, n}, ScalarType::Double);
     const auto own = read.batch("packed", packed, packed.dim() == 2 ? packed.size(1) : 0);
-    DIFFVBD_RUN(device, contact_coarse_system<T>, c, own, memory, data<double>(r), data<double>(matrix));
+    DIFFVBD_RUN(device, contact_coarse_system<T>, c, own, rows, memory, data<double>(r), data<double>(matrix));
     return Out<2>(r, matrix);
   });
 }
@@ -64,15 +67,19 @@ DIFFVBD_OPERATOR(Out<2>, contact_coarse_move, DIFFVBD_PARAMETERS(TOUCHING) DIFFV
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const Tensor move = device.like_x();
-    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, data_or_null<T>(move));
+    contact::CoarseStep<T> step;
+    step.c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps});
+    step.in = step.c.in;
     const Reader<T> read(x);
-    const int64_t b = read.b, v = read.v, n = c.in.bodies();
+    const int64_t b = read.b, n = step.in.bodies();
     const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double);
-    contact::TrialMemory<T> memory{f.pairs.size(0), lagged_pairs(f), data<T>(move), data<double>(fraction)};
-    const Tensor work = workspace(device, [&](auto& take) { memory.parts(take, b, b * v, b * n); });
-    DIFFVBD_RUN(device, contact_coarse_move<T>, c, read.doubles("a", a, b * c.size()),
-                read.doubles("r", r, b * c.size()), read.index("info", info, b), memory, data<T>(end));
+    const Tensor memory = memory_of_trials(
+        f, device, step, true,
+        [&](auto& take, int64_t, int64_t vertices, int64_t bodies) { step.own.parts(take, vertices, bodies); });
+    step.a = read.doubles("a", a, b * step.c.size()), step.r = read.doubles("r", r, b * step.c.size());
+    step.info = read.index("info", info, b);
+    step.fraction = data<double>(fraction), step.x_end = data<T>(end);
+    DIFFVBD_RUN(device, contact_coarse_move<T>, step);
     return Out<2>(end, fraction);
   });
 }
@@ -84,7 +91,7 @@ DIFFVBD_OPERATOR(Tensor, contact_coarse_restrict, DIFFVBD_PARAMETERS(TOUCHING) D
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr);
+    const auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps});
     const Reader<T> read(x);
     const Tensor out = device.empty({read.b, c.size() / 3, 3}, ScalarType::Double);
     DIFFVBD_RUN(device, contact_coarse_restrict<T>, c, read.vectors("x_bar", x_bar),
@@ -104,7 +111,7 @@ DIFFVBD_OPERATOR(Out<14>, contact_coarse_reverse, DIFFVBD_PARAMETERS(TOUCHING) D
   const SpaceFields s{DIFFVBD_ITEMS(SPACE)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps}, nullptr);
+    auto c = coarse_inputs<T>(f, s, {data_count, time_step, friction_eps});
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, corners = c.in.gate.corners, tets_listed = c.num_tets,
                   cells = packed.dim() == 2 ? packed.size(1) / 9 : 0;

@@ -11,16 +11,11 @@ struct Correcting {
   Tensor memory;
 
   Correcting(const TouchingFields& f, const TouchingSettings& settings, const Device& device, bool trials) {
-    contact::RigidMemory<T>& m = step.m;
-    step.in = touching_inputs<T>(f, settings, nullptr);
-    m.listed = f.pairs.size(0), m.lagged = lagged_pairs(f);
-    const int64_t b = f.x.size(0);
-    const auto& in = step.in;
-    memory = workspace(device, [&](auto& take) {
-      m.parts(take, b, b * in.scene.vertices, b * in.bodies(), in.matrix_size(), trials);
+    step.in = touching_inputs<T>(f, settings);
+    memory = memory_of_trials(f, device, step, trials, [&](auto& take, int64_t scenes, int64_t, int64_t units) {
+      step.r.parts(take, scenes, units, step.in.matrix_size());
     });
-    step.in.groups = m.groups, step.in.gate.move = m.move;
-    m.state.motion = m.motions, m.state.first = false;
+    step.in.groups = step.r.groups;
   }
 };
 
@@ -42,8 +37,8 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Int
     const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double),
                  moved = device.empty({b, n}, ScalarType::Bool), blocked = device.empty({b, n}, ScalarType::Bool),
                  alone = device.empty({b, n}, ScalarType::Bool), remaining = device.empty({b, n});
-    s.out = {data<double>(fraction), data<bool>(moved), data<bool>(blocked), data<bool>(alone), data<T>(remaining)};
-    s.x_end = data<T>(end);
+    s.out = {data<bool>(moved), data<bool>(blocked), data<bool>(alone), data<T>(remaining)};
+    s.fraction = data<double>(fraction), s.x_end = data<T>(end);
     if (b * n > 0) DIFFVBD_RUN(device, contact_rigid_correct<T>, s);
     return Out<6>(end, fraction, moved, blocked, alone, remaining);
   });

@@ -13,9 +13,8 @@ struct TouchingSettings {
   double time_step, friction_eps;
 };
 
-// move: what is tried, memory of the operator, or null.
 template <class T>
-contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q, const T* move) {
+contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingSettings& q) {
   const Reader<T> read(t.x);
   const int64_t b = read.b, v = read.v, colliders = read.colliders(t.collider), corners = v + colliders;
   contact::RigidInputs<T> in{};
@@ -24,7 +23,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
   const int64_t bodies = in.scene.bodies;
   in.free = read.flags("free", t.free, bodies);
   contact::AdvanceInputs<T>& gate = in.gate;
-  gate.x = read.positions(), gate.move = move;
+  gate.x = read.positions();
   gate.origin = in.scene.origin.data;
   gate.center = read.vectors("center", t.center), gate.trust_radius = read.of_vertices("trust_radius", t.trust_radius);
   gate.collider = gate.collider_next = read.like("collider", t.collider, 3 * b * colliders);
@@ -59,6 +58,23 @@ Tensor workspace(const Device& device, const F& parts) {
   const Tensor out = device.empty({static_cast<int64_t>(sizes.bytes)}, ScalarType::Byte);
   Parts<> places(out.data_ptr());
   parts(places);
+  return out;
+}
+
+// Memory of a correction and, if it makes them, of its trials. more(take, scenes, vertices, bodies): what else it
+// takes, vertices and bodies of all scenes.
+template <class T, class More>
+Tensor memory_of_trials(const TouchingFields& f, const Device& device, contact::TrialStep<T>& s, bool trials,
+                        const More& more) {
+  const int64_t b = f.x.size(0), vertices = b * s.in.scene.vertices, units = b * s.in.bodies();
+  s.all.listed = f.pairs.size(0), s.all.lagged = lagged_pairs(f);
+  const Tensor out = workspace(device, [&](auto& take) {
+    s.all.parts(take, vertices);
+    s.m.parts(take, s.all.rows(), b, vertices, units, trials);
+    more(take, b, vertices, units);
+  });
+  s.in.gate.move = s.m.move;
+  s.m.state.motion = s.m.motions, s.m.state.first = false;
   return out;
 }
 

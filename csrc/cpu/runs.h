@@ -62,8 +62,11 @@ struct Loops {
     for_each(count, [&](int64_t point) { phase(s, point, Threads(false)); }, kItems);
   }
 
-  bool is_done(const uint8_t* decided, int64_t n) const {
-    return std::all_of(decided, decided + n, [](uint8_t a) { return a != 0; });
+  bool all(const uint8_t* flags, int64_t n) const {
+    return std::all_of(flags, flags + n, [](uint8_t a) { return a != 0; });
+  }
+  bool none(const uint8_t* flags, int64_t n) const {
+    return std::none_of(flags, flags + n, [](uint8_t a) { return a != 0; });
   }
   // Labels may change while they are read; every value read is an item of the same set.
   static int32_t root_of(const int32_t* label, int32_t i) {

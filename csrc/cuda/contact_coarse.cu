@@ -4,15 +4,14 @@
 namespace diffvbd::cuda {
 
 template <class T>
-cudaError_t contact_coarse_system(const CoarseInputs<T>& c, const Batched<const T>& packed, const SystemMemory& memory,
-                                  double* r, double* matrix, cudaStream_t stream) {
-  coarse_system(Launches(stream), c, packed, memory, r, matrix);
+cudaError_t contact_coarse_system(const CoarseInputs<T>& c, const Batched<const T>& packed, const RowMemory& rows,
+                                  const SystemMemory& memory, double* r, double* matrix, cudaStream_t stream) {
+  coarse_system(Launches(stream), c, packed, rows, memory, r, matrix);
   return cudaGetLastError();
 }
 template <class T>
-cudaError_t contact_coarse_move(const CoarseInputs<T>& c, const double* a, const double* r, const int32_t* info,
-                                const TrialMemory<T>& memory, T* x, cudaStream_t stream) {
-  coarse_move(Launches(stream), c, a, r, info, memory, x);
+cudaError_t contact_coarse_move(const CoarseStep<T>& s, cudaStream_t stream) {
+  coarse_move(Launches(stream), s);
   return cudaGetLastError();
 }
 template <class T>

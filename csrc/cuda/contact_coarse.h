@@ -9,10 +9,10 @@ namespace diffvbd::cuda {
 
 template <class T>
 cudaError_t contact_coarse_system(const contact::CoarseInputs<T>& c, const Batched<const T>& packed,
-                                  const contact::SystemMemory& memory, double* r, double* matrix, cudaStream_t stream);
+                                  const contact::RowMemory& rows, const contact::SystemMemory& memory, double* r,
+                                  double* matrix, cudaStream_t stream);
 template <class T>
-cudaError_t contact_coarse_move(const contact::CoarseInputs<T>& c, const double* a, const double* r,
-                                const int32_t* info, const contact::TrialMemory<T>& memory, T* x, cudaStream_t stream);
+cudaError_t contact_coarse_move(const contact::CoarseStep<T>& s, cudaStream_t stream);
 template <class T>
 cudaError_t contact_coarse_restrict(const contact::CoarseInputs<T>& c, const T* x_bar, const double* fraction,
                                     double* to, cudaStream_t stream);

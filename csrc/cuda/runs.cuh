@@ -180,7 +180,8 @@ struct Launches : Sets {
     const int64_t items = s.inputs().scene.scenes * s.inputs().gate.corners;
     if (items > 0) points_kernel<<<blocks_for(32 * items, kItems), kItems, 0, stream>>>(phase, s);
   }
-  bool is_done(const uint8_t*, int64_t) const { return false; }  // the host would wait
+  bool all(const uint8_t*, int64_t) const { return false; }  // the host would wait
+  bool none(const uint8_t*, int64_t) const { return false; }
 };
 
 // A block for a scene.
@@ -258,10 +259,17 @@ struct InBlock : Sets {
     by_warp(corners, [&](int64_t k) { phase(s, scene * corners + k, Tile<32>()); });
   }
   // flags: of all scenes, of which there is a block each
-  __device__ bool is_done(const uint8_t* flags, int64_t n) const {
+  __device__ bool all(const uint8_t* flags, int64_t n) const {
+    return holds(n, [&](int64_t i) { return flags[i] != 0; });
+  }
+  __device__ bool none(const uint8_t* flags, int64_t n) const {
+    return holds(n, [&](int64_t i) { return flags[i] == 0; });
+  }
+  template <class F>
+  __device__ bool holds(int64_t n, const F& f) const {
     const int64_t count = n / gridDim.x;
     bool all = true;
-    own(scene * count, (scene + 1) * count, [&](int64_t i) { all = all && flags[i] != 0; });
+    own(scene * count, (scene + 1) * count, [&](int64_t i) { all = all && f(i); });
     return __syncthreads_and(all) != 0;
   }
 };

@@ -7,13 +7,12 @@
 // where s is the first of 1, 1/2, ... that lowers the potential enough and that nothing blocks, for each island of
 // bodies. In double precision. The factors and solutions in between are those of torch.
 //
-// A Run makes the loops: run.each(n, f) calls f(i); run.lanes(n, f) calls f(i, lane), where lane.each(count, f) shares
-// items that lane.meet() ends; run.teams(n, f) calls f(i, team).
+// A Run makes the loops, those of trials.h and more: run.each(n, f) calls f(i); run.lanes(n, f) calls f(i, lane), where
+// lane.each(count, f) shares items that lane.meet() ends; run.teams(n, f) calls f(i, team).
 #pragma once
 
-#include "coarse.h"
-#include "contact_rigid.h"
 #include "contact_rigid_reverse.h"
+#include "trials.h"
 
 #ifdef __CUDACC__
 #define DIFFVBD_LAMBDA [=] __device__
@@ -22,8 +21,6 @@
 #endif
 
 namespace diffvbd::contact {
-
-using rigid::Body;
 
 // The coarse functions of a Model, by vertex and by function (CoarseIndex in diffvbd/step/contact_coarse.py).
 struct CoarseSpace {
@@ -92,29 +89,33 @@ struct CornerForce {
   Vector pull[4];
 };
 
-// Rows of listed pairs, and then of lagged ones. forces are written where `acts`.
+// Memory of the system. forces are written where `acts`.
 struct SystemMemory {
-  int64_t listed, lagged;
   uint8_t* acts;             // [rows]
   CornerForce* forces;       // [rows]
   double *gradient, *block;  // [B, V, 3], [B, V, 6]  the blocks without inertia
-  int32_t *acting, *count;   // [4 rows], [B, V, 2]  entries of a vertex that act, where those of the lists begin
 
-  // take(pointer, items), for so many vertices of all scenes
+  // take(pointer, items), for so many rows, and vertices of all scenes
   template <class Take>
-  void parts(Take& take, int64_t vertices) {
-    const int64_t rows = listed + lagged;
-    take(forces, rows), take(gradient, 3 * vertices), take(block, 6 * vertices);
-    take(acting, 4 * rows), take(count, 2 * vertices), take(acts, rows);
+  void parts(Take& take, int64_t rows, int64_t vertices) {
+    take(forces, rows), take(gradient, 3 * vertices), take(block, 6 * vertices), take(acts, rows);
   }
 };
 
 template <class T>
-DIFFVBD_FN bool force_of_listed(const RigidInputs<T>& in, int64_t pair, CornerForce& out) {
-  PairForce known;
+DIFFVBD_FN bool force_at_corners(const Rows<T>& s, int64_t row, CornerForce& out) {
+  const RigidInputs<T>& in = s.in;
   const CornerPoints<T> at{in, false};
-  if (pair >= in.first_listed(in.scene.scenes) || !barrier_force(in, pair, at, known)) return false;
-  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
+  PairForce known;
+  if (!s.exists(row) || !s.force(row, at, known)) return false;
+  out.force = known.force, out.stiffness = known.stiffness;
+  const int64_t pair = s.pair_of(row);
+  if (!s.is_listed(row)) {
+    const Lag<T> lag(in.lag + kLagScalars * pair);
+    for (int k = 0; k < 4; ++k) out.w[k] = lag.w[k], out.pull[k] = Vector{};
+    return true;
+  }
+  const int32_t* record = s.record(row);
   const int64_t scene = record[5];
   Corners<double> c;
   const Vector origin = at(scene, record[0]);
@@ -122,50 +123,8 @@ DIFFVBD_FN bool force_of_listed(const RigidInputs<T>& in, int64_t pair, CornerFo
   const double h2 = in.scene.time_step * in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
   const ForceTerms<double> a =
       barrier_terms(record[4], c, PairConstants<T>(in.gate.constants + kConstants * pair), h2 * kappa);
-  out.force = known.force, out.stiffness = known.stiffness;
   for (int k = 0; k < 4; ++k) out.w[k] = a.w[k], out.pull[k] = a.at_corner[k];
   return true;
-}
-template <class T>
-DIFFVBD_FN bool force_of_lagged(const RigidInputs<T>& in, int64_t pair, CornerForce& out) {
-  PairForce a;
-  if (pair >= in.first_lagged(in.scene.scenes)) return false;
-  if (!lagged_force(in, pair, CornerPoints<T>{in, false}, a)) return false;
-  const Lag<T> lag(in.lag + kLagScalars * pair);
-  out.force = a.force, out.stiffness = a.stiffness;
-  for (int k = 0; k < 4; ++k) out.w[k] = lag.w[k], out.pull[k] = Vector{};
-  return true;
-}
-
-// Finds the entries of a vertex that act, and calls f(row, corner) for each.
-template <class T, class F>
-DIFFVBD_FN void find_acting(const RigidInputs<T>& in, const SystemMemory& m, int64_t scene, int64_t v, const F& f) {
-  for (int list = 0; list < 2; ++list) {
-    int32_t& found = m.count[2 * (scene * in.gate.vertices + v) + list];
-    found = 0;
-    if ((list == 0 ? m.listed : m.lagged) == 0) continue;
-    const PairList& pairs = list == 0 ? in.gate.listed : in.lagged;
-    const int64_t corner = scene * in.gate.corners + v, first = list == 0 ? 0 : m.listed;
-    for (int32_t e = pairs.ptr[corner]; e < pairs.ptr[corner + 1]; ++e) {
-      const int32_t entry = pairs.entry[e];
-      if (!m.acts[first + (entry >> 2)]) continue;
-      m.acting[4 * first + pairs.ptr[corner] + found++] = entry;
-      f(first + (entry >> 2), entry & 3);
-    }
-  }
-}
-// Calls f(force, corner, record) for those that were found.
-template <class T, class F>
-DIFFVBD_FN void each_acting(const RigidInputs<T>& in, const SystemMemory& m, int64_t scene, int64_t v, const F& f) {
-  for (int list = 0; list < 2; ++list) {
-    const PairList& pairs = list == 0 ? in.gate.listed : in.lagged;
-    const int32_t count = m.count[2 * (scene * in.gate.vertices + v) + list];
-    const int64_t first = list == 0 ? 0 : m.listed;
-    for (int32_t i = 0; i < count; ++i) {
-      const int32_t entry = m.acting[4 * first + pairs.ptr[scene * in.gate.corners + v] + i], pair = entry >> 2;
-      f(m.forces[first + pair], entry & 3, pairs.pairs + kPairRow * int64_t{pair});
-    }
-  }
 }
 
 // Energies of a vertex and its friction on planes: gradient and block, which are added to.
@@ -192,14 +151,11 @@ DIFFVBD_FN Vector elastic_gradient(const CoarseInputs<T>& c, const Body<T>& b, i
 
 // r = P' g [B, F, 3] and the matrix [B, 3F, 3F], from the matrices of all bodies [1 | B, 9 cells].
 template <class T, class Run>
-void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const T>& packed, const SystemMemory& m,
-                   double* r, double* matrix) {
+void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const T>& packed, const RowMemory& all,
+                   const SystemMemory& m, double* r, double* matrix) {
   const int64_t V = c.vertices(), F = c.space.functions, n = c.size();
-  run.each(
-      m.listed + m.lagged, DIFFVBD_LAMBDA(int64_t row) {
-        m.acts[row] = row < m.listed ? force_of_listed(c.in, row, m.forces[row])
-                                     : force_of_lagged(c.in, row - m.listed, m.forces[row]);
-      });
+  const Rows<T> rows{c.in, all};
+  run.each(all.rows(), DIFFVBD_LAMBDA(int64_t row) { m.acts[row] = force_at_corners(rows, row, m.forces[row]); });
   run.each(
       c.scenes() * V, DIFFVBD_LAMBDA(int64_t item) {
         const int64_t scene = item / V, v = item % V;
@@ -207,8 +163,11 @@ void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const
         Vector g = b.mass(v) * (b.position(v) - b.target(v)) + c.h2() * elastic_gradient(c, b, v);
         Sym3<double> H{};
         if (!c.in.gate.pinned[v]) add_vertex_energies(c, b, v, g, H);
-        find_acting(c.in, m, scene, v,
-                    [&](int64_t row, int k) { g += m.forces[row].w[k] * m.forces[row].force + m.forces[row].pull[k]; });
+        rows.list(scene, v, [&](int64_t row, int k) {
+          const CornerForce& a = m.forces[row];
+          if (m.acts[row]) g += a.w[k] * a.force + a.pull[k];
+          return m.acts[row];
+        });
         put(m.gradient + 3 * item, c.in.gate.pinned[v] ? Vector{} : g);
         const double entries[] = {H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
         for (int i = 0; i < 6; ++i) m.block[6 * item + i] = entries[i];
@@ -249,7 +208,9 @@ void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const
           const double* b = m.block + 6 * at;
           const Sym3<double> H{b[0], b[1], b[2], b[3], b[4], b[5]};
           if (b[0] != 0 || b[3] != 0 || b[5] != 0) add(v, weight, H);
-          each_acting(c.in, m, scene, v, [&](const CornerForce& a, int k, const int32_t* record) {
+          rows.each_listed(scene, v, [&](int64_t row, int k) {
+            const CornerForce& a = m.forces[row];
+            const int32_t* record = rows.record(row);
             for (int j = 0; a.w[k] != 0 && j < 4; ++j) {
               if (record[j] < V) add(record[j], weight * a.w[k] * a.w[j], a.stiffness);
             }
@@ -261,52 +222,19 @@ void coarse_system(const Run& run, const CoarseInputs<T>& c, const Batched<const
 
 // --- the length of the step
 
-// Memory of the trials: of vertices, of bodies and of pairs.
-template <class T>
-struct TrialMemory {
-  int64_t listed, lagged;
-  T* move;                              // [B, V, 3], that of the inputs
-  double* fraction;                     // [B, bodies]
-  double *displacement, *coefficients;  // [B, V, 3], [B, V, kDegree]  -P a; of the change of tets and inertia
-  double *own, *size;                   // [B, V]  change of the energies of a vertex, and the sizes of their terms
-  double *before, *after;               // [rows]  potentials of pairs
-  double *body, *change;                // [B, bodies, kDegree + 1], [B, bodies, 2]  summed; the last one is the slope
-  int32_t* lead;                        // [B, bodies]  the first body of the island of each
-  uint8_t* decided;                     // [B, bodies]
-  AdvanceState<T> state;
-  Motion<T>* motions;  // [B, V], that of `state`
+// Memory of the length of the step beyond that of its trials.
+struct CoarseMemory {
+  double *displacement, *coefficients;  // [B, V, 3], [B, V, kDegree]  -P a; of the change of tets
+  double* slope;                        // [B, bodies]  of the potential
 
-  // take(pointer, items), for so many scenes, and vertices and bodies of all of them
+  // take(pointer, items), for so many vertices and bodies of all scenes
   template <class Take>
-  void parts(Take& take, int64_t scenes, int64_t vertices, int64_t units) {
-    take(displacement, 3 * vertices), take(coefficients, coarse::kDegree * vertices);
-    take(own, vertices), take(size, vertices), take(before, listed + lagged), take(after, listed + lagged);
-    take(body, (coarse::kDegree + 1) * units), take(change, 2 * units), take(motions, vertices), take(lead, units);
-    take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
-    take(state.failed, scenes), take(decided, units);
+  void parts(Take& take, int64_t vertices, int64_t units) {
+    take(displacement, 3 * vertices), take(coefficients, coarse::kDegree * vertices), take(slope, units);
   }
 };
 
-// The sides of a listed pair that may act within the trust regions, or of an active lagged one, are of one island.
-template <class Run, class T>
-DIFFVBD_FN void join(const RigidInputs<T>& in, int32_t* lead, int64_t pair, bool listed) {
-  const int32_t* record = (listed ? in.gate.listed.pairs : in.lagged.pairs) + kPairRow * pair;
-  if (listed && PairHints<T>(in.gate.constants + kConstants * pair).gap == std::numeric_limits<double>::infinity())
-    return;
-  if (!listed && !Lag<T>(in.lag + kLagScalars * pair).active()) return;
-  const int32_t a = moving_body(in, record[0]), b = moving_body(in, record[sides(record[4])]);
-  if (0 <= a && 0 <= b && a != b) Run::unite(lead, a, b);
-}
-
-template <class T>
-DIFFVBD_FN double value_of_pair(const RigidInputs<T>& in, int64_t pair, bool listed, bool moved) {
-  const CornerPoints<T> at{in, moved};
-  PairForce a;
-  const bool acts = listed ? barrier_force(in, pair, at, a) : lagged_force(in, pair, at, a);
-  return acts ? a.value : 0;
-}
-
-// The part of a vertex of the change by the displacement, a polynomial in s: inertia, and the tets that it is first in.
+// The part of a vertex of the change by the displacement, a polynomial in s: the tets that it is first in.
 template <class T>
 DIFFVBD_FN void coefficients_of(const CoarseInputs<T>& c, int64_t scene, int64_t v, const double* displacement,
                                 double* out) {
@@ -321,159 +249,76 @@ DIFFVBD_FN void coefficients_of(const CoarseInputs<T>& c, int64_t scene, int64_t
     for (int k = 0; k < 4; ++k) at[k] = b.position(c.tets[4 * tet + k]), to[k] = move(c.tets[4 * tet + k]);
     TetLaw::line(at, to, rest, material, sum);
   });
-  const Vector d = move(v);
   for (int i = 0; i < coarse::kDegree; ++i) out[i] = c.h2() * sum[i];
-  out[0] += b.mass(v) * dot(b.position(v) - b.target(v), d);
-  out[1] += 0.5 * b.mass(v) * dot(d, d);
 }
 
-// x_end [B, V, 3] after the fraction of -P a that each island takes; a solves for r [B, F, 3]. info [B]: not 0 where
-// the matrix was not positive definite.
-template <class T, class Run>
-void coarse_move(const Run& run, const CoarseInputs<T>& c, const double* a, const double* r, const int32_t* info,
-                 const TrialMemory<T>& m, T* x_end) {
-  const int64_t V = c.vertices(), n = c.in.bodies(), F = c.space.functions, rows = m.listed + m.lagged;
-  using Team = typename Run::Team;
-  constexpr int kSums = coarse::kDegree + 1;
-  AdvanceState<T> state = m.state;
-  state.motion = m.motions, state.first = false;
-  run.each(
-      c.scenes() * n, DIFFVBD_LAMBDA(int64_t unit) {
-        m.lead[unit] = static_cast<int32_t>(unit % n);
-        m.fraction[unit] = 0, m.decided[unit] = info[unit / n] != 0;
-        state.fraction[unit] = T(0), state.now[unit] = T(1), state.blocked[unit] = state.stamp[unit] = 0;
-      });
-  run.each(
-      c.scenes() * V,
-      DIFFVBD_LAMBDA(int64_t item) { put(m.displacement + 3 * item, -c.moved_by(a + item / V * 3 * F, item % V)); });
-  run.each(
-      c.scenes() * V, DIFFVBD_LAMBDA(int64_t item) {
-        coefficients_of(c, item / V, item % V, m.displacement, m.coefficients + item * coarse::kDegree);
-      });
-  run.teams(
-      c.scenes(), DIFFVBD_LAMBDA(int64_t scene, const Team& team) {
-        for (int list = 0; list < 2; ++list) {
-          const bool listed = list == 0;
-          const int64_t first = listed ? c.in.first_listed(scene) : c.in.first_lagged(scene),
-                        end = listed ? c.in.first_listed(scene + 1) : c.in.first_lagged(scene + 1);
-          team.each(static_cast<int32_t>(end - first),
-                    [&](int32_t i) { join<Run>(c.in, m.lead + scene * n, first + i, listed); });
-        }
-      });
-  run.each(
-      rows, DIFFVBD_LAMBDA(int64_t row) {
-        const bool listed = row < m.listed;
-        const int64_t pair = listed ? row : row - m.listed;
-        if (pair < (listed ? c.in.first_listed(c.scenes()) : c.in.first_lagged(c.scenes()))) {
-          m.before[row] = value_of_pair(c.in, pair, listed, false);
-        }
-      });
-  run.teams(
-      c.scenes() * n, DIFFVBD_LAMBDA(int64_t unit, const Team& team) {
-        const int64_t scene = unit / n;
-        const Body<T> b{c.in.scene, scene, static_cast<int32_t>(unit % n)};
-        double sum[kSums], slope[1];
-        team.template sum<kSums>(b.size(), sum, [&](int32_t i, double* to) {
-          const double* own = m.coefficients + (scene * V + b.vertex(i)) * coarse::kDegree;
-          for (int k = 0; k < coarse::kDegree; ++k) to[k] += own[k];
-        });
-        const int32_t first = c.space.body_ptr[b.body], count = c.space.body_ptr[b.body + 1] - first;
-        team.template sum<1>(count, slope, [&](int32_t i, double* to) {
-          const int64_t at = 3 * (scene * F + c.space.body_function[first + i]);
-          to[0] -= dot(wide_at(a + at), wide_at(r + at));
-        });
-        if (!team.leads()) return;
-        m.lead[unit] = Run::root_of(m.lead + scene * n, b.body);
-        for (int k = 0; k < coarse::kDegree; ++k) m.body[unit * kSums + k] = sum[k];
-        m.body[unit * kSums + coarse::kDegree] = slope[0];
-      });
-  for (int trial = 0; trial < kFractions; ++trial) {
-    const double s = fraction_of(trial);
-    run.each(
-        c.scenes() * V, DIFFVBD_LAMBDA(int64_t item) {
-          const int64_t scene = item / V;
-          const auto v = static_cast<int32_t>(item % V);
-          const Body<T> b = c.body_of(scene, v);
-          const int64_t unit = scene * n + b.body;
-          if (m.decided[unit]) return;
-          const Vector d = s * wide_at(m.displacement + 3 * item);
-          put(m.move + 3 * item, d);
-          m.motions[item] = motion_of(c.in.gate, state, scene, v);
-          m.own[item] = m.size[item] = 0;
-          if (c.in.gate.pinned[v]) return;
-          m.own[item] = change_of_vertex(c.in, b, v, d, m.size[item]);
-          stay(c.in.gate, state, scene, v, 0);
-        });
-    run.each(
-        rows, DIFFVBD_LAMBDA(int64_t row) {
-          const bool listed = row < m.listed;
-          const int64_t pair = listed ? row : row - m.listed;
-          if (pair >= (listed ? c.in.first_listed(c.scenes()) : c.in.first_lagged(c.scenes()))) return;
-          const int32_t* record = (listed ? c.in.gate.listed.pairs : c.in.lagged.pairs) + kPairRow * pair;
-          const int32_t owner = owner_of(c.in, record);
-          if (owner < 0 || m.decided[record[5] * n + owner]) return;
-          m.after[row] = value_of_pair(c.in, pair, listed, true);
-          if (listed) test_pair(c.in.gate, state, pair, 0);
-        });
-    run.teams(
-        c.scenes() * n, DIFFVBD_LAMBDA(int64_t unit, const Team& team) {
-          if (m.decided[unit]) return;
-          const int64_t scene = unit / n;
-          const Body<T> b{c.in.scene, scene, static_cast<int32_t>(unit % n)};
-          double sum[2];
-          team.template sum<2>(b.size(), sum, [&](int32_t i, double* to) {
-            const int32_t v = b.vertex(i);
-            to[0] += m.own[scene * V + v], to[1] += m.size[scene * V + v];
-            // the pairs that it is the first vertex of
-            const auto add = [&](const PairList& list, int64_t first) {
-              const PairList::Entries all = list.of(scene * c.in.gate.corners + v);
-              for (int e = 0; e < all.count; ++e) {
-                const int64_t pair = all.first[e] >> 2, row = first + pair;
-                const int32_t* record = list.pairs + kPairRow * pair;
-                const int at = all.first[e] & 3;
-                if (at != (0 <= moving_body(c.in, record[0]) ? 0 : sides(record[4]))) continue;
-                to[0] += m.after[row] - m.before[row], to[1] += absolute(m.after[row]) + absolute(m.before[row]);
-              }
-            };
-            if (m.listed > 0) add(c.in.gate.listed, 0);
-            if (m.lagged > 0) add(c.in.lagged, m.listed);
-          });
-          if (team.leads()) m.change[2 * unit] = sum[0], m.change[2 * unit + 1] = sum[1];
-        });
-    run.each(
-        c.scenes() * n, DIFFVBD_LAMBDA(int64_t unit) {
-          const int64_t first = unit / n * n;
-          if (m.decided[unit] || m.lead[unit] != unit - first) return;
-          double increase = 0, size = 0, slope = 0;
-          bool fits = true;
-          for (int64_t k = first; k < first + n; ++k) {
-            if (m.lead[k] != unit - first) continue;
-            coarse::Change change;
-            for (int i = 0; i < coarse::kDegree; ++i) change.c[i] = m.body[k * kSums + i];
-            increase += change.at(s) + m.change[2 * k], size += change.size(s) + m.change[2 * k + 1];
-            slope += m.body[k * kSums + coarse::kDegree];
-            fits = fits && !state.blocked[k];
-            state.blocked[k] = 0;
-          }
-          const double slack = kRounding * double(std::numeric_limits<T>::epsilon()) * size;
-          const bool good = fits && slope <= 0 && increase <= coarse::kDecrease * s * slope + slack;
-          for (int64_t k = first; (good || !(slope <= 0)) && k < first + n; ++k) {
-            if (m.lead[k] == unit - first) m.fraction[k] = good ? s : 0, m.decided[k] = 1;
-          }
-        });
-    if (run.is_done(m.decided, c.scenes() * n)) break;
+template <class T>
+struct CoarseStep : TrialStep<T> {
+  CoarseInputs<T> c;
+  CoarseMemory own;
+  const double *a, *r;  // [B, F, 3]
+  const int32_t* info;  // [B]
+
+  DIFFVBD_FN Vector displacement(const Body<T>& b, int32_t v, double fraction) const {
+    return fraction * wide_at(own.displacement + 3 * b.row(v));
   }
-  run.each(
-      c.scenes() * V, DIFFVBD_LAMBDA(int64_t item) {
-        const int64_t scene = item / V, v = item % V;
-        const double s = m.fraction[scene * n + c.in.gate.body[v]];
-        const Vector x = c.body_of(scene, v).position(v);
-        if (s > 0) {  // a displacement that was refused may be no number
-          put(x_end + 3 * item, x + s * wide_at(m.displacement + 3 * item));
-        } else {
-          put(x_end + 3 * item, x);
-        }
-      });
+  DIFFVBD_FN double smooth_change(const Body<T>& b, int32_t v, double fraction, double& size) const {
+    coarse::Change change{};
+    for (int k = 0; k < coarse::kDegree; ++k) change.c[k] = own.coefficients[coarse::kDegree * b.row(v) + k];
+    size += change.size(fraction);
+    return change.at(fraction);
+  }
+  DIFFVBD_FN double length(const Body<T>& b, int32_t v) const {
+    const Vector d = displacement(b, v, 1);
+    return square_root(dot(d, d));
+  }
+  DIFFVBD_FN double slope(int64_t unit) const { return own.slope[unit]; }
+};
+
+struct BeginTrials {  // each scene
+  template <class T>
+  DIFFVBD_FN void operator()(const CoarseStep<T>& s, int64_t scene, int64_t) const {
+    s.m.active[scene] = s.info[scene] == 0;
+  }
+};
+struct Displace {  // each vertex
+  template <class T>
+  DIFFVBD_FN void operator()(const CoarseStep<T>& s, int64_t scene, int64_t v) const {
+    const double* a = s.a + scene * s.c.size();
+    put(s.own.displacement + 3 * (scene * s.c.vertices() + v), -s.c.moved_by(a, v));
+  }
+};
+struct FindCoefficients {  // each vertex
+  template <class T>
+  DIFFVBD_FN void operator()(const CoarseStep<T>& s, int64_t scene, int64_t v) const {
+    double* to = s.own.coefficients + coarse::kDegree * (scene * s.c.vertices() + v);
+    coefficients_of(s.c, scene, v, s.own.displacement, to);
+  }
+};
+struct FindSlope {  // bodies
+  template <class T, class Team>
+  DIFFVBD_FN void operator()(const CoarseStep<T>& s, const Body<T>& b, const Team& team) const {
+    const CoarseSpace& space = s.c.space;
+    const int32_t first = space.body_ptr[b.body], count = space.body_ptr[b.body + 1] - first;
+    double sum[1];
+    team.template sum<1>(count, sum, [&](int32_t i, double* to) {
+      const int64_t at = b.scene * s.c.size() + 3 * space.body_function[first + i];
+      to[0] -= dot(wide_at(s.a + at), wide_at(s.r + at));
+    });
+    if (team.leads()) s.own.slope[s.unit(b.scene, b.body)] = sum[0];
+  }
+};
+
+// x_end after the fraction of -P a that each island takes; a solves for r. info: not 0 where the matrix was not
+// positive definite.
+template <class T, class Run>
+void coarse_move(const Run& run, const CoarseStep<T>& s) {
+  run.each(BeginTrials{}, s, 1);
+  run.rows(FindForce{}, s);
+  run.each(Displace{}, s, s.c.vertices());
+  run.each(FindCoefficients{}, s, s.c.vertices());
+  run.bodies(FindSlope{}, s);
+  try_fractions(run, s, kFractions, 1);
 }
 
 // --- the transpose. With l the solution for P' (adjoint of the displacement -P a), everything that g and H read gets

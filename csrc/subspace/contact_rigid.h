@@ -368,72 +368,11 @@ DIFFVBD_FN bool lagged_force(const RigidInputs<T>& in, int64_t pair, const At& a
   return true;
 }
 
-// --- trial fractions of the rigid motions: shortened until no body is blocked and the potential does not increase.
-// Bodies decide together with those that they may touch, and with no others.
-
-constexpr int kTrials = 3, kHalvings = 2;  // fractions 1, 1/4, 1/16 before 0
-constexpr double kRounded = 1e-6;          // of a length, that rounding cannot reach
-
 // The body that a pair counts for: the first of those that it moves with, or -1.
 template <class T>
 DIFFVBD_FN int32_t owner_of(const RigidInputs<T>& in, const int32_t* record) {
   const int32_t first = moving_body(in, record[0]);
   return 0 <= first ? first : moving_body(in, record[sides(record[4])]);
-}
-
-// Bounds for any fraction of the motion of a vertex's body: its displacement since gaps were taken, and the size of its
-// position, the scale of rounding.
-struct Farthest {
-  double displacement, size;
-};
-template <class T>
-DIFFVBD_FN Farthest farthest_of(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const double* center,
-                                const double* motion) {
-  const Vector x = b.position(v), arm = x - wide_at(center);
-  const Vector since = x - wide_at(in.gate.center + 3 * b.row(v));
-  const Vector turn = wide_at(motion), shift = wide_at(motion + 3);
-  const auto length = [](const Vector& a) { return square_root(dot(a, a)); };
-  const Vec3<T> at = vector_at(in.gate.x + 3 * b.row(v));
-  const Vec3<T> from = in.gate.origin ? vector_at(in.gate.origin + 3 * b.row(v)) : zero3<T>();
-  const double displacement = length(since) + length(shift) + length(turn) * length(arm);
-  return {(1 + kRounded) * displacement, size_of(at + from)};
-}
-
-// Whether a listed pair may come within reach of its barrier for any fractions: a gap shrinks by no more than its sides
-// have moved. reach [bodies, 2]: the largest displacement and size of their vertices.
-template <class T>
-DIFFVBD_FN bool may_touch(const RigidInputs<T>& in, int64_t pair, const double* reach) {
-  if (!is_between(in, pair)) return false;
-  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
-  const T* constants = in.gate.constants + kConstants * pair;
-  const int32_t a = in.gate.body[record[0]], b = in.gate.body[record[sides(record[4])]];
-  if (a >= in.bodies() || b >= in.bodies()) return true;  // its gap may be older
-  const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
-  const T size = static_cast<T>(larger(reach[2 * a + 1], reach[2 * b + 1]));
-  return !(reach[2 * a] + reach[2 * b] < (1 - kRounded) * (gap - guard_of_size(size)));  // as stays_far()
-}
-
-// The result of the trials, of each body [B, bodies].
-template <class T>
-struct RigidOutcome {
-  double* fraction;  // of its motion
-  bool* moved;       // whether it has a motion
-  // whether it was blocked, in a scene in which some blocked bodies have moved: others may move on now
-  bool* blocked;
-  bool* alone;  // whether it is solved for alone, since too many touch
-  T* left;      // the rest of its shift [m]
-};
-// Ends the trials of a body; returns whether it was blocked after a part of its motion.
-template <class T>
-DIFFVBD_FN bool finish_trials(const double* motions, int64_t unit, const RigidOutcome<T>& out) {
-  const double* motion = motions + kUnknowns * unit;
-  bool moved = false;
-  for (int i = 0; i < kUnknowns; ++i) moved = moved || motion[i] != 0;
-  const double fraction = out.fraction[unit];
-  const Vector shift = wide_at(motion + 3);
-  out.moved[unit] = moved, out.blocked[unit] = moved && fraction < 1;
-  out.left[unit] = T((1 - fraction) * square_root(dot(shift, shift)));
-  return out.blocked[unit] && 0 < fraction;
 }
 
 }  // namespace diffvbd::contact
