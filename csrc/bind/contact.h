@@ -4,6 +4,7 @@
 #include "../contact/friction.h"
 #include "../contact/islands.h"
 #include "../contact/passes.h"
+#include "../core/parts.h"
 #include "backend.h"
 
 namespace diffvbd {
@@ -19,6 +20,17 @@ inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const
 template <class T>
 const T* pair_constants(const Tensor& constants, const Tensor& pairs, const Tensor& x) {
   return array<T>("constants", constants, x, x.scalar_type(), pairs.size(0) * contact::kConstants);
+}
+
+// Memory for what parts(take) takes; lives as long as the result.
+template <class F>
+Tensor workspace(const Device& device, const F& parts) {
+  Parts<> sizes(nullptr);
+  parts(sizes);
+  const Tensor out = device.empty({static_cast<int64_t>(sizes.bytes)}, ScalarType::Byte);
+  Parts<> places(out.data_ptr());
+  parts(places);
+  return out;
 }
 
 // Planes of a floor [1 | B, 7 planes]; none where it is empty.

@@ -1,45 +1,66 @@
-// Operators of the start of a substep with contact: islands, step fractions; lagged quantities of the
-// start of the step; and lists of pairs.
-#include "../contact/advance.h"
-#include "../contact/islands.h"
+// Operators of the start of a substep with contact; lagged quantities of the start of the step; and lists of pairs.
+#include "../contact/start.h"
+
 #include "../contact/pair_list.h"
 #include "contact.h"
 
 namespace diffvbd {
 namespace {
 
-// Step fraction of each vertex at the start [scenes, vertices], see contact/advance.h; infeasible: how many pairs a
-// prescribed motion brings too close. center: positions at which gaps were taken, less u. unit [vertices]: the vertex
-// whose fraction each has.
-DIFFVBD_OPERATOR(Out<2>, contact_advance, In x, In move, In u, In center, In origin, In collider, In collider_next,
-                 In pinned, In body, In unit, In pairs, In constants, In ptr, In entry, bool careful) {
+// The start of a substep (contact/start.h): x [scenes, vertices, 3]; center of each vertex's trust region, and of its
+// deformation, or empty; trust-region radius, deformation radius or empty, and step fraction [scenes, vertices];
+// whether its displacement was truncated; and how many pairs a prescribed motion brings too close. rigid: the rigid
+// motion of each body as a displacement [scenes, vertices, 3], or empty without deformation radii. trust_radius,
+// deformation_radius [scenes, bodies + 1]. closed: fraction of a gap to a floor that a displacement may close.
+DIFFVBD_OPERATOR(Out<8>, contact_start, In x, In move, In u, In rigid, In trust_radius, In deformation_radius, In floor,
+                 In origin, In collider, In collider_next, In pinned, In body, In unit, In pairs, In constants, In ptr,
+                 In entry, double closed) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     const int64_t b = read.b, v = read.v, corners = v + read.colliders(collider);
-    require(u.dim() == 3, "diffvbd::contact_advance: expected u [scenes, bodies, 3]");
-    contact::AdvanceInputs<T> in{};
-    in.x = read.positions(), in.move = read.vectors("move", move), in.u = read.like("u", u, 3 * b * u.size(1));
-    in.center = read.vectors("center", center), in.origin = read.vectors_or_null("origin", origin);
-    in.collider = read.like("collider", collider, 3 * b * (corners - v));
-    in.collider_next = read.like("collider_next", collider_next, 3 * b * (corners - v));
-    in.pinned = read.flags("pinned", pinned, corners), in.body = read.index("body", body, corners);
-    in.unit_of = read.index("unit", unit, v);
-    in.listed = pair_list(pairs, ptr, entry, x, b * corners);
-    in.constants = pair_constants<T>(constants, pairs, x);
-    in.scenes = b;
-    in.vertices = static_cast<int32_t>(v), in.corners = static_cast<int32_t>(corners);
-    in.bodies = static_cast<int32_t>(u.size(1));
-    in.units_of_scene = in.vertices, in.careful = careful;
-    Tensor fraction = device.empty({b, v}), infeasible = device.empty({1}, ScalarType::Long);
+    require(u.dim() == 3, "diffvbd::contact_start: expected u [scenes, bodies, 3]");
+    const int64_t bodies = u.size(1);
+    contact::StartStep<T> s{};
+    contact::AdvanceInputs<T>& gate = s.in.gate;
+    gate.x = gate.center = read.positions(), gate.u = read.like("u", u, 3 * b * bodies);
+    gate.origin = read.vectors_or_null("origin", origin);
+    gate.collider = read.like("collider", collider, 3 * b * (corners - v));
+    gate.collider_next = read.like("collider_next", collider_next, 3 * b * (corners - v));
+    gate.pinned = read.flags("pinned", pinned, corners), gate.body = read.index("body", body, corners);
+    gate.unit_of = read.index("unit", unit, v);
+    gate.listed = pair_list(pairs, ptr, entry, x, b * corners);
+    gate.constants = pair_constants<T>(constants, pairs, x);
+    gate.scenes = b;
+    gate.vertices = static_cast<int32_t>(v), gate.corners = static_cast<int32_t>(corners);
+    gate.bodies = static_cast<int32_t>(bodies);
+    gate.units_of_scene = gate.vertices, gate.careful = true;
+    s.in.move = read.vectors("move", move), s.in.rigid = read.vectors_or_null("rigid", rigid);
+    s.in.trust_radius = read.like("trust_radius", trust_radius, b * (bodies + 1));
+    const bool own = s.in.rigid != nullptr;
+    if (own) s.in.deformation_radius = read.like("deformation_radius", deformation_radius, b * (bodies + 1));
+    s.in.floor = floor_of(read, floor), s.in.floor_planes = planes_of(floor), s.in.closed = static_cast<T>(closed);
+    const Tensor memory = workspace(device, [&](auto& take) { s.m.parts(take, b * v); });
+    gate.move = s.m.wanted;
+    const Tensor start = device.like_x(), center = device.like_x(), own_center = device.empty({own ? b : 0, v, 3}),
+                 radius = device.empty({b, v}), own_radius = device.empty({own ? b : 0, v}),
+                 fraction = device.empty({b, v}), truncated = device.empty({b, v}, ScalarType::Bool),
+                 infeasible = device.empty({1}, ScalarType::Long);
+    s.out = {data<T>(start),
+             data<T>(center),
+             data<T>(radius),
+             data_or_null<T>(own_radius),
+             data<T>(fraction),
+             data<bool>(truncated),
+             data_or_null<T>(own_center)};
 #ifdef USE_CUDA
-    const Tensor work = device.bytes(cuda::advance_workspace_bytes<T>(in, pairs.size(0)));
-    DIFFVBD_RUN(device, advance<T>, in, pairs.size(0), data<T>(fraction), data<int64_t>(infeasible), work.data_ptr(),
+    const Tensor work = device.bytes(cuda::advance_workspace_bytes<T>(gate, pairs.size(0)));
+    DIFFVBD_RUN(device, start_substep<T>, s, pairs.size(0), data<int64_t>(infeasible), work.data_ptr(),
                 device.attribute(cudaDevAttrMultiProcessorCount));
 #else
-    *data<int64_t>(infeasible) = advance<T>(in, data<T>(fraction));
+    *data<int64_t>(infeasible) = start_substep<T>(s);
 #endif
-    return Out<2>(fraction, infeasible);
+    return Out<8>(start, center, own_center, radius, own_radius, fraction, truncated, infeasible);
   });
 }
 

@@ -1,7 +1,6 @@
 // Bodies that touch, as the operators of their corrections take them.
 #pragma once
 
-#include "../core/parts.h"
 #include "../subspace/rigid_step.h"
 #include "body.h"
 #include "contact.h"
@@ -49,17 +48,6 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
 }
 
 inline int64_t lagged_pairs(const TouchingFields& f) { return f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0; }
-
-// Memory for what parts(take) takes; lives as long as the result.
-template <class F>
-Tensor workspace(const Device& device, const F& parts) {
-  Parts<> sizes(nullptr);
-  parts(sizes);
-  const Tensor out = device.empty({static_cast<int64_t>(sizes.bytes)}, ScalarType::Byte);
-  Parts<> places(out.data_ptr());
-  parts(places);
-  return out;
-}
 
 // Memory of a correction and, if it makes them, of its trials. more(take, scenes, vertices, bodies): what else it
 // takes, vertices and bodies of all scenes.

@@ -40,8 +40,7 @@ int64_t count(int64_t n, int64_t grain, const F& f) {
   return total;
 }
 
-}  // namespace
-
+// fraction of each unit
 template <class T>
 int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
   const int64_t rows = in.scenes * in.vertices, units = in.units();
@@ -128,6 +127,17 @@ int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
   return infeasible;
 }
 
+}  // namespace
+
+template <class T>
+int64_t start_substep(const StartStep<T>& s) {
+  const auto each = [&](const auto& phase) { for_each(s.items(), [&](int64_t row) { phase(s, row); }, kPairGrain); };
+  each(ClearUnit{}), each(LimitStart{}), each(WantStart{});
+  const int64_t infeasible = advance(s.in.gate, s.m.passed);
+  each(EndStart{});
+  return infeasible;
+}
+
 template <class T>
 void refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants) {
   for_each(pairs, [&](int64_t i) { refresh_gap(in, i, constants + kConstants * i); }, kPairGrain);
@@ -135,7 +145,7 @@ void refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants) {
 
 template void refresh_gaps<float>(const GapInputs<float>&, int64_t, float*);
 template void refresh_gaps<double>(const GapInputs<double>&, int64_t, double*);
-template int64_t advance<float>(const AdvanceInputs<float>&, float*);
-template int64_t advance<double>(const AdvanceInputs<double>&, double*);
+template int64_t start_substep<float>(const StartStep<float>&);
+template int64_t start_substep<double>(const StartStep<double>&);
 
 }  // namespace diffvbd

@@ -1,14 +1,14 @@
-// Step fractions at the start of the sweeps (contact/advance.h), and gaps refreshed (contact/pair_list.h), on the CPU.
+// The start of the sweeps (contact/start.h), and gaps refreshed (contact/pair_list.h), on the CPU.
 #pragma once
 
-#include "../contact/advance.h"
 #include "../contact/pair_list.h"
+#include "../contact/start.h"
 
 namespace diffvbd {
 
-// fraction of each unit; returns the number of pairs that make the prescribed motion infeasible
+// returns the number of pairs that make the prescribed motion infeasible
 template <class T>
-int64_t advance(const contact::AdvanceInputs<T>& in, T* fraction);
+int64_t start_substep(const contact::StartStep<T>& s);
 
 // constants [pairs, 8]
 template <class T>

@@ -207,6 +207,12 @@ __global__ void __launch_bounds__(kThreads, 2)
   advance_scenes(SceneTeam{cluster, answers}, in, s, motions, {scene, scene + 1}, pairs, infeasible);
 }
 
+template <class Phase, class T>
+__global__ void __launch_bounds__(kThreads) start_kernel(Phase phase, const __grid_constant__ StartStep<T> s) {
+  const int64_t row = own_item(kThreads);
+  if (row < s.items()) phase(s, row);
+}
+
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     refresh_kernel(const __grid_constant__ GapInputs<T> in, int64_t pairs, T* constants) {
@@ -233,13 +239,6 @@ struct AdvanceWork {
     bytes = static_cast<int64_t>(take.bytes);
   }
 };
-
-}  // namespace
-
-template <class T>
-int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
-  return AdvanceWork<T>(in, capacity, has_block_each(in.vertices, in.scenes, capacity), nullptr).bytes;
-}
 
 template <class T>
 cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* fraction, int64_t* infeasible, void* workspace,
@@ -271,6 +270,27 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* fraction, i
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 
+}  // namespace
+
+template <class T>
+int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
+  return AdvanceWork<T>(in, capacity, has_block_each(in.vertices, in.scenes, capacity), nullptr).bytes;
+}
+
+template <class T>
+cudaError_t start_substep(const StartStep<T>& s, int64_t capacity, int64_t* infeasible, void* workspace,
+                          int multiprocessors, cudaStream_t stream) {
+  const auto each = [&](const auto& phase) {
+    if (s.items() > 0) start_kernel<<<blocks_for(s.items(), kThreads), kThreads, 0, stream>>>(phase, s);
+  };
+  each(ClearUnit{}), each(LimitStart{}), each(WantStart{});
+  if (auto error = advance(s.in.gate, capacity, s.m.passed, infeasible, workspace, multiprocessors, stream)) {
+    return error;
+  }
+  each(EndStart{});
+  return cudaGetLastError();
+}
+
 template <class T>
 cudaError_t refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
   if (pairs == 0) return cudaSuccess;
@@ -281,6 +301,6 @@ cudaError_t refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants, cu
 
 DIFFVBD_INSTANTIATE(refresh_gaps)
 DIFFVBD_INSTANTIATE(advance_workspace_bytes)
-DIFFVBD_INSTANTIATE(advance)
+DIFFVBD_INSTANTIATE(start_substep)
 
 }  // namespace diffvbd::cuda

@@ -5,7 +5,6 @@
 
 #include <cstddef>
 
-#include "../contact/advance.h"
 #include "../contact/detection.h"
 #include "../contact/friction.h"
 #include "../contact/intersect.h"
@@ -13,6 +12,7 @@
 #include "../contact/motion.h"
 #include "../contact/pair_list.h"
 #include "../contact/passes.h"
+#include "../contact/start.h"
 #include "../contact/trust_region.h"
 
 namespace diffvbd::cuda {
@@ -64,10 +64,10 @@ cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, vo
 template <class T>
 int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in, int64_t capacity);
 
-// share, infeasible [1] as on the CPU. capacity: of the list of pairs.
+// infeasible [1] as on the CPU. capacity: of the list of pairs.
 template <class T>
-cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* infeasible,
-                    void* workspace, int multiprocessors, cudaStream_t stream);
+cudaError_t start_substep(const contact::StartStep<T>& s, int64_t capacity, int64_t* infeasible, void* workspace,
+                          int multiprocessors, cudaStream_t stream);
 
 // constants [pairs, 8] (contact/pair_list.h).
 template <class T>

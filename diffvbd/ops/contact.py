@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .._common.constants import FILTER_ETA
 from .._common.context import is_captured
 from ..energies import VERTEX_ENERGIES
 from .autograd import Bars, Differentiable, sum_to
@@ -206,22 +207,37 @@ def sweep_radii(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, gravity_m
 # --- the start of a substep -------------------------------------------------------------------------------------------
 
 
-def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
-            pinned: Tensor, body: Tensor, unit: Tensor, listed: Sequence[Tensor], careful: bool = True
-            ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Step fraction 1, 1/2, ... or 0 of ``move - u`` of each vertex, all moving at once [B, V]; number of pairs that
-    make the prescribed motion infeasible, int64 [1]. Not differentiable.
+class SubstepStart(NamedTuple):
+    """Start of the sweeps of a substep; all but x is index data."""
+
+    x: Tensor  # [B, V, 3] [m]
+    center: Tensor  # [B, V, 3]  center of the trust region of each vertex [m]
+    own_center: Tensor  # [B, V, 3]  center of the deformation; empty where bodies have no pairs of their own
+    trust_radius: Tensor  # [B, V] [m]
+    own_radius: Tensor  # [B, V]  of the deformation [m], or empty
+    fractions: Tensor  # [B, V]  fraction of its displacement that each vertex went
+    truncated: Tensor  # [B, V] bool: pairs or radii have truncated the displacement
+    infeasible: Tensor  # [1] int64: pairs that hinder what is prescribed
+
+
+def start_substep(x: Tensor, move: Tensor, u: Tensor, rigid: Tensor, trust_radius: Tensor, deformation_radius: Tensor,
+                  floor: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, pinned: Tensor, body: Tensor,
+                  unit: Tensor, listed: Sequence[Tensor]) -> SubstepStart:  # fmt: skip
+    """``x + u + f (move - u)``, differentiable in x and move. The fraction f is the largest of 1, 1/2, ..., 1/64 and 0
+    that keeps radii and gaps to floors, and of that what keeps pairs: one for each free body, one for each vertex of a
+    body that is pinned.
 
     Args:
-        x, move: [B, V, 3], state and wanted displacement [m].  u: Translation of each body's island [B, bodies, 3] [m].
-        center: [B, V, 3], where the gaps of the pairs were taken, less u [m].
+        x, move: [B, V, 3], state and wanted displacement [m].  u: Translation of each body's island [B, NB, 3] [m].
+        rigid: Rigid motion of each body, a displacement [B, V, 3] [m]; empty where bodies have no pairs of their own.
+        trust_radius, deformation_radius: As of :func:`contact_trust_radii`.
+        floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
+        collider, collider_next: [B, Vc, 3] [m], before and during the sweeps.
         unit: [V] int32, the vertex whose fraction each vertex has.
-        listed: pairs, constants, ptr, entry of :func:`contact_detect`.
-        careful: Whether the motion does not minimise the barrier.
+        listed: pairs, constants, ptr, entry of :func:`contact_detect`, gaps taken at x.
     """
-    found, infeasible = raw.contact_advance(x, move, u, center, origin, collider, collider_next, pinned, body, unit,
-                                            *listed, careful)  # fmt: skip
-    return found[:, unit], infeasible
+    return SubstepStart(*_start(x.contiguous(), move.contiguous(), u, rigid, trust_radius, deformation_radius, floor,
+                                origin, collider, collider_next, pinned, body, unit, *listed))  # fmt: skip
 
 
 def refresh_gaps(x: Tensor, origin: Tensor, collider: Tensor, trust_radius: Tensor, pairs: Tensor, constants: Tensor,
@@ -377,6 +393,20 @@ def _lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[
     bar = torch.cat([own[:, None], by_state[:, 1:]], 1)
     points, by_kappa = raw.contact_lag_backward(bar, x, origin, collider, kappa, *rest)
     return *_split(points, x), by_kappa
+
+
+def _start_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
+    (bar, *_), (*_, fraction, pinned) = bars, saved
+    assert bar is not None
+    went = torch.where(pinned[: fraction.shape[1]], 1.0, fraction)
+    return bar, went[..., None] * bar
+
+
+# Of the arguments of start_substep(); what is saved first has the shapes of x and move.
+_start = Differentiable(
+    lambda *args: raw.contact_start(*args, FILTER_ETA), _start_reverse, arguments=17, inputs=2,
+    saved=lambda inputs, made: (inputs[0], inputs[0], made[5], inputs[10]), rest=lambda inputs: (),
+)  # fmt: skip
 
 
 # Of each pair: activity, normal and weights in [pairs, 9], whose first column is not differentiable; the normal force

@@ -18,7 +18,6 @@ from .._common.context import MorePairs, checking, in_segment, is_captured, not_
 from .._contact import detection as search
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
-from .._contact.start import SubstepStart, start_above, start_between
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
 from ..adjoint.contact import Pairs, floor_coefficients, friction_lag, no_pairs, some_of
 from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
@@ -30,7 +29,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
 from ..ops.autograd import no_transforms
-from ..ops.contact import TrustRadii, contact_trust_radii, sweep_radii
+from ..ops.contact import SubstepStart, TrustRadii, contact_trust_radii, start_substep, sweep_radii
 from ..ops.fields import DISPLACEMENTS
 from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
@@ -41,6 +40,7 @@ from .predict import Begun
 
 CLOSE = 1e-3  # of dhat: pairs with so much more gap do not push, however it is rounded
 MOST_CAPACITY = 2**26
+FAR = 1e15  # [m] trust-region radius without pairs
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
         "time_step or softer materials, or look with diffvbd.testing.debug_checks()")  # fmt: skip
 
@@ -59,6 +59,8 @@ class ContactStep:
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
+        self.none = begun.x_prev.new_empty((0,))
+        self.planes = self.none if self.floor_data is None else self.floor_data.detach()
         unchecked = prepared.settings.sweeps == 0 or begun.law is not None
         if unchecked and self._reads(self.x_prev):  # for what sweeps raise
             plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=(), sweeps=0)
@@ -175,15 +177,17 @@ class ContactStep:
                 self._check(r, records.counts[r].tolist(), records)
             if r == 0:
                 self._lag_friction(self._pushing(detection.listed), was)
-            start = start_between(x, move, was, now, self.floor_data, self.origin, detection, surface,
-                                  motion.displacements.rigid, barrier.self_contact)  # fmt: skip
+            rigid = motion.displacements.rigid if barrier.self_contact else self.none
+            start = start_substep(x, move, detection.u, rigid, detection.trust_radius, detection.deformation_radius,
+                                  self.planes, self.origin, was.detach(), now.detach(), surface.pinned, surface.body,
+                                  surface.unit, detection.listed)  # fmt: skip
             records.counts[r] = torch.cat([detection.counts[:3], start.infeasible])
             if self._reads(x):
                 self._check(r, records.counts[r].tolist(), records)
             begin = x
             x, taken, _ = corrected(self, start.x, now, start, detection.listed)
-            if start.own:
-                start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
+            if barrier.self_contact:
+                start = replaced(start, own_center=start.own_center + (x - start.x).detach())
             trust_radius = radii_of_sweeps(motion, surface, barrier, start, x, begin)
             near, kept = self._refreshed(detection.listed, x, now, trust_radius)
             swept_from = replaced(start, center=x.detach(), trust_radius=trust_radius)
@@ -250,10 +254,13 @@ class ContactStep:
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """The step with friction on a floor and without pairs: only the floor limits motion."""
         x, none = self.x_prev, no_pairs(self.x_prev, math.prod(self.x_prev.shape[:2]))
-        free, pinned, body = bodies_of(self.model)[2:]
-        body = body[: x.shape[1]].long()
-        start = start_above(x, self.begun.y - x - broadcast(self.begun.h2a, x.shape), self.floor_data, self.origin,
-                            pinned, units(body, ~free))  # fmt: skip
+        free, pinned, labels = bodies_of(self.model)[2:]
+        body = labels[: x.shape[1]].long()
+        scenes, bodies = len(x), len(free)
+        far, nowhere = x.new_full((scenes, bodies + 1), FAR), x.new_zeros((scenes, bodies, 3))
+        start = start_substep(x, self.begun.y - x - broadcast(self.begun.h2a, x.shape), nowhere, self.none, far,
+                              far, self.planes, self.origin, self.before, self.colliders, pinned, labels,
+                              units(body, ~free), none)  # fmt: skip
         x = torch.where(free[body, None], start.x, self.begun.x_start)
         x = corrected(self, x, self.colliders, start, none).x
         if self.prepared.settings.sweeps:
@@ -293,7 +300,7 @@ class ContactStep:
     def _trust_radii(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> TrustRadii:
         assert self.surface is not None and self.barrier is not None
         return trust_radii(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now,
-                           self.floor_data)  # fmt: skip
+                           self.planes)  # fmt: skip
 
     @torch.no_grad()
     def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: TrustRadii) -> Detection:
@@ -648,15 +655,14 @@ LEAST_RADIUS = 1.0  # of dhat, added to it: a compressed barrier may push so far
 
 @torch.no_grad()
 def trust_radii(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
-                was: Tensor, now: Tensor, floor: Tensor | None) -> TrustRadii:  # fmt: skip
+                was: Tensor, now: Tensor, floor: Tensor) -> TrustRadii:  # fmt: skip
     """Trust-region radii of bodies until pairs are found again. Index data.
 
     Args:
         motion: Wanted displacements.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
-        was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or None.
+        was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or empty.
     """
     s, dhat = surface, barrier.dhat
-    floor = x.new_empty((0,)) if floor is None else floor.detach().contiguous()
     return contact_trust_radii(
         x.detach(), origin, mass.detach().contiguous(), motion.move, s.pinned, s.body_order,
         s.body_ptr, motion.displacements, floor, was.detach(), now.detach(), s.planes, s.body, s.radius,
@@ -675,12 +681,11 @@ def radii_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrie
         motion: Wanted displacements of the substep.  start: Its start, whose trust regions bound the sum.
         x, begin: Positions before the sweeps, and before the substep, [B, V, 3] [m].
     """
-    s, none = surface, x.new_empty((0,))
-    deformation_center, deformation_radius = start.own or (none, none)
+    s = surface
     x, led, begin = [t.detach().contiguous() for t in (x, start.x, begin)]
     return sweep_radii(
         x, led, begin, motion.move, motion.gravity_move, motion.apart, motion.stretched, start.center,
-        start.trust_radius, deformation_center, deformation_radius, s.pinned, s.body_order, s.body_ptr, RADIUS_FACTOR,
+        start.trust_radius, start.own_center, start.own_radius, s.pinned, s.body_order, s.body_ptr, RADIUS_FACTOR,
         LEAST_RADIUS * barrier.dhat,
     )  # fmt: skip
 

@@ -3,7 +3,7 @@ blocked bodies after the last sweeps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -11,10 +11,9 @@ from torch import Tensor
 
 from .. import ops
 from .._common.context import is_captured, replaced
-from .._contact.start import SubstepStart
 from ..adjoint.contact import Pairs, sum_of_scenes
 from ..model.system import System
-from ..ops.contact import Corrected, rigid_correct, rigid_reverse
+from ..ops.contact import SubstepStart, rigid_correct, rigid_reverse
 
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------
 
@@ -29,24 +28,14 @@ class Corrections(NamedTuple):
     back: Tensor  # translation that each did not take of its last motion [B, bodies] [m]
 
 
-# more(count, end): bool [B, bodies] of the bodies that the next correction moves, after `count` of them, or EVERY; END
-# ends them.
-EVERY, END = None, False
-More = Callable[[int, Corrected], Tensor | None | bool]
-
-
-def once(*_: Any) -> bool:
-    """Ends the corrections after the first."""
-    return END
-
-
-def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float,
-            more: More = once) -> Corrections:  # fmt: skip
-    """State after the rigid correction of every free body, by an admissible step fraction, and after those that
-    ``more`` adds. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
+def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float, least: int = 1,
+            most: int = 1) -> Corrections:  # fmt: skip
+    """State after rigid corrections of every free body, each by an admissible step fraction, and after those of blocked
+    bodies, or solved for alone, that follow until there are ``most``. friction_eps: [m], 0 without friction.
+    Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*[t.contiguous() for t in fields])
     kept = torch.is_grad_enabled() and any([t.requires_grad for t in fields])
-    x, back, *made = _correct(*fields, model, time_step, friction_eps, more, kept)
+    x, back, *made = _correct(*fields, model, time_step, friction_eps, least, most, kept)
     return Corrections(x, [fraction.to(x.dtype) for fraction in (made[::2] if kept else made)], back)
 
 
@@ -67,16 +56,19 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
-    fields, (model, time_step, friction_eps, more, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
-    made, count, back, moving = [], 0, fields.x, EVERY
-    while moving is not END:
-        if count and kept:
-            made.append(fields.x)
+    fields, (model, time_step, friction_eps, least, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
+    made, back, moving, captured = [], fields.x, None, is_captured(fields.x)
+    for count in range(1, most + 1):
         end = rigid_correct(fields, model._data_count, time_step, friction_eps, moving)
         made.append(end.fraction)
-        back = end.remaining if moving is EVERY else torch.where(end.moved, end.remaining, back)
-        count, fields = count + 1, replaced(fields, x=end.x)
-        moving = more(count, end)
+        back = end.remaining if moving is None else torch.where(end.moved, end.remaining, back)
+        fields = replaced(fields, x=end.x)
+        if count >= least:
+            moving = end.blocked | end.alone
+            if count == most or not (captured or bool(moving.any())):
+                break
+        if kept:
+            made.append(end.x)
     return fields.x, back, *made
 
 
@@ -92,10 +84,10 @@ def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequ
     return [own.get(name) for name in f._fields]
 
 
-# Fields; model, time_step, friction_eps, more, kept.
+# Fields; model, time_step, friction_eps, least, most, kept.
 _correct = ops.Differentiable(
-    _run, _reverse, arguments=_FIELDS + 5, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
-    rest=lambda inputs: inputs[_FIELDS:-2],
+    _run, _reverse, arguments=_FIELDS + 6, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
+    rest=lambda inputs: inputs[_FIELDS:-3],
 )  # fmt: skip
 
 
@@ -113,12 +105,12 @@ MOST_CORRECTIONS = 5
 BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
 
-def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, more: More = once
+def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, least: int = 1, most: int = 1
               ) -> Corrections:  # fmt: skip
-    """State after the rigid correction of all free bodies, and after those that ``more`` adds."""
+    """State after the rigid corrections of a step; least and most as of correct()."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
-    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, more)
+    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, least, most)
 
 
 def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs) -> ops.TouchingFields:
@@ -135,17 +127,9 @@ def corrected_after(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, l
                     ) -> Corrections:  # fmt: skip
     """State after the corrections that follow the sweeps of a substep. last: Whether these are the last sweeps."""
     # coarse sweeps leave a stiff body rotated; after one Newton step a free body still gained spin
-    least, captured = 1 if of.prepared.coarse is None else 2, is_captured(x)
-
-    def more(count: int, end: Corrected) -> Tensor | None | bool:
-        if count < least:
-            return EVERY
-        if not last or of.barrier is None or count >= MOST_CORRECTIONS:
-            return END
-        moving = end.blocked | end.alone
-        return moving if captured or bool(moving.any()) else END
-
-    return corrected(of, x, collider, start, listed, more)
+    least = 1 if of.prepared.coarse is None else 2
+    most = MOST_CORRECTIONS if last and of.barrier is not None else least
+    return corrected(of, x, collider, start, listed, least, most)
 
 
 def is_blocked(of: Any, x: Tensor, back: Tensor) -> Tensor:
