@@ -161,6 +161,7 @@ struct Launches : Sets {
   void bodies(const Phase& phase, const Step& s) const {
     const auto& in = s.inputs();
     const int64_t units = in.scene.scenes * in.bodies();
+    if (units == 0) return;
     small_bodies_kernel<<<blocks_for(32 * units, kItems), kItems, 0, stream>>>(phase, s);
     if (in.scene.vertices > kOfWarp) {
       large_bodies_kernel<<<static_cast<unsigned>(units), kThreads, 0, stream>>>(phase, s);
@@ -170,6 +171,7 @@ struct Launches : Sets {
   void groups(const Phase& phase, const Step& s) const {
     const auto& in = s.inputs();
     const int64_t units = in.scene.scenes * in.bodies();
+    if (units == 0) return;
     small_groups_kernel<<<blocks_for(32 * units, kItems), kItems, 0, stream>>>(phase, s);
     if (most_grouped(in.bodies()) > kFewBodies) {
       large_groups_kernel<<<static_cast<unsigned>(units), kThreads, 0, stream>>>(phase, s);
