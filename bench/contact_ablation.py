@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -35,24 +34,30 @@ def unchanged(*given: Any) -> Any:
 @contextmanager
 def start_with(**changes: Callable[..., Any]) -> Iterator[None]:
     """Arguments of the start of a substep replaced by functions of themselves and of all."""
-    work = contact.start_between
-    names = ("x", "move", "was", "now", "planes", "origin", "detection", "surface", "rigid", "own_pairs")
+    work = contact.start_substep
+    names = ("x", "move", "u", "rigid", "trust_radius", "deformation_radius", "floor", "origin", "collider",
+             "collider_next", "pinned", "body", "unit", "listed")  # fmt: skip
 
     def run(*values: Any) -> Any:
         given = dict(zip(names, values, strict=True))
         return work(**(given | {key: change(given[key], given) for key, change in changes.items()}))
 
-    with mock.patch.object(contact, "start_between", run):
+    with mock.patch.object(contact, "start_substep", run):
         yield
 
 
+def none(value: Any, given: dict[str, Any]) -> Any:
+    return 0 * value
+
+
 def at_rest(move: Any, given: dict[str, Any]) -> Any:
-    surface = given["surface"]
-    return torch.where(surface.pinned_bodies[surface.body[: move.shape[1]].long(), None], move, 0.0)
+    body, pinned = (given[name][: move.shape[1]] for name in ("body", "pinned"))
+    held = torch.isin(body, body[pinned])
+    return torch.where(held[:, None], move, 0.0)
 
 
-def each_vertex(surface: Any, given: dict[str, Any]) -> Any:
-    return replace(surface, unit=torch.arange(len(surface.unit), dtype=torch.int32, device=surface.unit.device))
+def each_vertex(unit: Any, given: dict[str, Any]) -> Any:
+    return torch.arange(len(unit), dtype=torch.int32, device=unit.device)
 
 
 @contextmanager
@@ -76,10 +81,9 @@ def with_gravity(of: Any, h2a: Any) -> Any:
 RULES: dict[str, Callable[[], Any]] = {
     "none: all rules": unchanged,
     "free bodies start by their inertia": lambda: start_with(
-        move=at_rest, rigid=lambda rigid, _: 0 * rigid,
-        detection=lambda detection, _: detection._replace(u=0 * detection.u)),
-    "one step fraction for a free body": lambda: start_with(surface=each_vertex),
-    "translation of islands": lambda: start_with(detection=lambda detection, _: detection._replace(u=0 * detection.u)),
+        move=at_rest, rigid=none, u=none),
+    "one step fraction for a free body": lambda: start_with(unit=each_vertex),
+    "translation of islands": lambda: start_with(u=none),
     "gravity at the start of pinned bodies": lambda: numbers(contact.ContactStep, _wanted=with_gravity),
     "pinned bodies at rest start without gravity": lambda: numbers(
         IncreaseInputs, increases_potential=lambda self, x, to: torch.zeros(x.shape[:2], dtype=torch.bool,

@@ -312,21 +312,20 @@ def risen(number: int, device: str) -> dict[str, float]:
 
         return mock.patch.object(owner, name, wrapped)
 
-    detect, start = step._detect, contact.start_between
+    detect, start = step._detect, contact.start_substep
 
     def detected(of: Any, *given: Any) -> Any:
         now["step"] = of
         return detect(of, *given)
 
-    def started(x: Tensor, move: Tensor, was: Tensor, at: Tensor, floor: Any, origin: Tensor, detection: Any,
-                *rest: Any) -> Any:  # fmt: skip
-        end = start(x, move, was, at, floor, origin, detection, *rest)
+    def started(x: Tensor, *given: Any) -> Any:
+        end = start(x, *given)
         note("start", x, end.x)
         return end
 
     with ExitStack() as patches, torch.no_grad():
         for patch in (mock.patch.object(step, "_detect", detected),
-                      mock.patch.object(contact, "start_between", started),
+                      mock.patch.object(contact, "start_substep", started),
                       watched(contact, "corrected", PARTS[1], lambda end: end.x),
                       watched(step, "_sweep", PARTS[2], lambda end: end[0]),
                       watched(contact.Corrections, "correct", PARTS[3], lambda end: end[0]),

@@ -16,7 +16,8 @@ DIFFVBD_FN R square_in(const Factor<R>& H, const Vec3<R>& d) {
   return first * first / H.inv1 + second * second / H.inv2 + d.z * d.z / H.inv3;
 }
 
-// The same for a law that is not quadratic in one vertex: the change of the vertex's whole potential, tet by tet.
+// The same for a law that is not quadratic in one vertex: the change of the vertex's whole potential, tet by tet; that
+// of pairs by their part of g and H.
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN R descending_fraction(const Block<R>& b, const Star& star, const StepParameters<T>& q, const Update<R>& u) {
   const Vec3<R> whole = u.alpha * u.step;
@@ -43,6 +44,11 @@ DIFFVBD_FN R descending_fraction(const Block<R>& b, const Star& star, const Step
         increase = increase + (after - before), terms = terms + absolute(before) + absolute(after);
       }
     });
+    if constexpr (Set::contact) {
+      const ContactTerm<R> pairs = star.contact(b);
+      const R down = dot(pairs.g, step), up = R(0.5) * dot(step, pairs.H * step);
+      increase = increase + (down + up), terms = terms + absolute(down) + absolute(up);
+    }
     const R rounding = R(kRounding * std::numeric_limits<T>::epsilon()) * terms;
     const R admitted = select(rounding < increase, R(0), s);
     out = select(R(0) < out, out, select(terms < R(std::numeric_limits<T>::max()), admitted, R(0)));

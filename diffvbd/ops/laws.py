@@ -23,7 +23,8 @@ from .autograd import Direct, direct
 from .load import extensions_folder, locked, sources
 
 # what reads the law; an object is of one scalar, DIFFVBD_SCALAR, which takes half the time
-_SOURCES = ("bind/body", "cpu/contact", "bind/sweep", "cpu/run", "cpu/coarse", "bind/mesh", "cpu/kernels")
+_SOURCES = ("bind/body", "cpu/contact", "bind/sweep", "cpu/run", "cpu/coarse", "bind/mesh", "cpu/kernels",
+            "bind/contact_coarse")
 _FLAGS = ("-std=c++20", "-g0", "-fPIC", "-w", "-fno-math-errno", "-fno-signed-zeros", "-ffp-contract=off",
           "-fvisibility=hidden", "-DDIFFVBD_NO_CLONES", "-DTORCH_TARGET_VERSION=0x020b000000000000")  # fmt: skip
 _libraries: list[Direct] = []

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
 from .couplings import Bounds, energies_of_sweeps
-from .energies import Law, StableNeoHookean, Viscosity, build_energies, floor_friction, rates
+from .energies import FloorFriction, Law, StableNeoHookean, Viscosity, build_energies, floor_friction, rates
 from .rigid import Correction
 from .scene import Layout, Scene, build_layout, build_scene, dot, put, solve6, take
 
@@ -433,12 +433,16 @@ def _descending(energies: list[Any], hessian: Tensor, raw: Tensor, update: Tenso
 @torch.no_grad()
 def _lowering(energies: list[Any], law: Law, k: int, mass: Tensor, y: Tensor, state: Tensor, x_prev: Tensor,
               update: Tensor) -> Tensor:  # fmt: skip
-    """The same for a law that is not quadratic in one vertex, from the whole potential of each vertex of color k."""
+    """The same for a law that is not quadratic in one vertex, from the whole potential of each vertex of color k; that
+    of pairs and of friction by their gradients and blocks."""
     vertices = law.scene.layout.colors[k].vertices
     x = take(state, vertices)
+    others = [e for e in energies if not isinstance(e, StableNeoHookean)]
+    contact = [e for e in others if isinstance(e, FloorFriction) or not hasattr(e, "terms")]
+    blocks = [e.block(k, state, x_prev).split((3, 6), -2) for e in contact]
 
     def of_vertices(at: Tensor) -> list[Tensor]:
-        parts = [e.terms(at, x_prev) for e in energies if not isinstance(e, StableNeoHookean)]
+        parts = [e.terms(at, x_prev) for e in others if e not in contact]
         return [at.new_zeros(*at.shape[:-2], at.shape[-1]).index_add(-1, vertex, terms)[..., vertices]
                 for terms, vertex in parts]  # fmt: skip
 
@@ -451,6 +455,9 @@ def _lowering(energies: list[Any], law: Law, k: int, mass: Tensor, y: Tensor, st
         increase, size = of_tets + slope + bend, size + slope.abs() + bend
         for one, two in zip(before, of_vertices(put(state, vertices, x + step)), strict=True):
             increase, size = increase + two - one, size + one.abs() + two.abs()
+        for gradient, hessian in blocks:
+            down, up = dot(gradient, step), _square(hessian, step) / 2
+            increase, size = increase + down + up, size + down.abs() + up.abs()
         found = found | (increase <= ROUNDING * torch.finfo(x.dtype).eps * size) & torch.isfinite(size)
         fraction = torch.where(found, fraction, fraction / 2)
     return torch.where(found, fraction, 0.0)

@@ -87,7 +87,8 @@ class Corrections:
         self.touching = [t.contiguous() for t in (*touching[:at], *self.space.bodies, *touching[at + 5 :])]
         rest = model.rest_scalars if fields.rest is None else fields.rest
         self.rest = [t.contiguous() for t in (fields.mu, fields.lam, rest, packed)]
-        self.constants = (self.space.functions, (model._data_count, numbers.time_step, numbers.friction_eps))
+        options = (model._data_count, numbers.time_step, numbers.friction_eps)
+        self.constants = (self.space.functions, options, ops.library_of(model.energy_mask))
 
     def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """x [B, V, 3] after a correction, and its length for each matrix [B, matrices]."""
@@ -107,24 +108,24 @@ def _solved(factor: Tensor, right: Tensor) -> Tensor:
 
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
-    fields, (*shape, packed), (index, options) = args[:_FIELDS], args[_FIELDS:_INPUTS], args[_INPUTS:]
+    fields, (*shape, packed), (index, options, library) = args[:_FIELDS], args[_FIELDS:_INPUTS], args[_INPUTS:]
     given = (*fields, *index, *shape)
-    r, matrix = ops.direct.contact_coarse_system(*given, packed, *options)
+    r, matrix = library.contact_coarse_system(*given, packed, *options)
     with one_thread(matrix):
         factor, info = torch.linalg.cholesky_ex(matrix)
     a = _solved(factor, r)
-    x, fraction = ops.direct.contact_coarse_move(*given, a, r, info, *options)
+    x, fraction = library.contact_coarse_move(*given, a, r, info, *options)
     return x, fraction, a, factor
 
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Tensor | None]:
     fields, (*shape, packed), (fraction, a, factor) = saved[:_FIELDS], saved[_FIELDS:_INPUTS], saved[_INPUTS:]
-    index, options = rest
+    index, options, library = rest
     given, f = (*fields, *index, *shape), ops.TouchingFields(*fields)
-    l = _solved(factor, ops.direct.contact_coarse_restrict(*given, bars[0], fraction, *options))  # noqa: E741
+    l = _solved(factor, library.contact_coarse_restrict(*given, bars[0], fraction, *options))  # noqa: E741
     data, (mu, lam, of_rest, of_packed) = needs[f._fields.index("energy_data")], needs[_FIELDS:]
     wants = [data, mu or lam, of_rest, of_packed]
-    *own, material, rest_bar, packed_bar = ops.direct.contact_coarse_reverse(*given, packed, a, l, fraction, bars[0],
+    *own, material, rest_bar, packed_bar = library.contact_coarse_reverse(*given, packed, a, l, fraction, bars[0],
                                                                          *options, wants)  # fmt: skip
     touching = adjoints_of(own, options[0], data)._asdict()
     by_kappa = touching.pop("by_kappa")
@@ -132,8 +133,8 @@ def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequ
     return [*(touching.get(name) for name in f._fields), *material.unbind(-1), rest_bar, packed_bar]
 
 
-# Fields, mu, lam, rest, packed; index, options.
+# Fields, mu, lam, rest, packed; index, options, library.
 _correct = ops.Differentiable(
-    _run, _reverse, arguments=_INPUTS + 2, inputs=_INPUTS,
+    _run, _reverse, arguments=_INPUTS + 3, inputs=_INPUTS,
     saved=lambda inputs, made: (*inputs[:_INPUTS], *made[1:]), rest=lambda inputs: inputs[_INPUTS:],
 )  # fmt: skip

@@ -5,8 +5,6 @@ One law with every invariant and function is compiled for all quick tests, once 
 """
 
 import math
-import os
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -14,6 +12,7 @@ import torch
 from helpers.coupled import coupled
 from helpers.coupled import inputs_of as inputs_of_coupled
 from helpers.executed import assert_executed, assert_like_differences, run_of
+from helpers.laws import STABLE, compiled_laws
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -25,23 +24,14 @@ from diffvbd.testing import evaluate, relative_error
 from diffvbd.testing.dense_statics import coupling_energy, residual, weight
 
 pytestmark = [needs_csrc, pytest.mark.slow]  # a law is compiled
+__all__ = ["compiled_laws"]
 F64 = torch.float64
 # stress-free at rest, with every invariant; not quadratic in one vertex
 TEXT = ("mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2 + c*(I2*J**(-4/3) - 3) + m*(trU - 3)**2"
         " + k/(2*s)*(exp(s*(I4 - 1)**2) - 1)")  # fmt: skip
 VALUES = {"mu": 4e4, "lam": 9e4, "c": 8e3, "m": 1e4, "k": 3e4, "s": 1.5}
-STABLE = "mu/2*(I1 - 3) - mu*(J - 1) + (mu + lam)/2*(J - 1)**2"
 MESH = dv.mesh.beam(3, 2, 2, size=(0.3, 0.2, 0.2))
 PINNED = MESH.points[:, 0] == 0.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    own = tmp_path_factory.getbasetemp()
-    shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own  # by the processes of the session
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCH_EXTENSIONS_DIR", str(shared / "laws"))
-        yield
 
 
 def law_of(text: str = TEXT) -> Any:
