@@ -110,6 +110,8 @@ cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups,
 }
 
 DIFFVBD_INSTANTIATE(begin)
+#ifndef DIFFVBD_LAW_HEADER  // the rest reads no law
 DIFFVBD_INSTANTIATE(begin_backward)
+#endif
 
 }  // namespace diffvbd::cuda

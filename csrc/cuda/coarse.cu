@@ -314,7 +314,7 @@ cudaError_t Corrections<T>::gradients(int wanted) const {
   constexpr int64_t kManyVertices = 16000;  // up to which a warp takes one vertex
   const bool reverse = wanted != kForward;
   const int64_t active = host.color_block[host.plan.colors];
-  const int least = s.scenes * active * kSlice > kManyVertices ? kFewLanes : kManyLanes;
+  const int least = !kOwnLaw && s.scenes * active * kSlice > kManyVertices ? kFewLanes : kManyLanes;
   int lanes = possible_lanes<T>(host, choice, least, reverse);
   if (lanes != kFewLanes && lanes != kSpillLanes) lanes = kManyLanes;
   const bool spills = lanes == kSpillLanes;
@@ -324,9 +324,11 @@ cudaError_t Corrections<T>::gradients(int wanted) const {
   const size_t shared = of_warp * warps;
   GradientKernel<T> kernel = gradient_kernel_of<T, kForward>(in.energies, lanes);
   if (reverse) {
-    kernel = wanted & kRest       ? gradient_kernel_of<T, kMaterial | kRest>(in.energies, lanes)
-             : wanted & kMaterial ? gradient_kernel_of<T, kMaterial>(in.energies, lanes)
-                                  : gradient_kernel_of<T, kState>(in.energies, lanes);
+    kernel = gradient_kernel_of<T, kMaterial | kRest>(in.energies, lanes);
+    if constexpr (!kOwnLaw) {
+      if (!(wanted & kRest)) kernel = gradient_kernel_of<T, kMaterial>(in.energies, lanes);
+      if (!(wanted & kMaterial)) kernel = gradient_kernel_of<T, kState>(in.energies, lanes);
+    }
   }
   if (shared > 48 * 1024) {
     const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
@@ -382,7 +384,11 @@ cudaError_t Corrections<T>::matrix_bars() const {
   return launch(sum_products<T>, s.scenes * 3 * a.c.plan.functions * 32, kRowThreads, stream, a);
 }
 
+#ifdef DIFFVBD_SCALAR
+template struct Corrections<DIFFVBD_SCALAR>;
+#else
 template struct Corrections<float>;
 template struct Corrections<double>;
+#endif
 
 }  // namespace diffvbd::cuda

@@ -178,7 +178,7 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
 
 template <class T, int wanted, int lanes, int mask>
 constexpr GradientKernel<T> gradient_variant() {
-  if constexpr ((mask & kPaperBlock) != 0) {
+  if constexpr ((mask & kPaperBlock) != 0 || (kOwnLaw && !gathers(lanes))) {
     return nullptr;
   } else if constexpr (wanted < 0) {
     return gradient_of_vertices<T, mask, lanes>;

@@ -21,7 +21,11 @@ __device__ __forceinline__ int64_t own_item(int threads) {
 
 }  // namespace diffvbd::cuda
 
-// Both instances of a function template that has no overloads.
+// The instances of a function template that has no overloads; an object of a generated law has one.
+#ifdef DIFFVBD_SCALAR
+#define DIFFVBD_INSTANTIATE(f) template decltype(f<DIFFVBD_SCALAR>) f<DIFFVBD_SCALAR>;
+#else
 #define DIFFVBD_INSTANTIATE(f)          \
   template decltype(f<float>) f<float>; \
   template decltype(f<double>) f<double>;
+#endif

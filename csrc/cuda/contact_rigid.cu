@@ -48,8 +48,10 @@ cudaError_t work_of_pairs(const WorkStep<T>& s, cudaStream_t stream) {
   return cudaGetLastError();
 }
 
+DIFFVBD_INSTANTIATE(work_of_pairs)
+#ifndef DIFFVBD_LAW_HEADER  // the rest reads no law
 DIFFVBD_INSTANTIATE(contact_rigid_correct)
 DIFFVBD_INSTANTIATE(contact_rigid_reverse)
-DIFFVBD_INSTANTIATE(work_of_pairs)
+#endif
 
 }  // namespace diffvbd::cuda

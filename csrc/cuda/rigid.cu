@@ -147,8 +147,10 @@ cudaError_t energy_increase(const IncreaseInputs<T>& in, double* workspace, doub
   return cudaGetLastError();
 }
 
+DIFFVBD_INSTANTIATE(energy_increase)
+#ifndef DIFFVBD_LAW_HEADER  // the rest reads no law
 DIFFVBD_INSTANTIATE(rigid_correct)
 DIFFVBD_INSTANTIATE(rigid_reverse)
-DIFFVBD_INSTANTIATE(energy_increase)
+#endif
 
 }  // namespace diffvbd::cuda

@@ -337,22 +337,20 @@ struct Runner {
 
 template <class T, int wanted>
 SweepKernel reverse_kernel_for(int energies, int lanes) {
-  switch (lanes) {
-    case kFewLanes:
-      return reverse_kernel<T, wanted, kFewLanes>(energies);
-    case kSomeReverseLanes:
-      return reverse_kernel<T, wanted, kSomeReverseLanes>(energies);
-    case kManyLanes:
-      return reverse_kernel<T, wanted, kManyLanes>(energies);
-    default:
-      return reverse_kernel<T, wanted, kSpillLanes>(energies);
+  if constexpr (!kOwnLaw) {
+    if (lanes == kFewLanes) return reverse_kernel<T, wanted, kFewLanes>(energies);
+    if (lanes == kSomeReverseLanes) return reverse_kernel<T, wanted, kSomeReverseLanes>(energies);
   }
+  return lanes == kManyLanes ? reverse_kernel<T, wanted, kManyLanes>(energies)
+                             : reverse_kernel<T, wanted, kSpillLanes>(energies);
 }
 template <class T>
 SweepKernel reverse_kernel_for(int energies, int wanted, int lanes) {
-  if (wanted & kRest) return reverse_kernel_for<T, kMaterial | kRest>(energies, lanes);
-  if (wanted & kMaterial) return reverse_kernel_for<T, kMaterial>(energies, lanes);
-  return reverse_kernel_for<T, kState>(energies, lanes);
+  if constexpr (!kOwnLaw) {
+    if (!(wanted & kMaterial)) return reverse_kernel_for<T, kState>(energies, lanes);
+    if (!(wanted & kRest)) return reverse_kernel_for<T, kMaterial>(energies, lanes);
+  }
+  return reverse_kernel_for<T, kMaterial | kRest>(energies, lanes);
 }
 
 }  // namespace
@@ -372,8 +370,11 @@ template <class T>
 cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out, const Choice& choice,
                         void* workspace, cudaStream_t stream) {
   if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
-  if (choice.regime == kThread)
-    return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
+  if constexpr (!kOwnLaw) {
+    if (choice.regime == kThread) {
+      return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
+    }
+  }
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
   run.contact.truncations = out.truncations;
   const int lanes = possible_lanes<T>(host, choice, choice.lanes, false);
@@ -391,8 +392,10 @@ template <class T>
 cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
                         const StepAdjoints<T>& out, const Choice& choice, void* workspace, cudaStream_t stream) {
   if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
-  if (choice.regime == kThread) {
-    return run_scene_reverse(host, in, ends, tape, out, choice, static_cast<uint8_t*>(workspace), stream);
+  if constexpr (!kOwnLaw) {
+    if (choice.regime == kThread) {
+      return run_scene_reverse(host, in, ends, tape, out, choice, static_cast<uint8_t*>(workspace), stream);
+    }
   }
   Runner<T> run(host, in, &out, choice, workspace, stream);
   run.s.limits = out.limits;

@@ -191,8 +191,11 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int stages, int
   return stages * stage_scalars<T>() + groups * (3 * degree + (reverse ? contributions : 0));
 }
 
-// With contact a vertex has many threads or some; the variant with few is not built.
-constexpr bool is_built(int mask, int lanes) { return (mask & kContact) == 0 || lanes != kFewLanes; }
+// With contact a vertex has many threads or some; the variant with few is not built. A generated law is compiled at its
+// first use, so for many threads only, with all adjoints.
+constexpr bool is_built(int mask, int lanes) {
+  return is_compiled(mask) && (kOwnLaw ? gathers(lanes) : (mask & kContact) == 0 || lanes != kFewLanes);
+}
 
 // Plan with the numbers that the host needs.
 struct HostPlan {

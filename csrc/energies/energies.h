@@ -33,9 +33,11 @@ enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
 constexpr int kElastic = kExactBlock | kPaperBlock;
 constexpr int kContact = 4;
 #ifdef DIFFVBD_LAW_HEADER
+constexpr bool kOwnLaw = true;
 template <bool>
 using ElasticLaw = OwnLaw;
 #else
+constexpr bool kOwnLaw = false;
 template <bool exact>
 using ElasticLaw = StableNeoHookean<exact>;
 #endif

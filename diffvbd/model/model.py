@@ -123,11 +123,9 @@ class Model:
         for energy in (*self.energies, *self.vertex_energies):
             mask |= energy.bit
         if self.law is not None:
-            if device.type != "cpu":
-                fail("device", '"cpu" with a law of your own', repr(str(device)))
             self.law.check_mesh(self.mesh.num_tets)
             density = self.law.density
-            mask |= ops.bits_of_law(density.digest, density.header, density.quadratic, dtype)
+            mask |= ops.bits_of_law(density.digest, density.header, density.quadratic, dtype, device)
         return mask
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:

@@ -105,6 +105,11 @@ class System(Model):
         """The same System on the CPU: what debug_checks() asks about a step on CUDA."""
         return self.derived("on_cpu", lambda: self.to("cpu"))
 
+    def launch(self, scenes: int) -> tuple[int, int, int, int]:
+        """How the sweeps of so many scenes are spread over a CUDA device."""
+        touches, together = bool(self.energy_mask & CONTACT), self.coarse is not None or self.law is not None
+        return regimes.choose(self.num_vertices, self.num_colors, scenes, touches, together)
+
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
         """Settings of the kernels; ``scenes`` chooses the regime on CUDA."""
         saturation = -1.0 if self.saturation is None else self.saturation
@@ -114,10 +119,7 @@ class System(Model):
         numbers = ops.StepNumbers(time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS,
                                   FILTER_ETA, last, friction_eps)  # fmt: skip
         coarse = self._coarse_plan.sizes if self.coarse is not None else ()
-        launch = ()
-        if self.device.type == "cuda":
-            touches = bool(self.energy_mask & CONTACT)
-            launch = regimes.choose(self.num_vertices, self.num_colors, scenes, touches, bool(coarse))
+        launch = self.launch(scenes) if self.device.type == "cuda" else ()
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch, coarse)
 
 

@@ -40,23 +40,36 @@ WANTED = {"state": "kState", "material": "kMaterial", "rest": "kMaterial | kRest
 LANES = {"few": ("kFewLanes", "kSomeReverseLanes"), "many": ("kManyLanes", "kSpillLanes")}
 
 
+def instance(header: str, templates: list[str], scalar: str, csrc: str = "../../csrc") -> str:
+    """Source of instances of templates of a header."""
+    names = [template.replace("<T", f"<{scalar}") for template in templates]
+    lines = [f"template {n};" if n.startswith("struct ") else f"template decltype({n}) {n};" for n in names]
+    include = f'#include "{csrc}/cuda/{header}.cuh"'
+    return "\n".join([include, "", "namespace diffvbd::cuda {", *lines, "}  // namespace diffvbd::cuda", ""])
+
+
+def reverse_names(wanted: str, lanes: str) -> list[str]:
+    return [f"reverse_kernel<T, ({WANTED[wanted]}), {count}>" for count in LANES[lanes]]
+
+
 def cuda_instances() -> dict[str, str]:
     """Sources of template instances for the CUDA object: text by name."""
-
-    def text(header: str, templates: list[str], scalar: str) -> str:
-        names = [template.replace("<T", f"<{scalar}") for template in templates]
-        lines = [f"template {n};" if n.startswith("struct ") else f"template decltype({n}) {n};" for n in names]
-        include = f'#include "../../csrc/cuda/{header}.cuh"'
-        return "\n".join([include, "", "namespace diffvbd::cuda {", *lines, "}  // namespace diffvbd::cuda", ""])
-
     out = {}
     for scalar in ("double", "float"):
-        out |= {f"{header}_{scalar}.cu": text(header, names, scalar) for header, names in TEMPLATES.items()}
-        for wanted, value in WANTED.items():
-            for share, lanes in LANES.items():
-                names = [f"reverse_kernel<T, ({value}), {count}>" for count in lanes]
-                out[f"reverse_{wanted}_{scalar}_{share}.cu"] = text("reverse", names, scalar)
+        out |= {f"{header}_{scalar}.cu": instance(header, names, scalar) for header, names in TEMPLATES.items()}
+        for wanted in WANTED:
+            for share in LANES:
+                name = f"reverse_{wanted}_{scalar}_{share}.cu"
+                out[name] = instance("reverse", reverse_names(wanted, share), scalar)
     return out
+
+
+def law_instances(scalar: str, csrc: str) -> dict[str, str]:
+    """The same for the object of a generated law, which has a kernel for many threads a vertex and all adjoints."""
+    gradients = [name for name in TEMPLATES["coarse_gradient"] if "kForward" in name or "kRest" in name]
+    own = {name: TEMPLATES[name] for name in ("contact", "forward", "run")}
+    own |= {"coarse_gradient": gradients, "reverse": reverse_names("rest", "many")}
+    return {f"{header}.cu": instance(header, names, scalar, csrc) for header, names in own.items()}
 
 
 def write_instances(sources: dict[str, str]) -> list[str]:

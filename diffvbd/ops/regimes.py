@@ -60,10 +60,11 @@ def regime(name: Regime | None) -> Iterator[None]:
         _forced = before
 
 
-def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corrects: bool = False
+def choose(vertices: int, colors: int, scenes: int, contact: bool = False, together: bool = False
            ) -> tuple[int, int, int, int]:  # fmt: skip
-    """Regimes of the sweeps and of their reverse, and threads per vertex of both, for SweepSettings.launch. Coarse
-    corrections are launches between sweeps, so a scene that has them is not left to one thread."""
+    """Regimes of the sweeps and of their reverse, and threads per vertex of both, for SweepSettings.launch. together:
+    No scene is left to one thread, as with coarse corrections, which are launches between sweeps, and with a law of
+    one's own, which has no such kernel."""
     at_once = vertices * scenes / max(1, colors)
     if contact:
         if at_once > MANY_LANES_VERTICES[0]:  # pairs are summed up in launches of their own
@@ -72,7 +73,7 @@ def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corre
         code = GRID if grid else COLOR
         return code, code, MANY_LANES, MANY_LANES
     code, back = (CODES[_forced],) * 2 if _forced else _automatic(vertices, scenes)
-    if code == THREAD and corrects:
+    if code == THREAD and together:
         code = back = BLOCK
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")

@@ -217,8 +217,7 @@ _POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": op
 
 def cuda_scratch(model: System, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
     """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
-    corrects = model.coarse is not None
-    launch = regimes.choose(model.num_vertices, model.num_colors, scenes, model.touches, corrects)
+    corrects, launch = model.coarse is not None, model.launch(scenes)
     if launch[0] == regimes.THREAD:
         return 0
     _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes

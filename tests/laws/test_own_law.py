@@ -12,7 +12,7 @@ import torch
 from helpers.coupled import coupled
 from helpers.coupled import inputs_of as inputs_of_coupled
 from helpers.executed import assert_executed, assert_like_differences, run_of
-from helpers.laws import STABLE, compiled_laws
+from helpers.laws import MESH, PINNED, STABLE, VALUES, compiled_laws, inputs_of_law, law_of, model_of
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -26,42 +26,6 @@ from diffvbd.testing.dense_statics import coupling_energy, residual, weight
 pytestmark = [needs_csrc, pytest.mark.slow]  # a law is compiled
 __all__ = ["compiled_laws"]
 F64 = torch.float64
-# stress-free at rest, with every invariant; not quadratic in one vertex
-TEXT = ("mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2 + c*(I2*J**(-4/3) - 3) + m*(trU - 3)**2"
-        " + k/(2*s)*(exp(s*(I4 - 1)**2) - 1)")  # fmt: skip
-VALUES = {"mu": 4e4, "lam": 9e4, "c": 8e3, "m": 1e4, "k": 3e4, "s": 1.5}
-MESH = dv.mesh.beam(3, 2, 2, size=(0.3, 0.2, 0.2))
-PINNED = MESH.points[:, 0] == 0.0
-
-
-def law_of(text: str = TEXT) -> Any:
-    law = dv.law(text, **VALUES, a0=(1.0, 0.3, -0.2)) if text == TEXT else dv.law(text, mu=4e4, lam=9e4)
-    return law
-
-
-def model_of(*energies: Any, pinned: Any = PINNED, text: str = TEXT) -> dv.Model:
-    return dv.Model(MESH, pinned=pinned, energies=(law_of(text), *energies))
-
-
-def inputs_of(model: dv.Model, jitter: float = 0.01, lead: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Every differentiable input, each tet with values of its own."""
-    rng = torch.Generator().manual_seed(1)
-
-    def noise(*shape: int) -> Tensor:
-        return torch.randn(shape, generator=rng, dtype=F64)
-
-    tets, full = model.num_tets, (*lead, *model.rest_points.shape)
-    out: dict[str, Any] = {"x": model.rest_points + jitter * noise(*full), "v": 0.3 * noise(*full)}
-    out |= {name: value * (1 + 0.2 * torch.rand(tets, generator=rng, dtype=F64))
-            for name, value in model.law.values.items()}  # fmt: skip
-    if model.law.a0 is not None:
-        out["a0"] = model.law.a0 + 0.3 * noise(tets, 3)
-    held = model.rest_points + 0.005 * noise(*model.rest_points.shape)
-    held = torch.where(model.pinned[:, None], held, torch.nan) if model.pinned.any() else None
-    out |= {"density": 800 + 400 * torch.rand(tets, generator=rng, dtype=F64), "force": 0.3 * noise(*full),
-            "rest_points": model.rest_points + 0.002 * noise(*model.rest_points.shape), "prescribed": held,
-            "stress_free": torch.eye(3, dtype=F64) + 0.05 * noise(tets, 3, 3)}  # fmt: skip
-    return {name: value for name, value in out.items() if value is not None}
 
 
 def compare(model: dv.Model, solver: dv.VBD, inputs: dict[str, Any], bar: float = 1e-11) -> None:
@@ -79,12 +43,14 @@ def compare(model: dv.Model, solver: dv.VBD, inputs: dict[str, Any], bar: float 
 def test_gradients_are_those_of_the_executed_sweeps(sweeps: int, jitter: float) -> None:
     """Against autograd through the reference; the larger jitter turns tets inside out and shortens updates."""
     model = model_of()
-    compare(model, dv.VBD(0.01, sweeps, relaxation=1.3, saturation=0.5, regularization=0.01), inputs_of(model, jitter))
+    compare(
+        model, dv.VBD(0.01, sweeps, relaxation=1.3, saturation=0.5, regularization=0.01), inputs_of_law(model, jitter)
+    )
 
 
 def test_batches_floors_anchors() -> None:
     model = model_of(dv.FloorBarrier(height=-0.03, kappa=500.0, dhat=0.05, damping=5.0), dv.Anchor(40.0), pinned=None)
-    inputs = {k: v for k, v in inputs_of(model, 0.004, (2,)).items() if k != "stress_free"}
+    inputs = {k: v for k, v in inputs_of_law(model, 0.004, (2,)).items() if k != "stress_free"}
     compare(model, dv.VBD(0.005, 2), inputs | {"anchor_stiffness": torch.tensor(40.0, dtype=F64)}, 1e-10)
 
 
@@ -159,12 +125,12 @@ LOG = "mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2"
 @pytest.mark.parametrize("sweeps", [1, 5])
 def test_laws_of_the_guide(law: Any, sweeps: int) -> None:
     model = dv.Model(MESH, pinned=PINNED, energies=(law,))
-    compare(model, dv.VBD(0.01, sweeps), inputs_of(model, 0.005))
+    compare(model, dv.VBD(0.01, sweeps), inputs_of_law(model, 0.005))
 
 
 def test_coarse_corrections() -> None:
     model = model_of()
-    inputs = {k: v for k, v in inputs_of(model, 0.003).items() if k not in ("stress_free", "rest_points")}
+    inputs = {k: v for k, v in inputs_of_law(model, 0.003).items() if k not in ("stress_free", "rest_points")}
     with dv.record("subspace") as lengths:
         compare(model, dv.VBD(0.01, 4, subspace="coarse"), inputs, 1e-10)
     assert any(float(length.max()) > 0 for length in lengths)
@@ -190,7 +156,7 @@ def test_integrators(integrator: Any) -> None:
 def test_central_differences() -> None:
     """Of one sweep, along a random direction of each input."""
     model, solver = model_of(), dv.VBD(0.01, 1)
-    inputs = inputs_of(model, 0.004)
+    inputs = inputs_of_law(model, 0.004)
     rng = torch.Generator().manual_seed(3)
     weight = torch.randn(inputs["x"].shape, generator=rng, dtype=F64)
 
@@ -211,7 +177,7 @@ def test_central_differences() -> None:
 def test_tapes_agree_and_updates_are_shortened() -> None:
     """Tapes bit for bit; no sweep raises the potential, at a violent state where whole Newton steps would."""
     model = model_of()
-    inputs = inputs_of(model, 0.08)
+    inputs = inputs_of_law(model, 0.08)
     weight = torch.linspace(0, 1, inputs["x"].numel(), dtype=F64).view_as(inputs["x"])
     found = []
     for tape in ("full", "compact", "recompute"):
@@ -313,7 +279,7 @@ def test_inputs_and_refusals() -> None:
 def test_a_modulus_of_zero_is_given() -> None:
     """It is not taken for the law's own; in the reference, too."""
     model, solver = model_of(), dv.VBD(0.01, 2)
-    inputs = inputs_of(model, 0.004)
+    inputs = inputs_of_law(model, 0.004)
     x, v = inputs["x"], inputs["v"]
     own, without = (dv.step(model, x, v, solver, **given)[0] for given in ({}, {"lam": 0.0}))
     assert float((own - without).abs().max()) > 1e-6
@@ -326,7 +292,7 @@ def test_the_built_in_law_as_a_law_of_ones_own() -> None:
     """A law that is quadratic in one vertex: values and gradients of StableNeoHookean, in float32 too; parameters that
     make it concave are refused."""
     own, built_in, solver = model_of(text=STABLE), dv.Model(MESH, pinned=PINNED), dv.VBD(0.01, 5)
-    inputs = inputs_of(own, 0.03)
+    inputs = inputs_of_law(own, 0.03)
     results = [evaluate(lambda model=model, **given: dv.step(model, given.pop("x"), given.pop("v"), solver, **given),
                         inputs, 0.01) for model in (own, built_in)]  # fmt: skip
     for name, value in results[1].items():

@@ -32,9 +32,14 @@ def scene_of(name: str, text: str) -> Scene:
 def test_the_built_in_law_as_ones_own(subspace: Any) -> None:
     scene, own = SCENES["stacked"](), scene_of("stacked", STABLE)
     solver = scene.solver(4, subspace=subspace)
-    expected, result = (
-        evaluate(lambda model=s.model, **given: dv.step(model, given.pop("x"), given.pop("v"), solver, gravity=GRAVITY,
-                                                        **given), s.leaves(), s.time_step) for s in (scene, own))  # fmt: skip
+
+    def end_of(given: Scene) -> dict[str, Tensor]:
+        def run(x: Tensor, v: Tensor, **inputs: Any) -> Any:
+            return dv.step(given.model, x, v, solver, gravity=GRAVITY, **inputs)
+
+        return evaluate(run, given.leaves(), given.time_step)
+
+    expected, result = end_of(scene), end_of(own)
     for name, value in expected.items():
         assert value.any() and relative_error(result[name], value) < 1e-11, name
 
