@@ -13,6 +13,7 @@ import diffvbd as dv
 
 F64 = torch.float64
 STABLE = "mu/2*(I1 - 3) - mu*(J - 1) + (mu + lam)/2*(J - 1)**2"
+LOG = "mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2"  # not quadratic in one vertex
 
 
 @pytest.fixture(scope="module", autouse=True)

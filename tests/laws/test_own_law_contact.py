@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.laws import STABLE, compiled_laws
+from helpers.laws import LOG, STABLE, compiled_laws
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -16,7 +16,6 @@ from diffvbd.testing.tolerances import tolerance
 
 pytestmark = [needs_csrc, pytest.mark.slow]  # a law is compiled
 __all__ = ["compiled_laws"]
-LOG = "mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2"  # not quadratic in one vertex
 
 
 def scene_of(name: str, text: str) -> Scene:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import why_no_cuda
-from helpers.laws import compiled_laws, inputs_of_law, law_of, model_of
+from helpers.laws import LOG, compiled_laws, inputs_of_law, law_of, model_of
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -55,40 +55,35 @@ def test_batches_floors_anchors() -> None:
 @pytest.mark.parametrize("name", ["stacked", "fast"])
 def test_contact(name: str, subspace: Any) -> None:
     scene = SCENES[name]()
-    energies = (law_of("mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2"), *scene.model.energies[1:])
+    energies = (law_of(LOG), *scene.model.energies[1:])
     model = dv.Model(scene.model.mesh, energies=energies)
     inputs = {"x": scene.x, "v": scene.v, **scene.inputs, **scene.parameters}
     same_on_both(model, scene.solver(4, subspace=subspace), inputs, 1e-9, gravity=GRAVITY)
 
 
 def test_float32_and_a_captured_step() -> None:
-    model = model_of()
-    x, v = (
-        model.rest_points + 0.01 * torch.sin(torch.arange(model.rest_points.numel()).view_as(model.rest_points)),
-        None,
-    )
-    v, solver = torch.zeros_like(x), dv.VBD(0.01, 8)
+    model, solver = model_of(text=LOG), dv.VBD(0.01, 8)
+    rest = model.rest_points
+    x, v = rest + 0.01 * torch.sin(torch.arange(rest.numel()).view_as(rest)), torch.zeros_like(rest)
     expected = dv.step(model, x, v, solver)[0]
-    single = model.to("cuda", torch.float32)
-    found = dv.step(single, x.to("cuda", torch.float32), v.to("cuda", torch.float32), solver)[0]
+    found = dv.step(model.to("cuda", torch.float32), *(t.to("cuda", torch.float32) for t in (x, v)), solver)[0]
     assert relative_error(found.cpu().double(), expected) < 1e-5
-    own = model.to("cuda")
-    given = x.cuda(), v.cuda()
+    own, given = model.to("cuda"), (x.cuda(), v.cuda())
     dv.step(own, *given, solver)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         end = dv.step(own, *given, solver)[0]
     graph.replay()
-    assert relative_error(end.cpu(), expected) < 1e-12
+    assert relative_error(end.cpu(), expected) < 1e-11
 
 
 def test_many_scenes_of_a_small_mesh_and_a_long_rollout() -> None:
     """Where a built-in law has a scene per thread; and derivatives through steps with checkpoints."""
-    model = model_of(pinned=None)
-    x = model.rest_points.expand(5000, -1, -1) + 0.01 * torch.randn(5000, *model.rest_points.shape,
-                                                                     generator=torch.Generator().manual_seed(0),
-                                                                     dtype=torch.float64)  # fmt: skip
-    ends = []
+    model, count = model_of(pinned=None, text=LOG), 5000
+    noise = torch.randn(
+        count, *model.rest_points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    x, ends = model.rest_points + 0.003 * noise, []
     for device in ("cpu", "cuda"):
         mu = torch.tensor(4e4, dtype=torch.float64, device=device, requires_grad=True)
         start = x[:: 500 if device == "cpu" else 1].to(device)
@@ -96,5 +91,5 @@ def test_many_scenes_of_a_small_mesh_and_a_long_rollout() -> None:
         end = done.x[-1] if device == "cpu" else done.x[-1][::500]
         (grad,) = torch.autograd.grad(end.square().sum(), mu)
         ends.append((end.detach().cpu(), grad.cpu()))
-    assert relative_error(ends[1][0], ends[0][0]) < 1e-11
+    assert relative_error(ends[1][0], ends[0][0]) < 1e-10
     assert ends[0][1].abs() > 0 and relative_error(ends[1][1], ends[0][1]) < 1e-8
