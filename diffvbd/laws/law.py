@@ -84,7 +84,8 @@ class Law:
     def at_rest(self, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """mu, lam and stress [Pa] at F = I, without fibres, of parameters in their order; differentiable."""
         like = parameters[0] if parameters else torch.zeros((), dtype=torch.float64)
-        mu, lam, stress = (torch.as_tensor(m, dtype=like.dtype, device=like.device)
+        # numbers are filled in, as nothing may be copied to a device while a CUDA graph is captured
+        mu, lam, stress = (m if isinstance(m, Tensor) else like.new_full((), float(m))
                            for m in self.density.at_rest(*parameters))  # fmt: skip
         return mu, lam, stress
 
