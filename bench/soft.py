@@ -109,7 +109,7 @@ def sparse_newton(model: dv.Model, mu: float, lam: float) -> tuple[Tensor, int]:
 
 
 def ring_down(quick: bool) -> list[Row]:
-    """The lowest mode of a clamped beam: damping ratios recovered from three periods with 1 % of noise."""
+    """The lowest mode of a clamped beam: damping ratios recovered from its decay with 1 % of noise."""
     mode = Mode()
     rows = []
     for ratio in (0.04,) if quick else (0.01, 0.02, 0.04, 0.08):

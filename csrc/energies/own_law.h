@@ -11,6 +11,7 @@
 
 #include "../core/hyper_dual.h"
 #include "../core/safeguards.h"
+#include "stable_neo_hookean.h"
 #include "tet.h"
 
 #ifdef __CUDACC__
@@ -95,6 +96,22 @@ struct OwnLaw {
     const auto real = R(0) < c6;
     return select(real, R(1) / (R(6) * select(real, c6, R(1))), R(0));
   }
+
+  // The viscosity, as a law of another rest shape.
+  using Viscous = StableNeoHookean<true>;
+  template <class R>
+  struct ViscousPair {
+    Vec3<R> xj, xk, xl;
+    R rest[4], material[2];
+    DIFFVBD_FN explicit ViscousPair(const TetPair<R>& e) : xj(e.xj), xk(e.xk), xl(e.xl) {
+      const R* own = e.rest + L::pair_viscous;
+      for (int i = 0; i < 4; ++i) rest[i] = own[i];
+      material[0] = own[4], material[1] = own[5];
+    }
+  };
+  struct None {};
+  template <class R>
+  using ViscousView = std::conditional_t<kViscous, Viscous::View<R>, None>;
 
   // The invariants, of positions in numbers S that move with x_i.
   template <class R, class S>
@@ -226,6 +243,7 @@ struct OwnLaw {
         h_outer.yz = h_outer.yz + a[i].y * sum.z, h_outer.zz = h_outer.zz + a[i].z * sum.z;
       }
     });
+    if constexpr (kViscous) Viscous::block(ViscousPair<R>(e), xi, g, h_diagonal, h_outer);
   }
   template <class R>
   DIFFVBD_FN static constexpr R scale_over_c6(int i) {
@@ -250,6 +268,7 @@ struct OwnLaw {
   struct View {
     Shape<R, Number<R>> s;
     Slopes<Number<R>> w;
+    ViscousView<R> second;
   };
   template <class R>
   DIFFVBD_FN static View<R> view(const TetPair<R>& e, const Vec3<R>& xi, const Vec3<R>& d_raw, const Vec3<R>& p) {
@@ -257,14 +276,16 @@ struct OwnLaw {
     const Vec3<R> d = xi - e.xj;
     View<R> v{shape(e, Vec3<Number<R>>{moving(d.x, d_raw.x, p.x, number), moving(d.y, d_raw.y, p.y, number),
                                        moving(d.z, d_raw.z, p.z, number)}),
+              {},
               {}};
     v.w = Density::slopes(v.s.v, e.rest + L::pair_parameters);
+    if constexpr (kViscous) v.second = Viscous::view(ViscousPair<R>(e), xi, d_raw, p);
     return v;
   }
 
   template <class R>
-  DIFFVBD_FN static TetAdjoint<R> block_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>&, const Vec3<R>&,
-                                            const R& minus_h2) {
+  DIFFVBD_FN static TetAdjoint<R> block_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw,
+                                            const Vec3<R>& p, const R& minus_h2) {
     const R* k = e.rest;
     const auto& s = v.s;
     const R twice = R(-2) * minus_h2, sixth = R(1) / R(6) * minus_h2;
@@ -288,6 +309,10 @@ struct OwnLaw {
       const Vec3<R> t = (R(2) * minus_h2 * volume(c6(e))) * extract(times(v.w.i4, s.fibre));
       out.xi += own_fibre(e) * t, out.xk += b[1] * t, out.xl += b[2] * t;
     }
+    if constexpr (kViscous) {
+      const TetAdjoint<R> more = Viscous::block_vjp(ViscousPair<R>(e), v.second, d_raw, p, minus_h2);
+      out.xi += more.xi, out.xk += more.xk, out.xl += more.xl;
+    }
     out.xj = -(out.xi + out.xk + out.xl);
     return out;
   }
@@ -297,10 +322,15 @@ struct OwnLaw {
     material_bar[0] = material_bar[1] = R(0);  // moduli at rest, which no sweep reads
   }
   template <class R>
-  DIFFVBD_FN static void rest_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>&, const Vec3<R>&,
+  DIFFVBD_FN static void rest_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& of,
                                   const R& minus_h2, R* rest_bar) {
     const auto& s = v.s;
     const R* p = e.rest + L::pair_parameters;
+    if constexpr (kViscous) {
+      const ViscousPair<R> second(e);
+      Viscous::rest_vjp(second, v.second, d_raw, of, minus_h2, rest_bar + L::pair_viscous);
+      Viscous::material_vjp(second, v.second, d_raw, of, minus_h2, rest_bar + L::pair_viscous + 4);
+    }
     const R of_volume = minus_h2 * volume(c6(e));
     const auto squared = [&](const auto& edge)
                              DIFFVBD_INLINED { return -(minus_h2 * extract(inner(edge, stressed(v.w, s.m, edge)))); };
@@ -350,6 +380,7 @@ struct OwnLaw {
     const Vec3<Dual<R>> f = times(k[1], ek - d) + times(k[2], el - d) - times(k[0], d);
     Vec3<R> out = R(2) * extract(stressed(w, m, f)) + (R(1) / R(6)) * extract(times(w.j, cross(ek, el)));
     if constexpr (Density::fibre) out += (R(2) * volume(c6(e)) * own_fibre(e)) * extract(times(w.i4, fibre));
+    if constexpr (kViscous) out += Viscous::product(ViscousPair<R>(e), v.second, wi, wj, wk, wl);
     return out;
   }
   // Invariants of corners i, j, k, l with x_j at the origin. weights: of ij ik il jk jl kl; b: of j, k, l.
@@ -386,7 +417,18 @@ struct OwnLaw {
     }
     Sym3<S> m{};
     Vec3<S> fibre{};
-    return volume(rest[6]) * Density::value(invariants(x, weights, rest[6], b, m, fibre), rest + L::parameters);
+    S sum = volume(rest[6]) * Density::value(invariants(x, weights, rest[6], b, m, fibre), rest + L::parameters);
+    if constexpr (kViscous) {
+      const R *second = rest + L::viscous, c6 = second[6], mu = second[7], lam = second[8], half = R(0.5);
+      for (int a = 0; a < 6; ++a) {
+        const Vec3<S> edge = x[edge_end(a, 1)] - x[edge_end(a, 0)];
+        const R weight = second[weight_index(order[edge_end(a, 0)], order[edge_end(a, 1)])];
+        sum = sum - (half * mu * weight) * inner(edge, edge);
+      }
+      const S strain = c6 * inner(cross(x[2], x[3]), x[0]) - S(R(1));
+      sum = sum + volume(c6) * ((half * (mu + lam)) * (strain * strain) - mu * strain);
+    }
+    return sum;
   }
   template <class R>
   DIFFVBD_FN static R value(const Vec3<R> (&x)[4], const R* rest, const R*) {
@@ -436,6 +478,14 @@ struct OwnLaw {
     size =
         size + absolute(before) + absolute(after) +
         v * (absolute(w.i1 * here.i1) + absolute(w.i2 * here.i2) + absolute(w.j * here.j) + absolute(w.i4 * here.i4));
+    if constexpr (kViscous) {  // which is quadratic
+      Vec3<R> g = zero3<R>();
+      R own = R(0);
+      Sym3<R> outer = diagonal(R(0));
+      Viscous::block(ViscousPair<R>(e), x, g, own, outer);
+      const R slope = dot(g, step), bend = R(0.5) * (own * dot(step, step) + dot(step, outer * step));
+      sum = sum + (slope + bend), size = size + absolute(slope) + absolute(bend);
+    }
   }
 
   // --- for blocks that are solved in two passes (sweep/refine.h), which only quadratic laws have

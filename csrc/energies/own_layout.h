@@ -1,5 +1,6 @@
-// What a tet of a generated law (own_law.h) reads: its rest shape, with a fibre a . grad N_a of its corners, then the
-// law's parameters. They are among the scalars of the rest shape, so that any number of them takes the way that is
+// What a tet of a generated law (own_law.h) reads: its rest shape, with a fibre a . grad N_a of its corners; with
+// DIFFVBD_LAW_VISCOUS the rest shape and the moduli of a second law, its viscosity in a step (docs/method.md, section
+// 20); then the law's parameters. They are among the scalars of the rest shape, so that any number of them takes the way that is
 // there; the material stays mu and lam, those of the law at rest, which no sweep reads.
 #pragma once
 
@@ -39,15 +40,24 @@ DIFFVBD_FN S stretch_sum(const S& i1, const S& i2, const S& j);
 
 namespace diffvbd {
 
+#ifdef DIFFVBD_LAW_VISCOUS
+constexpr bool kViscous = true;
+#else
+constexpr bool kViscous = false;
+#endif
+
 struct TetLayout {
   // whether a vertex must see the edges that it is no end of: of a law that is not linear in I1
   static constexpr bool edges = Density::edges;
   static constexpr int material = 2;
-  static constexpr int fibre = 7, parameters = fibre + (Density::fibre ? 4 : 0);
+  static constexpr int fibre = 7, viscous = fibre + (Density::fibre ? 4 : 0);
+  static constexpr int parameters = viscous + (kViscous ? 9 : 0);
   static constexpr int rest = parameters + Density::parameters;
-  // as a vertex sees them: k_ij k_ik k_il (k_jk k_jl k_kl) c6 (b_j b_k b_l), then the parameters
+  // as a vertex sees them: k_ij k_ik k_il (k_jk k_jl k_kl) c6 (b_j b_k b_l) (k_ij k_ik k_il c6 mu lam of the viscosity),
+  // then the parameters
   static constexpr int pair_c6 = edges ? 6 : 3, pair_fibre = pair_c6 + 1;
-  static constexpr int pair_parameters = pair_fibre + (Density::fibre ? 3 : 0);
+  static constexpr int pair_viscous = pair_fibre + (Density::fibre ? 3 : 0);
+  static constexpr int pair_parameters = pair_viscous + (kViscous ? 6 : 0);
   static constexpr int pair_rest = pair_parameters + Density::parameters, pair_shape = pair_parameters;
 
   DIFFVBD_FN static constexpr int rest_index(int local, int i) {
@@ -55,7 +65,9 @@ struct TetLayout {
     if (i < 3) return weight_index(local, other_corner(local, i));
     if (i < pair_c6) return i == 3 ? weight_index(j, k) : i == 4 ? weight_index(j, l) : weight_index(k, l);
     if (i == pair_c6) return 6;
-    if (i < pair_parameters) return fibre + other_corner(local, i - pair_fibre);
+    if (i < pair_viscous) return fibre + other_corner(local, i - pair_fibre);
+    if (i < pair_viscous + 3 && kViscous) return viscous + weight_index(local, other_corner(local, i - pair_viscous));
+    if (i < pair_parameters) return viscous + 3 + i - pair_viscous;
     return parameters + i - pair_parameters;
   }
   static constexpr int line_degree = 8;  // changes of the tet's energy along a line: OwnLaw::line()

@@ -18,12 +18,12 @@ template <bool Exact>
 struct StableNeoHookean {
   static constexpr bool quadratic = true;  // in the position of one vertex
   // The material of a tet: mu, lam [Pa].
-  template <class R>
-  DIFFVBD_FN static const R& mu(const TetPair<R>& e) {
+  template <class Pair>
+  DIFFVBD_FN static const auto& mu(const Pair& e) {
     return e.material[0];
   }
-  template <class R>
-  DIFFVBD_FN static const R& lam(const TetPair<R>& e) {
+  template <class Pair>
+  DIFFVBD_FN static const auto& lam(const Pair& e) {
     return e.material[1];
   }
   static constexpr const char* material_names[] = {"mu", "lam"};
@@ -36,26 +36,26 @@ struct StableNeoHookean {
     return lam >= 0 && lam <= most ? nullptr : "lam: expected finite values >= 0 Pa with block=\"paper\"";
   }
   // Its rest shape as the vertex sees it: k_ij, k_ik, k_il [m], c6 [1/m^3].
-  template <class R>
-  DIFFVBD_FN static const R& k_ij(const TetPair<R>& e) {
+  template <class Pair>
+  DIFFVBD_FN static const auto& k_ij(const Pair& e) {
     return e.rest[0];
   }
-  template <class R>
-  DIFFVBD_FN static const R& k_ik(const TetPair<R>& e) {
+  template <class Pair>
+  DIFFVBD_FN static const auto& k_ik(const Pair& e) {
     return e.rest[1];
   }
-  template <class R>
-  DIFFVBD_FN static const R& k_il(const TetPair<R>& e) {
+  template <class Pair>
+  DIFFVBD_FN static const auto& k_il(const Pair& e) {
     return e.rest[2];
   }
-  template <class R>
-  DIFFVBD_FN static const R& c6(const TetPair<R>& e) {
+  template <class Pair>
+  DIFFVBD_FN static const auto& c6(const Pair& e) {
     return e.rest[3];
   }
 
   // g += dE/dx_i / h^2, and the block mu k I + (lh c6 / 6) n n^T; lh = lam + mu is the exact block, lam the paper's.
-  template <class R>
-  DIFFVBD_FN static void block(const TetPair<R>& e, const Vec3<R>& xi, Vec3<R>& g, R& h_diagonal, Sym3<R>& h_outer) {
+  template <class Pair, class R>
+  DIFFVBD_FN static void block(const Pair& e, const Vec3<R>& xi, Vec3<R>& g, R& h_diagonal, Sym3<R>& h_outer) {
     const R sixth = R(1) / R(6);
     const Vec3<R> ek = e.xk - e.xj, el = e.xl - e.xj, d = xi - e.xj;
     const Vec3<R> n = cross(ek, el);
@@ -77,8 +77,8 @@ struct StableNeoHookean {
     R strain;  // J - 1 at x_i; with the exact block at x_i + d_raw
     R after;   // J - 1 at x_i + d_raw
   };
-  template <class R>
-  DIFFVBD_FN static View<R> view(const TetPair<R>& e, const Vec3<R>& xi, const Vec3<R>& d_raw, const Vec3<R>& p) {
+  template <class Pair, class R>
+  DIFFVBD_FN static View<R> view(const Pair& e, const Vec3<R>& xi, const Vec3<R>& d_raw, const Vec3<R>& p) {
     const Vec3<R> at = Exact ? xi + d_raw : xi;
     const Vec3<R> ek = e.xk - e.xj, el = e.xl - e.xj, d = at - e.xj;
     const Vec3<R> n = cross(ek, el);
@@ -86,16 +86,16 @@ struct StableNeoHookean {
     return {ek, el, d, n, dot(n, p), strain, Exact ? strain : strain + c6(e) * dot(n, d_raw)};
   }
   // 6 V times the factor of q in the gradient at x_i + d_raw
-  template <class R>
-  DIFFVBD_FN static R stress(const TetPair<R>& e, const View<R>& v) {
+  template <class Pair, class R>
+  DIFFVBD_FN static R stress(const Pair& e, const View<R>& v) {
     if constexpr (Exact) return (mu(e) + lam(e)) * v.after - mu(e);
     return lam(e) * v.after + mu(e) * v.strain - mu(e);
   }
 
   // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 7-12, 14-15): of the corners, of the
   // material, of the rest shape.
-  template <class R>
-  DIFFVBD_FN static TetAdjoint<R> block_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw,
+  template <class Pair, class R>
+  DIFFVBD_FN static TetAdjoint<R> block_vjp(const Pair& e, const View<R>& v, const Vec3<R>& d_raw,
                                             const Vec3<R>& p, const R& minus_h2) {
     const R sixth = R(1) / R(6), lb = mu(e) + lam(e);
     const R b = sixth * minus_h2;
@@ -115,8 +115,8 @@ struct StableNeoHookean {
     out.xj = -(out.xi + out.xk + out.xl);
     return out;
   }
-  template <class R>
-  DIFFVBD_FN static void material_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
+  template <class Pair, class R>
+  DIFFVBD_FN static void material_vjp(const Pair& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
                                       const R& minus_h2, R* material_bar) {
     const R b = R(1) / R(6) * minus_h2;
     const R dj = -dot(v.d, p), dk = dot(v.ek - v.d, p), dl = dot(v.el - v.d, p);
@@ -125,8 +125,8 @@ struct StableNeoHookean {
     material_bar[0] = minus_h2 * stretch + b * (v.strain - R(1)) * v.n_p;
     material_bar[1] = b * v.after * v.n_p;
   }
-  template <class R>
-  DIFFVBD_FN static void rest_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
+  template <class Pair, class R>
+  DIFFVBD_FN static void rest_vjp(const Pair& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
                                   const R& minus_h2, R* rest_bar) {
     const R b = R(1) / R(6) * minus_h2, mu_h2 = minus_h2 * mu(e), lb = mu(e) + lam(e);
     const R dj = -dot(v.d, p), dk = dot(v.ek - v.d, p), dl = dot(v.el - v.d, p);
@@ -140,8 +140,8 @@ struct StableNeoHookean {
 
   // The derivative of the gradient dE/dx_i / h^2 at the view's state along the motion w of the four corners: the tet's
   // rows of the Hessian times w. Both blocks are of one energy, so of the same Hessian; the view's d_raw is 0.
-  template <class R>
-  DIFFVBD_FN static Vec3<R> product(const TetPair<R>& e, const View<R>& v, const Vec3<R>& wi, const Vec3<R>& wj,
+  template <class Pair, class R>
+  DIFFVBD_FN static Vec3<R> product(const Pair& e, const View<R>& v, const Vec3<R>& wi, const Vec3<R>& wj,
                                     const Vec3<R>& wk, const Vec3<R>& wl) {
     const R sixth = R(1) / R(6), lb = mu(e) + lam(e);
     const Vec3<R> fk = wk - wj, fl = wl - wj, f = wi - wj;
@@ -216,16 +216,16 @@ struct StableNeoHookean {
   }
 
   // Adds what small parts of d_raw and p, kept apart, do to n . p and to the strain.
-  template <class R>
-  DIFFVBD_FN static void correct(const TetPair<R>& e, View<R>& v, const Vec3<R>& d_low, const Vec3<R>& p_low) {
+  template <class Pair, class R>
+  DIFFVBD_FN static void correct(const Pair& e, View<R>& v, const Vec3<R>& d_low, const Vec3<R>& p_low) {
     v.n_p = v.n_p + dot(v.n, p_low);
     v.after = v.after + c6(e) * dot(v.n, d_low);
     if constexpr (Exact) v.strain = v.after;
   }
 
   // g_sum += dE/dx_i + (block) d_raw, p_sum += (block) p, both without h^2: what a solve has to meet, tet by tet.
-  template <class R>
-  DIFFVBD_FN static void apply(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
+  template <class Pair, class R>
+  DIFFVBD_FN static void apply(const Pair& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
                                Vec3<R>& g_sum, Vec3<R>& p_sum) {
     const R sixth = R(1) / R(6), k_ii = -(k_ij(e) + k_ik(e) + k_il(e));
     Vec3<R> stretch = k_ik(e) * (v.ek - v.d) + k_il(e) * (v.el - v.d) - k_ij(e) * v.d;
