@@ -1,7 +1,7 @@
 // What a tet of a generated law (own_law.h) reads: its rest shape, with a fibre a . grad N_a of its corners; with
 // DIFFVBD_LAW_VISCOUS the rest shape and the moduli of a second law, its viscosity in a step (docs/method.md, section
-// 20); then the law's parameters. They are among the scalars of the rest shape, so that any number of them takes the way that is
-// there; the material stays mu and lam, those of the law at rest, which no sweep reads.
+// 20); then the law's parameters. They are among the scalars of the rest shape, so that any number of them takes the
+// way that is there; the material stays mu and lam, those of the law at rest, which no sweep reads.
 #pragma once
 
 #include "../core/hyper_dual.h"
@@ -53,8 +53,8 @@ struct TetLayout {
   static constexpr int fibre = 7, viscous = fibre + (Density::fibre ? 4 : 0);
   static constexpr int parameters = viscous + (kViscous ? 9 : 0);
   static constexpr int rest = parameters + Density::parameters;
-  // as a vertex sees them: k_ij k_ik k_il (k_jk k_jl k_kl) c6 (b_j b_k b_l) (k_ij k_ik k_il c6 mu lam of the viscosity),
-  // then the parameters
+  // as a vertex sees them: k_ij k_ik k_il (k_jk k_jl k_kl) c6 (b_j b_k b_l) (k_ij k_ik k_il c6 mu lam of the
+  // viscosity), then the parameters
   static constexpr int pair_c6 = edges ? 6 : 3, pair_fibre = pair_c6 + 1;
   static constexpr int pair_viscous = pair_fibre + (Density::fibre ? 3 : 0);
   static constexpr int pair_parameters = pair_viscous + (kViscous ? 6 : 0);

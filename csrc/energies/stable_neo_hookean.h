@@ -95,8 +95,8 @@ struct StableNeoHookean {
   // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 7-12, 14-15): of the corners, of the
   // material, of the rest shape.
   template <class Pair, class R>
-  DIFFVBD_FN static TetAdjoint<R> block_vjp(const Pair& e, const View<R>& v, const Vec3<R>& d_raw,
-                                            const Vec3<R>& p, const R& minus_h2) {
+  DIFFVBD_FN static TetAdjoint<R> block_vjp(const Pair& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
+                                            const R& minus_h2) {
     const R sixth = R(1) / R(6), lb = mu(e) + lam(e);
     const R b = sixth * minus_h2;
     const R c6_n_p = c6(e) * v.n_p;
@@ -225,8 +225,8 @@ struct StableNeoHookean {
 
   // g_sum += dE/dx_i + (block) d_raw, p_sum += (block) p, both without h^2: what a solve has to meet, tet by tet.
   template <class Pair, class R>
-  DIFFVBD_FN static void apply(const Pair& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
-                               Vec3<R>& g_sum, Vec3<R>& p_sum) {
+  DIFFVBD_FN static void apply(const Pair& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p, Vec3<R>& g_sum,
+                               Vec3<R>& p_sum) {
     const R sixth = R(1) / R(6), k_ii = -(k_ij(e) + k_ik(e) + k_il(e));
     Vec3<R> stretch = k_ik(e) * (v.ek - v.d) + k_il(e) * (v.el - v.d) - k_ij(e) * v.d;
     if constexpr (!Exact) stretch += k_ii * d_raw;

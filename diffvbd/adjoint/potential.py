@@ -314,7 +314,8 @@ class IncreaseInputs(NamedTuple):
     material: Tensor  # [1 | B, blocks, 2, 8], mu and lam of the tets by body [Pa]
     rest: Tensor  # [1 | B, blocks, 7, 8]
     time_step: float
-    averaged: Averaged | None = None  # of a Model with patches, whose part material has not
+    averaged: Averaged | None  # of a Model with patches, whose part material has not
+    energies: int  # which operators, see ops.library_of
 
     @property
     def bodies(self) -> MovingBodies:
@@ -345,9 +346,9 @@ def bodies_of(model: System) -> MovingBodies:
         bool(model.energy_mask & ELASTIC)).to(model.device, model.dtype))  # fmt: skip
 
 
-def increase_inputs(model: System, fields: ops.SweepFields, time_step: float, averaged: Averaged | None = None
-                    ) -> IncreaseInputs:  # fmt: skip
-    """fields, averaged: as of IncrementalPotential."""
+def increase_inputs(model: System, fields: ops.SweepFields, time_step: float, averaged: Averaged | None = None,
+                    energies: int | None = None) -> IncreaseInputs:  # fmt: skip
+    """fields, averaged: as of IncrementalPotential.  energies: Of the step's settings; None: the Model's."""
     # contiguous: a state may be expanded over scenes
     fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore
     if model.patches is not None:
@@ -362,7 +363,8 @@ def increase_inputs(model: System, fields: ops.SweepFields, time_step: float, av
     for i, modulus in enumerate((fields.mu, fields.lam)):
         material[:, :, i] = modulus[..., None] if modulus.shape[1] == 1 else modulus[:, moving.tet]
     rest = moving.rest if fields.rest is None else fields.rest[:, moving.tet].transpose(-1, -2).contiguous()
-    return IncreaseInputs(model, fields, material, rest, time_step, averaged)
+    energies = model.energy_mask if energies is None else energies
+    return IncreaseInputs(model, fields, material, rest, time_step, averaged, energies)
 
 
 def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
@@ -371,7 +373,7 @@ def increase_of_bodies(inputs: IncreaseInputs, x: Tensor, to: Tensor) -> Tensor:
     model, moving, f = inputs.model, inputs.bodies, inputs.fields
     origin = x.new_empty((0,)) if f.origin is None else f.origin
     index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
-    operators = ops.library_of(model.energy_mask)
+    operators = ops.library_of(inputs.energies)
     out = operators.potential_increase(x, to.contiguous(), f.x_prev, f.y, f.mass, f.energy_data, origin,
                                          inputs.material, inputs.rest, *index, list(model._data_count),
                                          inputs.time_step)  # fmt: skip

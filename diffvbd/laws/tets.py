@@ -1,5 +1,6 @@
 """A law at a state, in torch: the energy of tets, its derivatives and the stress, from the scalars of the rest shape
-that the kernels read: k01 k02 k03 k12 k13 k23, c6, with fibres a0 . grad N of the corners, then the parameters.
+that the kernels read: k01 k02 k03 k12 k13 k23, c6, with fibres a0 . grad N of the corners; with viscosity the weights,
+c6 and the moduli of a second law; then the parameters.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from .density import Density
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of the first six scalars
 FIBRE = 7  # the first scalar of a fibre
+VISCOUS = 9  # scalars of viscosity; twin of TetLayout in csrc/energies/own_layout.h
 
 
 def measures(density: Density, corners: Tensor, rest: Tensor) -> tuple[Tensor, list[Tensor], Tensor | None]:
@@ -36,15 +38,28 @@ def measures(density: Density, corners: Tensor, rest: Tensor) -> tuple[Tensor, l
     return b, [trace, second, ratio, fourth], fibre
 
 
+def first_viscous(density: Density) -> int:
+    """Where the scalars of viscosity stand, or else the parameters."""
+    return FIBRE + 4 if density.fibre else FIBRE
+
+
 def parameters_of(density: Density, rest: Tensor) -> list[Tensor]:
-    first = FIBRE + 4 if density.fibre else FIBRE
-    return list(rest[..., first:].unbind(-1))
+    return list(rest[..., rest.shape[-1] - len(density.parameters) :].unbind(-1))
 
 
 def energy(density: Density, corners: Tensor, rest: Tensor) -> Tensor:
-    """V psi of each tet [J], [..., T]."""
+    """V psi of each tet [J], [..., T], and what viscosity adds to it in a step."""
     _, invariants, _ = measures(density, corners, rest)
-    return density.value(invariants, parameters_of(density, rest))[0] / (6 * rest[..., 6])
+    own = density.value(invariants, parameters_of(density, rest))[0] / (6 * rest[..., 6])
+    first = first_viscous(density)
+    if rest.shape[-1] == first + len(density.parameters):
+        return own
+    *weights, c6, mu, lam = rest[..., first : first + VISCOUS].unbind(-1)
+    one, two = torch.tensor(PAIRS, device=corners.device).T
+    squares = (corners[..., two, :] - corners[..., one, :]).square().sum(-1)
+    strain = c6 * invariants[2] / rest[..., 6] - 1  # J is c6 six volumes
+    of_volume = ((mu + lam) / 2 * strain.square() - mu * strain) / (6 * c6)
+    return own - mu / 2 * (torch.stack(weights, -1) * squares).sum(-1) + of_volume
 
 
 def cauchy(density: Density, corners: Tensor, rest: Tensor) -> Tensor:

@@ -9,6 +9,8 @@ from torch import Tensor
 from .._common.checks import input_name
 from .._common.constants import ELASTIC
 
+VISCOSITIES = ("viscosity", "volume_viscosity")  # of an elastic law
+
 
 class Input(NamedTuple):
     """An input of a step.
@@ -56,13 +58,14 @@ def inputs_of(model: Any) -> Inputs:
                  for name, value in model.law.values.items()]  # fmt: skip
         rows += [] if model.law.a0 is None else [Input("a0", "[..., T, 3]", "-", "law(a0=)", "law")]
         rows += [Input("stress_free", "[..., T, 3, 3]", "-", "identity", "law")]
+        rows += [Input(name, "[..., T]", "Pa s", "0", "law") for name in VISCOSITIES]
     elif model.energy_mask & ELASTIC:
         pairs = (("mu", "Pa"), ("lam", "Pa"), ("young", "Pa"), ("poisson", "-"))
         defaults = ("or young, poisson", "or young, poisson", "or mu, lam", "or mu, lam")
         rows += [Input(name, "[..., T]", unit, given, "StableNeoHookean")
                  for (name, unit), given in zip(pairs, defaults, strict=True)]  # fmt: skip
         rows += [Input("stress_free", "[..., T, 3, 3]", "-", "identity", "StableNeoHookean")]
-        rows += [Input(name, "[..., T]", "Pa s", "0", "StableNeoHookean") for name in ("viscosity", "volume_viscosity")]
+        rows += [Input(name, "[..., T]", "Pa s", "0", "StableNeoHookean") for name in VISCOSITIES]
     for name, (energy, key, own) in parameters_of(model).items():
         value = model.constants(energy)[key]
         shape = "".join(f", {n}" for n in value.shape[:own])

@@ -124,8 +124,7 @@ class Model:
             mask |= energy.bit
         if self.law is not None:
             self.law.check_mesh(self.mesh.num_tets)
-            density = self.law.density
-            mask |= ops.bits_of_law(density.digest, density.header, density.quadratic, dtype, device)
+            mask |= ops.bits_of_law(self.law.density, dtype, device)
         return mask
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:

@@ -49,7 +49,7 @@ from .fields import (
     tape_rows,
     tape_shape,
 )
-from .laws import bits_of_law, library_of
+from .laws import bits_of_law, library_of, own_bits
 from .load import has_cuda, raw, require_cuda
 from .sums import broadcast, star_sum, tet_gather
 from .sweep import fused_step, pack_rest, plan_order, run_sweep, sweep, sweep_backward

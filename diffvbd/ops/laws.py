@@ -45,14 +45,16 @@ def own_bits(energies: int) -> int:
     return energies & (DECIDES - 1)
 
 
-def bits_of_law(digest: str, header: str, quadratic: bool, dtype: torch.dtype, device: torch.device) -> int:
-    """What a law adds to a mask; compiles and loads it at its first use. digest: of the header.
+def bits_of_law(density: Any, dtype: torch.dtype, device: torch.device, viscous: bool = False) -> int:
+    """What a law adds to a mask; compiles and loads it at its first use. density: Its laws.density.Density. viscous:
+    Together with the viscosity of a step, whose scalars stand before the law's parameters (step/damping.py).
 
     Raises:
         RuntimeError: Without a compiler, or with the last lines of what it says.
     """
     scalar = "double" if dtype == torch.float64 else "float"
-    name = f"{digest}_{scalar}"
+    header = "#define DIFFVBD_LAW_VISCOUS\n" * viscous + density.header
+    name = f"{density.digest}{'v' * viscous}_{scalar}"
     if name not in _numbers:
         torch.ops.load_library(str(_object(name, header, scalar)))
         _libraries.append(Direct(getattr(torch.ops, f"diffvbd_law_{name}")))
@@ -60,7 +62,7 @@ def bits_of_law(digest: str, header: str, quadratic: bool, dtype: torch.dtype, d
     if device.type == "cuda" and name not in _on_cuda:
         torch.ops.load_library(str(_object(name, header, scalar, cuda=True)))
         _on_cuda.add(name)
-    return _numbers[name] << LAW_SHIFT | (0 if quadratic else DECIDES)
+    return _numbers[name] << LAW_SHIFT | (0 if density.quadratic else DECIDES)
 
 
 def _object(name: str, header: str, scalar: str, cuda: bool = False) -> Path:

@@ -434,15 +434,15 @@ def _descending(energies: list[Any], hessian: Tensor, raw: Tensor, update: Tenso
 def _lowering(energies: list[Any], law: Law, k: int, mass: Tensor, y: Tensor, state: Tensor, x_prev: Tensor,
               update: Tensor) -> Tensor:  # fmt: skip
     """The same for a law that is not quadratic in one vertex, from the whole potential of each vertex of color k; that
-    of pairs and of friction by their gradients and blocks."""
+    of pairs, friction and viscosity by their gradients and blocks."""
     vertices = law.scene.layout.colors[k].vertices
     x = take(state, vertices)
-    others = [e for e in energies if not isinstance(e, StableNeoHookean)]
-    contact = [e for e in others if isinstance(e, FloorFriction) or not hasattr(e, "terms")]
-    blocks = [e.block(k, state, x_prev).split((3, 6), -2) for e in contact]
+    others = [e for e in energies if e is not law]
+    modelled = [e for e in others if isinstance(e, FloorFriction | Viscosity) or not hasattr(e, "terms")]
+    blocks = [e.block(k, state, x_prev).split((3, 6), -2) for e in modelled]
 
     def of_vertices(at: Tensor) -> list[Tensor]:
-        parts = [e.terms(at, x_prev) for e in others if e not in contact]
+        parts = [e.terms(at, x_prev) for e in others if e not in modelled]
         return [at.new_zeros(*at.shape[:-2], at.shape[-1]).index_add(-1, vertex, terms)[..., vertices]
                 for terms, vertex in parts]  # fmt: skip
 

@@ -33,7 +33,7 @@ from .._contact.colliders import MOST_LENGTH, Plane
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..couplings import COUPLINGS, Coupling
 from ..energies import VERTEX_ENERGIES
-from ..model.inputs import inputs_of, parameters_of
+from ..model.inputs import VISCOSITIES, inputs_of, parameters_of
 from ..model.material import deformed, determinant, lumped_mass, moduli_of, rest_metric
 from ..model.model import Model
 from ..model.patches import Averaged, uniform
@@ -44,7 +44,6 @@ from .law import law_inputs, law_rest
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 MODULI = ("mu", "lam", "young", "poisson")
-VISCOSITIES = ("viscosity", "volume_viscosity")
 OF_TETS = (*MODULI, "density", *VISCOSITIES)  # a value for each tet
 OF_ELASTIC = (*MODULI, "stress_free", *VISCOSITIES)  # inputs of a Model with an elastic law
 MATERIAL = (*MODULI, "rest_points", "density", "stress_free", *VISCOSITIES, "drag")
@@ -71,6 +70,7 @@ class Damping(NamedTuple):
     volume_viscosity: Tensor | None
     drag: Tensor | None  # [1 | B, 1 | V] [1/s]
     corners: Tensor | None  # of the tets' rest shapes [B, T, 4, 3]; None: the Model's
+    moduli: tuple[Tensor, Tensor]  # without viscosity [Pa], as the coarse matrices differentiate them
 
 
 class Drag(NamedTuple):
@@ -143,7 +143,7 @@ def given_of(model: Model, inputs: dict[str, Any]) -> Given:
         elif name in own:
             if value is not None:
                 parameters[name] = value
-        elif name in material and (name not in OF_ELASTIC or (elastic and not own) or name == "stress_free" and own):
+        elif name in material and (name not in OF_ELASTIC or (elastic and not own) or name not in MODULI and own):
             material[name] = value
         else:
             known = parameters_of(model) if known is None else known
@@ -284,7 +284,7 @@ def prepare(
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
     damping = None
     if viscosity is not None or bulk is not None or drag is not None:
-        damping = _damping(model, like, lead, material, corners)
+        damping = _damping(model, like, lead, material, corners, (materials[0], materials[1]))
     return Prepared(
         mu=materials[0] if law is None else materials[0].detach(),
         lam=materials[1] if law is None else materials[1].detach(),
@@ -324,8 +324,8 @@ def _not_negative(value: Tensor, name: str, axes: tuple[str, ...]) -> Tensor:
 _looked_at = ops.Linear(_not_negative, lambda bar, shape, *_: bar, 3, lambda info, *args: _looked_at(*args))
 
 
-def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str, Any], corners: Tensor | None
-             ) -> Damping:  # fmt: skip
+def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str, Any], corners: Tensor | None,
+             moduli: tuple[Tensor, Tensor]) -> Damping:  # fmt: skip
     """corners: of the tets' rest shapes [B, T, 4, 3] where a step is given those."""
     out: dict[str, Tensor | None] = {}
     for name in (*VISCOSITIES, "drag"):
@@ -339,7 +339,7 @@ def _damping(model: System, like: Tensor, lead: tuple[int, ...], given: dict[str
             if model.block == "paper" and name != "drag":
                 fail(name, 'a solver with block="exact"', 'one with block="paper"')
         out[name] = value
-    return Damping(**out, corners=corners)
+    return Damping(**out, corners=corners, moduli=moduli)
 
 
 def _unrolled(model: System, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,

@@ -230,8 +230,9 @@ class ContactStep:
     @functools.cached_property
     def increase_inputs(self) -> IncreaseInputs:
         """Common data of the step's comparisons of potentials."""
-        return increase_inputs(self.model, self.fields, self.prepared.settings.numbers.time_step,
-                               self.prepared.averaged)  # fmt: skip
+        settings = self.prepared.settings
+        return increase_inputs(self.model, self.fields, settings.numbers.time_step, self.prepared.averaged,
+                               settings.energies)  # fmt: skip
 
     def _inverted(self, x: Tensor) -> Tensor:
         """Scenes with an inverted tet, bool [B]."""
@@ -459,7 +460,7 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
             if corrections is None or of.begun.renews:
                 fields = touching(of, x, collider, start, listed)
                 own = of.fields if of.begun.law is None else replaced(of.fields, **of.begun.renewed(x))
-                corrections = Corrections(of.model, own, fields, matrix, settings.numbers)
+                corrections = Corrections(of.model, own, fields, matrix, settings)
             x, length = corrections.correct(x)
             lengths.append(length)
         x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))

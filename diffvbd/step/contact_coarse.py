@@ -77,18 +77,18 @@ class Corrections:
         model, fields: Of the step, before its sweeps.
         touching: Pairs, planes and trust regions of the sweeps.
         packed: Matrices of all bodies without vertex energies and pairs, differentiable.
-        numbers: Of the sweeps.
+        settings: Of the sweeps.
     """
 
     def __init__(self, model: System, fields: ops.SweepFields, touching: ops.TouchingFields, packed: Tensor,
-                 numbers: ops.StepNumbers) -> None:  # fmt: skip
+                 settings: ops.SweepSettings) -> None:  # fmt: skip
         self.space = model.derived("contact_space", lambda: _space(model))
         at = touching._fields.index("order")
         self.touching = [t.contiguous() for t in (*touching[:at], *self.space.bodies, *touching[at + 5 :])]
         rest = model.rest_scalars if fields.rest is None else fields.rest
         self.rest = [t.contiguous() for t in (fields.mu, fields.lam, rest, packed)]
-        options = (model._data_count, numbers.time_step, numbers.friction_eps)
-        self.constants = (self.space.functions, options, ops.library_of(model.energy_mask))
+        options = (model._data_count, settings.numbers.time_step, settings.numbers.friction_eps)
+        self.constants = (self.space.functions, options, ops.library_of(settings.energies))
 
     def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """x [B, V, 3] after a correction, and its length for each matrix [B, matrices]."""

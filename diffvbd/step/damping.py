@@ -8,18 +8,22 @@ corners with the same terms, and their sum is again a stable Neo-Hookean law, of
     r = (S_1 + J S_2) / (S_1 + S_2),    S = 2 mu + lam
     mu = r (mu_1 + mu_2),    lam = r (lam_1 + lam_2),    c6 = c6_1 / r,    r mu k_ab = ... = mu_1 k_ab,1 + mu_2 k_ab,2
 
+With a law of one's own the second law stays apart: its metric n_a . n_b c6 / (6 J), c6 / J and moduli J times these are
+scalars of the rest shape, which an object of the law that has them reads.
+
 Drag: m drag (x - x_start) / h only shifts the predictor y of the step and enlarges the mass.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .. import ops
 from .._common.context import replaced
+from ..laws.tets import first_viscous
 from ..model.material import determinant, face_normals, stiffness_weights
 from ..model.system import System
 from .arguments import Damping, Drag, Prepared
@@ -103,7 +107,7 @@ def _viscous(model: System, prepared: Prepared, damping: Damping, products: Tens
     """products: n_a . n_b of the tets' faces where the motion starts [B, T, 6]; six_volumes: 6 V there [B, T]."""
     h, rest = prepared.settings.numbers.time_step, prepared.rest
     rest = model.rest_scalars if rest is None else rest
-    given = prepared.mu, prepared.lam, damping.viscosity, damping.volume_viscosity
+    given = *damping.moduli, damping.viscosity, damping.volume_viscosity
     scenes = max(len(t) for t in (products, rest, *given) if t is not None)
     shape = scenes, model.num_tets
 
@@ -118,15 +122,25 @@ def _viscous(model: System, prepared: Prepared, damping: Damping, products: Tens
     all_shear, all_volume = (rate / h for rate in rates)
     shear, volume = (torch.where(upright, rate, 0.0) for rate in (all_shear, all_volume))
     ratio = torch.where(upright, ratio, 1.0)
-    elastic, viscous = 2 * mu + lam, 2 * shear + volume
-    total = elastic + viscous
-    r = torch.where(total > 0, (elastic + ratio * viscous) / torch.where(total > 0, total, 1.0), 1.0)
-    both = mu + shear + LEAST
-    share = (shear / both)[..., None]
     at_start = (c6 / 6)[..., None] * products
-    metric = torch.cat([(weights + share * (at_start - weights)) / r[..., None], (c6 / r)[..., None]], -1)
+    out: dict[str, Any] = {}
+    if model.law is not None:
+        density, first = model.law.density, first_viscous(model.law.density)
+        second = [at_start / ratio[..., None], torch.stack([c6 / ratio, ratio * shear, ratio * volume], -1)]
+        metric = torch.cat([own[..., :first], *second, own[..., first:]], -1)
+        bits = ops.bits_of_law(density, model.dtype, model.device, viscous=True)
+        energies = ops.own_bits(prepared.settings.energies) | bits
+        out["settings"] = replaced(prepared.settings, energies=energies)
+    else:
+        elastic, viscous = 2 * mu + lam, 2 * shear + volume
+        total = elastic + viscous
+        r = torch.where(total > 0, (elastic + ratio * viscous) / torch.where(total > 0, total, 1.0), 1.0)
+        both = mu + shear + LEAST
+        share = (shear / both)[..., None]
+        metric = torch.cat([(weights + share * (at_start - weights)) / r[..., None], (c6 / r)[..., None]], -1)
+        out |= {"mu": r * both, "lam": r * (lam + volume)}
     coarse = prepared.coarse
     if coarse is not None:  # whose matrices are those of the shape at rest
         parts = coarse_parts(model, mu + all_shear, lam + all_volume, None, metric, damping.corners)
         coarse = replaced(parts, mass=coarse.mass)
-    return replaced(prepared, mu=r * both, lam=r * (lam + volume), rest=metric, coarse=coarse)
+    return replaced(prepared, rest=metric, coarse=coarse, **out)

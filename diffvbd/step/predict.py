@@ -144,7 +144,7 @@ def begin(
     begins = partial(
         start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, *moduli[:2],
         rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
-        start=model.starts_from, filters=filters, parts=parts, energies=model.energy_mask,
+        start=model.starts_from, filters=filters, parts=parts, energies=prepared.settings.energies,
     )  # fmt: skip
     x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:

@@ -189,8 +189,8 @@ class Mode:
         return torch.exp(-ratio * w * t) * torch.sin(damped * t) / damped
 
     def recovered(self, true: float, seed: int = 3, noise: float = 0.01) -> float:
-        """Damping ratio recovered from a noisy motion, by the gradient of the rollout. It is seen until it has decayed to
-        1 / e, three periods at least."""
+        """Damping ratio recovered from a noisy motion, by the gradient of the rollout. It is seen until it has decayed
+        to 1 / e, three periods at least."""
         per_period = 40
         steps = per_period * max(3, round(1 / (2 * math.pi * true)))
         solver = self.solver(per_period, 20, SDIRK2())

@@ -262,9 +262,9 @@ def test_converged_routes_and_rest_states() -> None:
 def test_inputs_and_refusals() -> None:
     model = model_of()
     x, v, solver = model.rest_points, torch.zeros_like(model.rest_points), dv.VBD(0.01, 2)
-    assert {"mu", "lam", "c", "m", "k", "s", "a0", "stress_free"} <= set(model.inputs)
-    assert not {"young", "viscosity"} & set(model.inputs)
-    for name, value in (("young", 1e5), ("viscosity", 10.0), ("poisson", 0.3)):
+    assert {"mu", "lam", "c", "m", "k", "s", "a0", "stress_free", "viscosity", "drag"} <= set(model.inputs)
+    assert "young" not in model.inputs
+    for name, value in (("young", 1e5), ("poisson", 0.3)):
         with pytest.raises(TypeError, match=f"{name}: expected an input of this Model .*which has no StableNeoHookean"):
             dv.step(model, x, v, solver, **{name: value})
     with pytest.raises(ValueError, match='block: expected "exact" with a law of your own'):

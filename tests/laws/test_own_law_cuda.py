@@ -61,6 +61,12 @@ def test_contact(name: str, subspace: Any) -> None:
     same_on_both(model, scene.solver(4, subspace=subspace), inputs, 1e-9, gravity=GRAVITY)
 
 
+def test_viscosity() -> None:
+    model = model_of(text=LOG)
+    inputs = inputs_of_law(model, 0.01) | {"viscosity": torch.full((model.num_tets,), 300.0, dtype=torch.float64)}
+    same_on_both(model, dv.VBD(0.01, 4), inputs)
+
+
 def test_float32_and_a_captured_step() -> None:
     model, solver = model_of(text=LOG), dv.VBD(0.01, 8)
     rest = model.rest_points
