@@ -367,6 +367,9 @@ def _of_smaller_steps(inputs: dict[str, Any], parts: int, model: Model) -> dict[
         before = out.get("colliders_before")
         first = model.collider_points if before is None else before
         out["colliders"] = _between(out["colliders"].values, first, parts)
+    elif callable(out.get("colliders")) and not isinstance(out["colliders"], Tensor):
+        before = out.get("colliders_before")
+        out["colliders"] = _led(out["colliders"], model.collider_points if before is None else before, parts)
     return out
 
 
@@ -413,6 +416,18 @@ def _moving(value: Any, parts: int, model: Model) -> Any:
         way = begin + (end - begin) * ((step % parts + 1) / parts)
         # a policy has given elsewhere where vertices were: that is checked in the first smaller step, and old in others
         return torch.where(pinned, way, end if step % parts == 0 else x)
+
+    return now
+
+
+def _led(value: Callable[[int, Tensor, Tensor], Any], first: Tensor, parts: int) -> Callable[..., Tensor]:
+    """Positions of colliders that a function moves, at the end of each smaller step."""
+    ends, begins = _kept(value, parts), {0: first}
+
+    def now(step: int, x: Tensor, v: Tensor) -> Tensor:
+        asked, end = step // parts, ends(step, x, v)
+        begins[asked + 1] = end
+        return begins[asked] + (end - begins[asked]) * ((step % parts + 1) / parts)
 
     return now
 

@@ -12,7 +12,16 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .._common.checks import check_bool, check_count, check_function, check_kind, check_positive, check_save, fail
+from .._common.checks import (
+    check_bool,
+    check_count,
+    check_function,
+    check_kind,
+    check_positive,
+    check_save,
+    check_tensor,
+    fail,
+)
 from .._common.context import looks_at, recorders, refinement, replaced
 from .._common.messages import is_own
 from ..adjoint.routes import Adjoint, check_adjoint
@@ -69,8 +78,9 @@ def rollout(
             A function may close over tensors and modules that require grad: they get gradients under every schedule. A
             checkpointed segment calls it again in the backward, where it must return the same: no state that it keeps
             from call to call, nothing that has changed in place since. ``prescribed`` may also have the initial x where
-            a vertex is not pinned. ``colliders`` are a tensor, and rest there, or per_step: where they are at the end
-            of each step; ``colliders_before``: where these are at the start; None: the Model's collider_points.
+            a vertex is not pinned. ``colliders`` are a tensor, and rest there, or per_step or a function: where they
+            are at the end of each step, from which their velocity follows; ``colliders_before``: where these are at the
+            start; None: the Model's collider_points.
         save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
             the last, or only the ``"last"``.
         observe: Called after each step as observe(step, x, v) with step = 1 ... steps; its results (a tensor, or a
@@ -161,19 +171,22 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
     solves: dict[int, Any] = {}  # by step, of a few: a segment that runs again finds them
     ending = look_at_end(checks.energy, model, scheme, x, v, steps, execution)
 
-    outer = x
+    outer, moves = x, _is_function(loads["colliders"])
 
     def segment(first: int, end: int, x: Tensor, v: Tensor, *before: Tensor) -> Segment:
         for name, tensor, version in versions:
             if tensor._version != version:
                 raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
         frames, observed = [], []
+        points = before[-1] if moves else None  # of the colliders that a function moves
+        before = before[:-1] if moves else before
         past = History(before[0], before[1], before[2], h) if before else None
         for k in range(first, end):
             run = partial(advance, adjoint=adjoint, index=k)
             try:
                 now = prepare(model, lead, _at_step(material, own, k, x, v), **chosen) if fixed is None else fixed
-                given = _to_advance(model, loads, k, x, v, outer)
+                given = _to_advance(model, loads, k, x, v, outer, points)
+                points = given["colliders"] if moves else None
                 check_staged(scheme, given)
                 v_before = v
                 x, v, past, solve = take(scheme, model, x, v, past, now, given, run)
@@ -201,11 +214,13 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
                 observed.append(observe(k + 1, x, v))
             if bar is not None:
                 bar.show(k + 1)
-        return Segment((x, v, *(past[:3] if past else ())), frames, observed)
+        return Segment((x, v, *(past[:3] if past else ()), *([points] if moves else [])), frames, observed)
 
+    begins = [_first_points(model, loads, x)] if moves else []
     done = run_segments(
-        segment, steps, (x, v, *(history[:3] if history else ())), every if torch.is_grad_enabled() else None
+        segment, steps, (x, v, *(history[:3] if history else ()), *begins), every if torch.is_grad_enabled() else None
     )
+    _, _, *past = done.end[:-1] if moves else done.end
     if last:
         warn_of_contact(model, cuts, *last)
         last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
@@ -223,7 +238,7 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
         steps=[f[0] for f in frames],
         observations=stacked(done.observed),
         errors=of_steps([errors[k] for k in range(steps)], model, x, solver.sweeps) if checks.errors else None,
-        history=History(done.end[2], done.end[3], done.end[4], h) if len(done.end) > 2 else None,
+        history=History(past[0], past[1], past[2], h) if past else None,
     )
     if not torch.compiler.is_compiling():
         for heard in recorders("rollout"):  # of a viewer, which has no use for the graph
@@ -239,10 +254,11 @@ def _check_values(inputs: Given, steps: int) -> None:
     colliders = inputs.loads["colliders"]
     for name in ("prescribed", "colliders"):
         refuse_average(name, inputs.loads[name])
-    if _changes(colliders) and not isinstance(colliders, PerStep):
-        raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
-    if inputs.loads["colliders_before"] is not None and not isinstance(colliders, PerStep):
-        raise TypeError("colliders_before: expected it with per_step colliders, which it is the start of")
+    before = inputs.loads["colliders_before"]
+    if _changes(before):
+        raise TypeError(f"colliders_before: expected a tensor, got {type(before).__name__}")
+    if before is not None and not (_changes(colliders) or isinstance(colliders, PerStep)):
+        raise TypeError("colliders_before: expected it with colliders per_step or by a function, whose start it is")
     for part in inputs:
         for name, value in part.items():
             if isinstance(value, PerStep) and value.values.shape[0] != steps:
@@ -257,8 +273,10 @@ def _at_step(material: dict[str, Any], own: dict[str, Any], k: int, x: Tensor, v
     return Given(now[0], now[1], {})
 
 
-def _to_advance(model: System, loads: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor) -> dict[str, Any]:
-    """The loads of step k; ``start``: x before the first step."""
+def _to_advance(model: System, loads: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,
+                points: Tensor | None) -> dict[str, Any]:  # fmt: skip
+    """The loads of step k; ``start``: x before the first step.  points: Where the step before has left colliders that
+    a function moves."""
     now = {name: _at(name, value, k, x, v) for name, value in loads.items()}
     if _changes(loads["prescribed"]) and not isinstance(loads["prescribed"], _Steps):
         for value in _tensors(now["prescribed"]):
@@ -268,7 +286,14 @@ def _to_advance(model: System, loads: dict[str, Any], k: int, x: Tensor, v: Tens
         before = loads["colliders_before"]
         first = model.collider_points if before is None else before
         now["colliders_before"] = loads["colliders"][k - 1] if k else first
+    elif points is not None:
+        now["colliders"], now["colliders_before"] = check_tensor("colliders", now["colliders"], x), points
     return now
+
+
+def _first_points(model: System, loads: dict[str, Any], x: Tensor) -> Tensor:
+    before = loads["colliders_before"]
+    return model.collider_points if before is None else check_tensor("colliders_before", before, x)
 
 
 def _versions(inputs: dict[str, Any]) -> list[tuple[str, Tensor, int]]:
@@ -296,7 +321,11 @@ def _frozen(value: Any, time_step: float) -> Any:
 
 
 def _changes(value: Any) -> bool:
-    return isinstance(value, _Steps) or (callable(value) and not isinstance(value, Tensor))
+    return isinstance(value, _Steps) or _is_function(value)
+
+
+def _is_function(value: Any) -> bool:
+    return callable(value) and not isinstance(value, Tensor)
 
 
 def _at(name: str, value: Any, k: int, x: Tensor, v: Tensor) -> Any:
