@@ -61,8 +61,8 @@ class Robot:
         self._origins = torch.from_numpy(np.array(origins).reshape(-1, 4, 4).astype(np.float64))
         lengths = np.linalg.norm(np.array(axes).reshape(-1, 3), axis=1, keepdims=True)
         self._axes = torch.from_numpy(np.array(axes).reshape(-1, 3) / np.where(lengths > 0, lengths, 1.0))
-        surfaces = {link.name: _surface(urdf, link) for link in urdf.robot.links}
-        self.links = tuple(name for name, surface in surfaces.items() if surface is not None)
+        surfaces = {link.name: _surface(urdf, link) for link in urdf.robot.links if link.collisions}
+        self.links = tuple(surfaces)
         if not self.links:
             fail("path", "a robot with collision shapes", "none")
         self._points = [torch.from_numpy(surfaces[name][0]) for name in self.links]  # of each link, in its frame
@@ -210,11 +210,12 @@ def _in_order(robot: Any) -> list[Any]:
     return out
 
 
-def _surface(urdf: Any, link: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """Points and triangles of a link's collision shapes in its frame; None without any."""
+def _surface(urdf: Any, link: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points and triangles of a link's collision shapes in its frame."""
     import trimesh
 
     points, triangles, count = [], [], 0
+    mesh: Any
     for collision in link.collisions:
         shape = collision.geometry
         if shape.box is not None:
@@ -234,7 +235,7 @@ def _surface(urdf: Any, link: Any) -> tuple[NDArray[np.float64], NDArray[np.int6
         points.append(own)
         triangles.append(np.asarray(mesh.faces, dtype=np.int64) + count)
         count += len(own)
-    return (np.concatenate(points), np.concatenate(triangles)) if points else None
+    return np.concatenate(points), np.concatenate(triangles)
 
 
 def _turned(axis: Tensor, angle: Tensor) -> Tensor:

@@ -214,7 +214,7 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
                 observed.append(observe(k + 1, x, v))
             if bar is not None:
                 bar.show(k + 1)
-        return Segment((x, v, *(past[:3] if past else ()), *([points] if moves else [])), frames, observed)
+        return Segment((x, v, *(past[:3] if past else ()), *([] if points is None else [points])), frames, observed)
 
     begins = [_first_points(model, loads, x)] if moves else []
     done = run_segments(
