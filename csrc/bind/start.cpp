@@ -37,7 +37,7 @@ DIFFVBD_OPERATOR(Out<8>, contact_start, In x, In move, In u, In rigid, In trust_
     gate.units_of_scene = gate.vertices, gate.careful = true;
     s.in.move = read.vectors("move", move), s.in.rigid = read.vectors_or_null("rigid", rigid);
     s.in.trust_radius = read.like("trust_radius", trust_radius, b * (bodies + 1));
-    const bool own = s.in.rigid != nullptr;
+    const bool own = rigid.dim() == 3;
     if (own) s.in.deformation_radius = read.like("deformation_radius", deformation_radius, b * (bodies + 1));
     s.in.floor = floor_of(read, floor), s.in.floor_planes = planes_of(floor), s.in.closed = static_cast<T>(closed);
     const Tensor memory = workspace(device, [&](auto& take) { s.m.parts(take, b * v); });

@@ -1,6 +1,6 @@
-// The start of a substep with contact (docs/method.md, section 12): each unit, a free body or a vertex of one that is
-// pinned, goes the largest of the fractions 1, 1/2, ..., 1/64 and 0 of its displacement relative to its island that
-// keeps its radii and the gaps to floors, and of that what advance.h lets it go.
+// The start of a substep with contact (docs/method.md, section 12). A unit is a free body, or a vertex of a body that
+// is pinned. It goes a fraction of its displacement relative to its island: the largest of 1, 1/2, ..., 1/64 and 0 that
+// keeps its radii and the gaps to floors, times the fraction that keeps its pairs apart (advance.h).
 #pragma once
 
 #include "../core/safeguards.h"
@@ -89,7 +89,7 @@ struct ClearUnit {
     for (int k = 0; k < kLeastStart + 2; ++k) s.m.refused[(kLeastStart + 2) * row + k] = 0;
   }
 };
-// Refuses what is too much for a vertex to its unit.
+// Marks the fractions that a vertex does not admit, for its unit.
 struct LimitStart {
   template <class T>
   DIFFVBD_FN void operator()(const StartStep<T>& s, int64_t row) const {

@@ -6,7 +6,7 @@
 // run.rows() phase(step, row) for listed and then lagged pairs, run.parts() phase(step, row, part) for the former,
 // run.bodies() phase(step, body, team), run.groups() phase(step, scene, place, team), and run.points() phase(step,
 // point, team) for corner points. What a loop wrote the next one may read. run.all(flags, n): whether n flags are set,
-// run.none(flags, n) whether none is, where that can be told.
+// run.none(flags, n) whether none is; both false on launches, where the host would wait.
 #pragma once
 
 #include "coarse.h"

@@ -16,8 +16,8 @@ DIFFVBD_FN R square_in(const Factor<R>& H, const Vec3<R>& d) {
   return first * first / H.inv1 + second * second / H.inv2 + d.z * d.z / H.inv3;
 }
 
-// The same for a law that is not quadratic in one vertex: the change of the vertex's whole potential, tet by tet; that
-// of pairs by their part of g and H.
+// The same for a law that is not quadratic in one vertex: the change of the vertex's whole potential, tet by tet. Pairs
+// count by their quadratic model.
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN R descending_fraction(const Block<R>& b, const Star& star, const StepParameters<T>& q, const Update<R>& u) {
   const Vec3<R> whole = u.alpha * u.step;

@@ -85,8 +85,8 @@ class LawTets:
 
     @cached_property
     def size(self) -> Tensor:
-        """The energy of each scene that rounding of the invariants is a share of, [B]: psi may be small where its terms
-        are not."""
+        """The sizes of the terms of each scene's energy, [B], whose rounding the energy has: it may be small where they
+        are not. Those of viscosity are left out: only statics ask, which have none."""
         corners, rest = self.corners.detach(), self.rest.detach()
         _, invariants, _ = measures(self.density, corners, rest)
         slopes = self.density.slopes(invariants, parameters_of(self.density, rest))

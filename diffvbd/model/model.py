@@ -333,8 +333,8 @@ class Model:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
         self.__dict__.update(lasting(state))
         self._derived = {}
-        self.energy_mask = self._mask(self.dtype, self.device)
         actual = checked_device(self._mass.device)
+        self.energy_mask = self._mask(self.dtype, actual)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
 

@@ -224,8 +224,8 @@ def start_substep(x: Tensor, move: Tensor, u: Tensor, rigid: Tensor, trust_radiu
                   floor: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, pinned: Tensor, body: Tensor,
                   unit: Tensor, listed: Sequence[Tensor]) -> SubstepStart:  # fmt: skip
     """``x + u + f (move - u)``, differentiable in x and move. The fraction f is the largest of 1, 1/2, ..., 1/64 and 0
-    that keeps radii and gaps to floors, and of that what keeps pairs: one for each free body, one for each vertex of a
-    body that is pinned.
+    that keeps radii and gaps to floors, times the fraction that keeps pairs apart: one for each free body, one for each
+    vertex of a body that is pinned.
 
     Args:
         x, move: [B, V, 3], state and wanted displacement [m].  u: Translation of each body's island [B, NB, 3] [m].

@@ -70,10 +70,10 @@ def _object(name: str, header: str, scalar: str, cuda: bool = False) -> Path:
     flags = [*_FLAGS, *_native(), "-O1" if os.environ.get("DIFFVBD_QUICK") else "-O3"]
     parts = [compiler, *flags, torch.__version__]
     if cuda:
-        from . import build_cuda
-
-        parts += [str(torch.version.cuda), *_architecture(), *build_cuda.NVCC_FLAGS]
+        parts += [str(torch.version.cuda), *_architectures()]
     digest = hashlib.sha256(" ".join(parts).encode())
+    for file in (__file__, Path(__file__).with_name("build_cuda.py")):  # what is compiled, and how
+        digest.update(Path(file).read_bytes())
     ends = (".h", ".cpp", ".cu", ".cuh") if cuda else (".h", ".cpp")
     for path in sorted(p for p in sources().rglob("*") if p.suffix in ends):
         digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
@@ -83,9 +83,10 @@ def _object(name: str, header: str, scalar: str, cuda: bool = False) -> Path:
                   lambda folder: build(folder, name, header, scalar, compiler, flags))  # fmt: skip
 
 
-def _architecture() -> list[str]:
-    major, minor = torch.cuda.get_device_capability()
-    return [f"-gencode=arch=compute_{major}{minor},code=sm_{major}{minor}"]
+def _architectures() -> list[str]:
+    """Of all visible devices."""
+    found = sorted({torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())})
+    return [f"-gencode=arch=compute_{major}{minor},code=sm_{major}{minor}" for major, minor in found]
 
 
 def _native() -> list[str]:
@@ -130,11 +131,17 @@ def _compile_cuda(folder: Path, name: str, header: str, scalar: str, compiler: s
         paths.append(folder / file)
         paths[-1].write_text(text, encoding="utf-8")
     paths += [root / "cuda" / f"{path}.cu" for path in _CUDA]
-    nvcc = [str(Path(CUDA_HOME, "bin", "nvcc")), *build_cuda.NVCC_FLAGS, *_architecture(), "-Xcompiler", "-fPIC", "-w",
+    nvcc = [str(Path(CUDA_HOME, "bin", "nvcc")), *build_cuda.NVCC_FLAGS, *_architectures(), "-Xcompiler", "-fPIC", "-w",
             *given]  # fmt: skip
     host = [*shlex.split(compiler), *_COMMON, "-O3", "-DUSE_CUDA", *given, *_included("cuda")]
     jobs = [*((nvcc, path) for path in paths), *((host, root / f"{path}.cpp") for path in _BIND)]
-    libraries = [f"-L{Path(CUDA_HOME, 'lib64')}", "-ltorch_cpu", "-ltorch_cuda", "-lc10", "-lcudart"]
+    libraries = [
+        *(f"-L{Path(CUDA_HOME, name)}" for name in ("lib64", "lib")),
+        "-ltorch_cpu",
+        "-ltorch_cuda",
+        "-lc10",
+        "-lcudart",
+    ]
     return _linked(folder, "law_cuda.so", compiler, jobs, libraries)
 
 

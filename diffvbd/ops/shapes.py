@@ -167,6 +167,14 @@ def _contact_compact(a: Any) -> Any:
             new(like, 4 * count, dtype=INT))  # fmt: skip
 
 
+def _contact_start(a: Any) -> Any:
+    scenes, vertices, _ = a.x.shape
+    own = scenes if a.rigid.dim() == 3 else 0
+    return (torch.empty_like(a.x), torch.empty_like(a.x), new(a.x, own, vertices, 3), new(a.x, scenes, vertices),
+            new(a.x, own, vertices), new(a.x, scenes, vertices), new(a.x, scenes, vertices, dtype=torch.bool),
+            new(a.x, 1, dtype=LONG))  # fmt: skip
+
+
 def _contact_trust_radii(a: Any) -> Any:
     b, n = a.x.shape[0], _bodies(a)
     return new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1)
@@ -236,9 +244,7 @@ TABLE: dict[str, Row] = {
                                  new(a.x, a.x.shape[0], _bodies(a), 4)),
     "contact_trust_radii": _contact_trust_radii,
     "contact_sweep_radii": lambda a: new(a.x, *a.x.shape[:2]),
-    "contact_start": lambda a: (torch.empty_like(a.x), torch.empty_like(a.x), torch.empty_like(a.rigid),
-                                *(new(a.x, *like.shape[:2]) for like in (a.x, a.rigid, a.x)),
-                                new(a.x, *a.x.shape[:2], dtype=torch.bool), new(a.x, 1, dtype=LONG)),
+    "contact_start": _contact_start,
     "contact_refresh_gaps": lambda a: torch.empty_like(a.constants),
     "contact_compact": _contact_compact,
     "contact_lag": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), new(a.x, a.pairs.shape[0]),

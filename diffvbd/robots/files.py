@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._common.checks import check_tensor, fail
+from .._common.checks import fail, real_array
 from .robot import Description, Joint, Robot
 
 TYPES = {"revolute": "turns", "continuous": "turns", "prismatic": "slides", "fixed": "fixed"}  # of URDF
@@ -33,19 +33,20 @@ def load(path: str | PathLike[str], base: Tensor | None = None) -> Robot:
     Raises:
         FileNotFoundError: Without such a file.
         ImportError: Without yourdfpy or, for MJCF, mujoco.
-        ValueError: For another file or one without collision shapes; for joints with more than one freedom, as ball and
+        ValueError: For another file, one without collision shapes, or a mesh that is not there; for joints with more than one freedom, as ball and
             free joints; for planes and height fields, which a Model has colliders of its own for; for a base that is no
             pose.
     """
     with open(path, "rb"):  # the error of a missing file names it
         pass
     like = torch.eye(4, dtype=torch.float64)
-    base = like if base is None else check_tensor("base", base.to(torch.float64), like)
-    turn = base[:3, :3] if base.shape == (4, 4) else None
-    if turn is None or not torch.allclose(turn @ turn.mT, like[:3, :3], atol=1e-6) or not torch.equal(base[3], like[3]):
-        fail("base", "a pose [4, 4]: a rotation, a translation, and 0, 0, 0, 1", base.tolist())
+    pose = like if base is None else real_array("base", base, "a pose [4, 4]").detach().to(like)
+    turn = pose[:3, :3] if pose.shape == (4, 4) else 0 * like[:3, :3]
+    is_turn = torch.allclose(turn @ turn.mT, like[:3, :3], atol=1e-6) and float(torch.linalg.det(turn)) > 0
+    if not is_turn or not torch.equal(pose[3], like[3]):
+        fail("base", "a pose [4, 4]: a rotation, a translation, and 0, 0, 0, 1", pose.tolist())
     of_mjcf = fspath(path).lower().endswith(".xml")
-    return Robot((_mjcf if of_mjcf else _urdf)(fspath(path)), base)
+    return Robot((_mjcf if of_mjcf else _urdf)(fspath(path)), pose)
 
 
 # --- URDF -------------------------------------------------------------------------------------------------------------
@@ -93,7 +94,12 @@ def _shape_of_urdf(urdf: Any, collision: Any) -> Surface:
     elif shape.sphere is not None:
         mesh = trimesh.creation.icosphere(2, shape.sphere.radius)
     else:
-        mesh = trimesh.load(urdf._filename_handler(shape.mesh.filename), force="mesh")
+        try:
+            mesh = trimesh.load(urdf._filename_handler(shape.mesh.filename), force="mesh")
+        except Exception as error:  # of its many readers
+            raise ValueError(
+                f"path: expected a mesh that can be read, got {shape.mesh.filename!r} ({error})"
+            ) from error
         if shape.mesh.scale is not None:
             mesh.apply_scale(shape.mesh.scale)
     return _placed(mesh, np.eye(4) if collision.origin is None else collision.origin)

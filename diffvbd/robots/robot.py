@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._common.checks import fail
+from .._common.checks import fail, kind_of
 from .._contact.colliders import Obstacle
 from ..inspect.forces import Forces
 
@@ -30,6 +30,15 @@ class Joint(NamedTuple):
     offset: float = 0.0
 
 
+class _Tensors(NamedTuple):
+    """Constants of a Robot on a device."""
+
+    base: Tensor  # [4, 4]
+    origins: tuple[Tensor, ...]  # of each joint [4, 4]
+    axes: tuple[Tensor, ...]  # [3]
+    points: tuple[Tensor, ...]  # of each link [n, 3]
+
+
 class Description(NamedTuple):
     """A robot as a file describes it."""
 
@@ -44,7 +53,7 @@ class Robot:
     Attributes:
         joints: Names of the joints that a position moves, n of them. Joints that mimic others are not among them.
         limits: Least and largest position of each [n, 2], float64 [rad, or m of a prismatic joint]; infinite where
-            there is none.
+            there is none. A range that a URDF file leaves out is [0, 0], as its format says.
         links: Names of the links with a collision shape, in the order of their colliders.
         colliders: An Obstacle for each of them, at the positions 0, for ``Model(colliders=...)``.
         rows: Slice of each collider's corner points among those of all, Vc of them.
@@ -59,11 +68,14 @@ class Robot:
         self._roots = set(given.links) - {joint.child for joint in joints}
         for joint in moving:
             if joint.leader not in self.joints:
-                fail("mimic", f"a joint that {joint.name!r} follows and that moves", repr(joint.leader))
+                fail("mimic", f"a joint for {joint.name!r} to follow that follows none itself", repr(joint.leader))
         self._number = {joint.name: self.joints.index(joint.leader) for joint in moving}
         self._origins = torch.from_numpy(np.array([joint.origin for joint in joints], dtype=np.float64))
         axes = np.array([joint.axis for joint in joints], dtype=np.float64).reshape(-1, 3)
         lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+        for joint, length in zip(joints, lengths[:, 0].tolist(), strict=True):
+            if joint.kind != "fixed" and not length > 0:
+                fail("path", "joints with an axis", f"{joint.name!r}, whose axis is 0")
         self._axes = torch.from_numpy(axes / np.where(lengths > 0, lengths, 1.0))
         surfaces = given.surfaces
         self.links = tuple(surfaces)
@@ -72,6 +84,7 @@ class Robot:
         self._points = [torch.from_numpy(surfaces[name][0]) for name in self.links]  # of each link, in its frame
         ends = np.cumsum([0, *map(len, self._points)]).tolist()
         self.rows = tuple(map(slice, ends[:-1], ends[1:]))
+        self._kept: dict[tuple[torch.device, torch.dtype], _Tensors] = {}
         at_rest = self(torch.zeros(len(self.joints), dtype=torch.float64)).numpy()
         self.colliders = tuple(Obstacle(at_rest[rows], surfaces[name][1])
                                for name, rows in zip(self.links, self.rows, strict=True))  # fmt: skip
@@ -80,12 +93,21 @@ class Robot:
         return f"Robot(joints={list(self.joints)}, links={list(self.links)})"
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Corner points of all colliders [..., Vc, 3] [m] at joint positions q [..., n], differentiable: what
-        :func:`diffvbd.step` takes as ``colliders``, and a function of these what :func:`diffvbd.rollout` takes."""
+        """Corner points of all colliders [..., Vc, 3] [m] at joint positions q [..., n], differentiable. A step takes
+        them as ``colliders``, a rollout a function of (step, x, v) that returns them."""
         frames = self.frames(q)
-        parts = [points.to(q) @ frames[..., k, :3, :3].mT + frames[..., k, None, :3, 3]
-                 for k, points in enumerate(self._points)]  # fmt: skip
+        parts = [points @ frames[..., k, :3, :3].mT + frames[..., k, None, :3, 3]
+                 for k, points in enumerate(self._tensors(q).points)]  # fmt: skip
         return torch.cat(parts, -2)
+
+    def _tensors(self, like: Tensor) -> _Tensors:
+        """Constants on a device, where nothing may be copied while a CUDA graph is captured: kept from the first use."""
+        key = like.device, like.dtype
+        if key not in self._kept:
+            with torch.inference_mode(False):
+                moved = [tuple(t.to(like) for t in part) for part in (self._origins, self._axes, self._points)]
+                self._kept[key] = _Tensors(self.base.to(like), *moved)
+        return self._kept[key]
 
     def frames(self, q: Tensor) -> Tensor:
         """Poses of the links in the world [..., links, 4, 4] at joint positions q [..., n] [rad, m], differentiable.
@@ -112,21 +134,22 @@ class Robot:
         if total.shape[-2] != len(self.links):
             fail("forces", f"those of {len(self.links)} colliders from number {first} on", f"{total.shape[-2]}")
         about = torch.as_tensor(about, dtype=total.dtype, device=total.device)
-        poses, pivots = self._poses(q)
-        out: list[Any] = [torch.zeros_like(total[..., 0, 0])] * len(self.joints)
+        _, pivots = self._poses(q.to(total.dtype) if isinstance(q, Tensor) else q)
+        lead = torch.broadcast_shapes(q.shape[:-1], total.shape[:-2], about.shape[:-1])
+        out = [total.new_zeros(lead)] * len(self.joints)
         for k, name in enumerate(self.links):
             for joint in self._above(name):
                 of, (pivot, axis) = self._joints[joint], pivots[joint]
                 if of.kind == "fixed":
                     continue
                 if of.kind == "turns":
-                    arm = torch.linalg.cross(about - pivot, total[..., k, :])
+                    arm = torch.linalg.cross(*torch.broadcast_tensors(about - pivot, total[..., k, :]))
                     work = (axis * (torque[..., k, :] + arm)).sum(-1)
                 else:
                     work = (axis * total[..., k, :]).sum(-1)
                 number = self._number[of.name]
                 out[number] = out[number] + of.factor * work
-        return torch.stack(out, -1)
+        return torch.stack(out, -1) if out else total.new_zeros((*lead, 0))
 
     def _above(self, link: str) -> list[int]:
         """Joints between the base and a link."""
@@ -140,14 +163,13 @@ class Robot:
     def _poses(self, q: Tensor) -> tuple[dict[str, Tensor], list[tuple[Tensor, Tensor]]]:
         """Poses of all links by name [..., 4, 4]; a point and the axis of each joint in the world [..., 3]."""
         if not isinstance(q, Tensor) or not q.is_floating_point():
-            raise TypeError(f"q: expected a tensor of joint positions, got {type(q).__name__}")
+            raise TypeError(f"q: expected a floating-point tensor of joint positions, got {kind_of(q)}")
         if q.dim() == 0 or q.shape[-1] != len(self.joints):
             fail("q", f"shape [..., {len(self.joints)}] of {', '.join(self.joints) or 'no joint'}", list(q.shape))
-        base = self.base.to(q).expand(*q.shape[:-1], 4, 4)
-        poses, pivots = dict.fromkeys(self._roots, base), []
+        own = self._tensors(q)
+        poses, pivots = dict.fromkeys(self._roots, own.base.expand(*q.shape[:-1], 4, 4)), []
         for k, joint in enumerate(self._joints):
-            at = poses[joint.parent] @ self._origins[k].to(q)
-            axis = self._axes[k].to(q)
+            at, axis = poses[joint.parent] @ own.origins[k], own.axes[k]
             pivots.append((at[..., :3, 3], (at[..., :3, :3] * axis).sum(-1)))
             if joint.kind != "fixed":
                 value = joint.factor * q[..., self._number[joint.name]] + joint.offset
@@ -158,6 +180,11 @@ class Robot:
 
 def _in_order(given: Description) -> list[Joint]:
     """Joints, parents before their children."""
+    for what, names in (("joint", [j.name for j in given.joints]), ("link", given.links),
+                        ("joint above", [j.child for j in given.joints])):  # fmt: skip
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            fail("path", f"one {what} of each name" if what != "joint above" else "one joint above each link", twice[0])
     known = set(given.links) - {joint.child for joint in given.joints}
     out, left = [], list(given.joints)
     while left:

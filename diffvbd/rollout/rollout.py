@@ -21,6 +21,7 @@ from .._common.checks import (
     check_save,
     check_tensor,
     fail,
+    kind_of,
 )
 from .._common.context import looks_at, recorders, refinement, replaced
 from .._common.messages import is_own
@@ -79,8 +80,8 @@ def rollout(
             checkpointed segment calls it again in the backward, where it must return the same: no state that it keeps
             from call to call, nothing that has changed in place since. ``prescribed`` may also have the initial x where
             a vertex is not pinned. ``colliders`` are a tensor, and rest there, or per_step or a function: where they
-            are at the end of each step, from which their velocity follows; ``colliders_before``: where these are at the
-            start; None: the Model's collider_points.
+            are at the end of each step, in any tensor that broadcasts to x.shape[:-2] + (Vc, 3). Their velocity follows
+            from these; ``colliders_before``: where they are at the start; None: the Model's collider_points.
         save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
             the last, or only the ``"last"``.
         observe: Called after each step as observe(step, x, v) with step = 1 ... steps; its results (a tensor, or a
@@ -255,8 +256,8 @@ def _check_values(inputs: Given, steps: int) -> None:
     for name in ("prescribed", "colliders"):
         refuse_average(name, inputs.loads[name])
     before = inputs.loads["colliders_before"]
-    if _changes(before):
-        raise TypeError(f"colliders_before: expected a tensor, got {type(before).__name__}")
+    if before is not None and not isinstance(before, Tensor):
+        raise TypeError(f"colliders_before: expected a tensor, got {kind_of(before)}")
     if before is not None and not (_changes(colliders) or isinstance(colliders, PerStep)):
         raise TypeError("colliders_before: expected it with colliders per_step or by a function, whose start it is")
     for part in inputs:
@@ -287,7 +288,8 @@ def _to_advance(model: System, loads: dict[str, Any], k: int, x: Tensor, v: Tens
         first = model.collider_points if before is None else before
         now["colliders_before"] = loads["colliders"][k - 1] if k else first
     elif points is not None:
-        now["colliders"], now["colliders_before"] = check_tensor("colliders", now["colliders"], x), points
+        # a copy: the function may write the next positions into the same tensor
+        now["colliders"], now["colliders_before"] = check_tensor("colliders", now["colliders"], x).clone(), points
     return now
 
 

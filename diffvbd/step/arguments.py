@@ -70,7 +70,7 @@ class Damping(NamedTuple):
     volume_viscosity: Tensor | None
     drag: Tensor | None  # [1 | B, 1 | V] [1/s]
     corners: Tensor | None  # of the tets' rest shapes [B, T, 4, 3]; None: the Model's
-    moduli: tuple[Tensor, Tensor]  # without viscosity [Pa], as the coarse matrices differentiate them
+    moduli: tuple[Tensor, Tensor]  # mu and lam without viscosity [Pa], differentiable
 
 
 class Drag(NamedTuple):

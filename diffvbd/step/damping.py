@@ -8,8 +8,8 @@ corners with the same terms, and their sum is again a stable Neo-Hookean law, of
     r = (S_1 + J S_2) / (S_1 + S_2),    S = 2 mu + lam
     mu = r (mu_1 + mu_2),    lam = r (lam_1 + lam_2),    c6 = c6_1 / r,    r mu k_ab = ... = mu_1 k_ab,1 + mu_2 k_ab,2
 
-With a law of one's own the second law stays apart: its metric n_a . n_b c6 / (6 J), c6 / J and moduli J times these are
-scalars of the rest shape, which an object of the law that has them reads.
+With a law of one's own the second law stays apart. Its metric n_a . n_b c6 / (6 J), c6 / J and its moduli times J are
+more scalars of the rest shape. The law is compiled once more for them.
 
 Drag: m drag (x - x_start) / h only shifts the predictor y of the step and enlarges the mass.
 """

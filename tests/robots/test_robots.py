@@ -92,6 +92,9 @@ def test_contact_is_read_as_joint_torques(path: Path) -> None:
     found = dv.contact.forces(model, x, colliders=robot(q), about=about)
     torques = robot.torques(q, found, about)
     assert found.colliders.total.abs().sum() > 1e-3 and bool((torques.abs() > 1e-9).all())
+    many = dv.contact.forces(model, x.expand(2, -1, -1), colliders=robot(q), about=about)
+    assert torch.allclose(robot.torques(q.float(), many, about), torques.expand(2, 3), rtol=1e-4)
+    assert torch.allclose(robot.torques(q.expand(4, 1, 3), many, about), torques.expand(4, 2, 3), rtol=1e-9)
 
     def energy(q: Tensor) -> float:
         points, surface = robot(q), model.surface_of_contact
@@ -132,18 +135,25 @@ def test_bad_input(path: Path, tmp_path: Path) -> None:
     robot = dv.robots.load(path)
     with pytest.raises(ValueError, match=r"q: expected shape \[\.\.\., 3\] of lift, turn, close, got \[2\]"):
         robot(torch.zeros(2, dtype=F64))
-    with pytest.raises(TypeError, match="q: expected a tensor of joint positions, got list"):
+    with pytest.raises(TypeError, match="q: expected a floating-point tensor of joint positions, got"):
         robot([0.0, 0.0, 0.0])
     with pytest.raises(FileNotFoundError, match="missing.urdf"):
         dv.robots.load(tmp_path / "missing.urdf")
-    with pytest.raises(ValueError, match="base: expected a pose"):
-        dv.robots.load(path, 2 * torch.eye(4))
+    for base in (2 * torch.eye(4), torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), torch.eye(3)):
+        with pytest.raises(ValueError, match="base: expected a pose"):
+            dv.robots.load(path, base)
     other, bare = tmp_path / "other.urdf", GRIPPER.replace("collision>", "visual>")
     cases = {
         "<mujoco/>": "path: expected",
         bare: "path: expected a robot with collision shapes",
         GRIPPER.replace("revolute", "floating"): "path: expected joints of the types revolute",
         GRIPPER.replace('mimic joint="close"', 'mimic joint="clos"'): "mimic: expected",
+        GRIPPER.replace('"0 2 0.2"', '"0 0 0"'): "path: expected joints with an axis, got 'turn'",
+        GRIPPER.replace('name="turn"', 'name="lift"'): "path: expected one joint of each name",
+        GRIPPER.replace('<child link="tip"/>', '<child link="right"/>'): "path: expected one joint above each link",
+        GRIPPER.replace(
+            '<sphere radius="0.004"/>', '<mesh filename="none.stl"/>'
+        ): "path: expected a mesh .* 'none.stl'",
     }
     for text, message in cases.items():
         other.write_text(text, encoding="utf-8")

@@ -62,6 +62,20 @@ def test_it_is_the_positions_that_it_gives(device: str) -> None:
     assert float((led.x[-1] - x).mean(0)[0]) > 1e-3  # it was pushed
 
 
+def test_it_may_write_into_one_tensor() -> None:
+    model, x, v = pushed()
+    buffer, way = model.collider_points.clone(), torch.tensor([0.002, 0.0, 0.0], dtype=F64)
+
+    def onward(step: int, x: Tensor, v: Tensor) -> Tensor:
+        buffer.copy_(model.collider_points + (step + 1) * way)
+        return buffer
+
+    with torch.no_grad():
+        ends = [dv.rollout(model, x, v, SOLVER, steps=8, colliders=act, **MATERIAL).x[-1]
+                for act in (onward, lambda step, x, v: model.collider_points + (step + 1) * way)]  # fmt: skip
+    assert torch.equal(*ends) and not torch.equal(ends[0], x)
+
+
 @pytest.mark.parametrize("every", [None, 3, dv.BinomialCheckpoints(2)], ids=str)
 def test_gradients_go_through_it(every: Any) -> None:
     gain = torch.tensor(0.5, dtype=F64, requires_grad=True)
