@@ -12,8 +12,8 @@ from helpers.paths import CSRC, PACKAGE, needs_csrc
 PYTHON = (
     "_version", "_common", "distributed", "energies", "laws", "mesh", "reference", "ops", "embedding", "couplings",
     "_contact", "model", "adjoint",
-    "step", "rollout", "inspect", "contact", "results", "colliders", "robots", "solvers", "losses", "viz", "testing", "", "tasks",
-    "cli", "__main__",
+    "step", "rollout", "inspect", "contact", "results", "colliders", "robots", "solvers", "losses", "viz", "testing",
+    "", "tasks", "cli", "__main__",
 )  # fmt: skip
 CPP = ("core", "energies", "sweep", "contact", "subspace", "cpu", "cuda", "bind")
 

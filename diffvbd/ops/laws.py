@@ -135,13 +135,8 @@ def _compile_cuda(folder: Path, name: str, header: str, scalar: str, compiler: s
             *given]  # fmt: skip
     host = [*shlex.split(compiler), *_COMMON, "-O3", "-DUSE_CUDA", *given, *_included("cuda")]
     jobs = [*((nvcc, path) for path in paths), *((host, root / f"{path}.cpp") for path in _BIND)]
-    libraries = [
-        *(f"-L{Path(CUDA_HOME, name)}" for name in ("lib64", "lib")),
-        "-ltorch_cpu",
-        "-ltorch_cuda",
-        "-lc10",
-        "-lcudart",
-    ]
+    libraries = [f"-L{Path(CUDA_HOME, name)}" for name in ("lib64", "lib")]
+    libraries += ["-ltorch_cpu", "-ltorch_cuda", "-lc10", "-lcudart"]
     return _linked(folder, "law_cuda.so", compiler, jobs, libraries)
 
 

@@ -33,9 +33,9 @@ def load(path: str | PathLike[str], base: Tensor | None = None) -> Robot:
     Raises:
         FileNotFoundError: Without such a file.
         ImportError: Without yourdfpy or, for MJCF, mujoco.
-        ValueError: For another file, one without collision shapes, or a mesh that is not there; for joints with more than one freedom, as ball and
-            free joints; for planes and height fields, which a Model has colliders of its own for; for a base that is no
-            pose.
+        ValueError: For another file, one without collision shapes, or a mesh that is not there; for joints with more
+            than one freedom, as ball and free joints; for planes and height fields, which a Model has colliders of its
+            own for; for a base that is no pose.
     """
     with open(path, "rb"):  # the error of a missing file names it
         pass
@@ -205,7 +205,9 @@ def _frame(shift: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0)) -> NDArray[np.flo
 def _placed(mesh: Any, at: NDArray[np.float64]) -> Surface:
     mesh.merge_vertices()
     points = np.asarray(mesh.vertices, dtype=np.float64) @ at[:3, :3].T + at[:3, 3]
-    return points, np.asarray(mesh.faces, dtype=np.int64)
+    triangles = np.asarray(mesh.faces, dtype=np.int64)
+    one, two = (points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2))
+    return points, triangles[np.linalg.norm(np.cross(one, two), axis=1) > 0]  # files may have some without an area
 
 
 def _joined(parts: list[Surface]) -> Surface:

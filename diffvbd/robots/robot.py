@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._common.checks import fail, kind_of
+from .._common.checks import check_count, check_kind, fail, kind_of
 from .._contact.colliders import Obstacle
 from ..inspect.forces import Forces
 
@@ -51,7 +51,8 @@ class Robot:
     """Links of a robot and how joints move them; see :func:`load`, which makes one.
 
     Attributes:
-        joints: Names of the joints that a position moves, n of them. Joints that mimic others are not among them.
+        joints: Names of the joints that a position moves, n of them in the order of the file. Joints that mimic others
+            are not among them.
         limits: Least and largest position of each [n, 2], float64 [rad, or m of a prismatic joint]; infinite where
             there is none. A range that a URDF file leaves out is [0, 0], as its format says.
         links: Names of the links with a collision shape, in the order of their colliders.
@@ -62,7 +63,7 @@ class Robot:
     def __init__(self, given: Description, base: Tensor) -> None:
         self.base, self._joints = base, joints = base, _in_order(given)
         moving = [joint for joint in joints if joint.kind != "fixed"]
-        own = [joint for joint in moving if joint.leader == joint.name]
+        own = [joint for joint in given.joints if joint.kind != "fixed" and joint.leader == joint.name]
         self.joints = tuple(joint.name for joint in own)
         self.limits = torch.tensor([joint.limits for joint in own], dtype=torch.float64).reshape(-1, 2)
         self._roots = set(given.links) - {joint.child for joint in joints}
@@ -101,12 +102,12 @@ class Robot:
         return torch.cat(parts, -2)
 
     def _tensors(self, like: Tensor) -> _Tensors:
-        """Constants on a device, where nothing may be copied while a CUDA graph is captured: kept from the first use."""
+        """Constants on a device, kept from the first use: the capture of a CUDA graph admits no copies to it."""
         key = like.device, like.dtype
         if key not in self._kept:
             with torch.inference_mode(False):
-                moved = [tuple(t.to(like) for t in part) for part in (self._origins, self._axes, self._points)]
-                self._kept[key] = _Tensors(self.base.to(like), *moved)
+                moved = [tuple(t.to(*key) for t in part) for part in (self._origins, self._axes, self._points)]
+                self._kept[key] = _Tensors(self.base.to(*key), *moved)
         return self._kept[key]
 
     def frames(self, q: Tensor) -> Tensor:
@@ -129,11 +130,14 @@ class Robot:
             about: The point that these torques are about [m], shape [3] or [..., 3].
             first: The number of the robot's first collider among those of the Model.
         """
-        own = slice(first, first + len(self.links))
+        check_kind("forces", forces, Forces)
+        own = slice(check_count("first", first), first + len(self.links))
         total, torque = (-part.sum(-3)[..., own, :] for part in (forces.colliders.total, forces.colliders.torque))
         if total.shape[-2] != len(self.links):
             fail("forces", f"those of {len(self.links)} colliders from number {first} on", f"{total.shape[-2]}")
         about = torch.as_tensor(about, dtype=total.dtype, device=total.device)
+        if about.shape != (3,) and about.shape != (*total.shape[:-2], 3):
+            fail("about", f"shape [3] or {[*total.shape[:-2], 3]}", list(about.shape))
         _, pivots = self._poses(q.to(total.dtype) if isinstance(q, Tensor) else q)
         lead = torch.broadcast_shapes(q.shape[:-1], total.shape[:-2], about.shape[:-1])
         out = [total.new_zeros(lead)] * len(self.joints)
@@ -185,7 +189,12 @@ def _in_order(given: Description) -> list[Joint]:
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             fail("path", f"one {what} of each name" if what != "joint above" else "one joint above each link", twice[0])
+    unknown = [joint.child for joint in given.joints if joint.child not in given.links]
+    if unknown:
+        fail("path", "joints between links of the file", repr(unknown[0]))
     known = set(given.links) - {joint.child for joint in given.joints}
+    if len(known) > 1:
+        fail("path", "one root link", ", ".join(sorted(known)))
     out, left = [], list(given.joints)
     while left:
         ready = [joint for joint in left if joint.parent in known]

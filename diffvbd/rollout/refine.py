@@ -426,7 +426,7 @@ def _led(value: Callable[[int, Tensor, Tensor], Any], first: Tensor, parts: int)
 
     def now(step: int, x: Tensor, v: Tensor) -> Tensor:
         asked, end = step // parts, ends(step, x, v)
-        begins[asked + 1] = end
+        begins[asked + 1] = end.clone()  # the function may write the next positions into the same tensor
         return begins[asked] + (end - begins[asked]) * ((step % parts + 1) / parts)
 
     return now

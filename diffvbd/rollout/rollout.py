@@ -80,7 +80,7 @@ def rollout(
             checkpointed segment calls it again in the backward, where it must return the same: no state that it keeps
             from call to call, nothing that has changed in place since. ``prescribed`` may also have the initial x where
             a vertex is not pinned. ``colliders`` are a tensor, and rest there, or per_step or a function: where they
-            are at the end of each step, in any tensor that broadcasts to x.shape[:-2] + (Vc, 3). Their velocity follows
+            are at the end of each step, in a tensor [..., Vc, 3] that broadcasts over scenes. Their velocity follows
             from these; ``colliders_before``: where they are at the start; None: the Model's collider_points.
         save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
             the last, or only the ``"last"``.
@@ -288,14 +288,17 @@ def _to_advance(model: System, loads: dict[str, Any], k: int, x: Tensor, v: Tens
         first = model.collider_points if before is None else before
         now["colliders_before"] = loads["colliders"][k - 1] if k else first
     elif points is not None:
+        found, count = check_tensor("colliders", now["colliders"], x), len(model.collider_points)
+        if found.shape[-2:] != (count, 3):  # one point for all corners of a surface would be none
+            fail("colliders", f"a function that returns shape [..., {count}, 3]", f"shape {list(found.shape)}")
         # a copy: the function may write the next positions into the same tensor
-        now["colliders"], now["colliders_before"] = check_tensor("colliders", now["colliders"], x).clone(), points
+        now["colliders"], now["colliders_before"] = found.clone(), points
     return now
 
 
 def _first_points(model: System, loads: dict[str, Any], x: Tensor) -> Tensor:
     before = loads["colliders_before"]
-    return model.collider_points if before is None else check_tensor("colliders_before", before, x)
+    return model.collider_points if before is None else check_tensor("colliders_before", before, x).clone()
 
 
 def _versions(inputs: dict[str, Any]) -> list[tuple[str, Tensor, int]]:

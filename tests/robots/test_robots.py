@@ -92,6 +92,10 @@ def test_contact_is_read_as_joint_torques(path: Path) -> None:
     found = dv.contact.forces(model, x, colliders=robot(q), about=about)
     torques = robot.torques(q, found, about)
     assert found.colliders.total.abs().sum() > 1e-3 and bool((torques.abs() > 1e-9).all())
+    with pytest.raises(ValueError, match="first: expected"):
+        robot.torques(q, found, about, first=-1)
+    with pytest.raises(TypeError, match="forces: expected"):
+        robot.torques(q, found.bodies, about)  # type: ignore[arg-type]
     many = dv.contact.forces(model, x.expand(2, -1, -1), colliders=robot(q), about=about)
     assert torch.allclose(robot.torques(q.float(), many, about), torques.expand(2, 3), rtol=1e-4)
     assert torch.allclose(robot.torques(q.expand(4, 1, 3), many, about), torques.expand(4, 2, 3), rtol=1e-9)
@@ -148,6 +152,10 @@ def test_bad_input(path: Path, tmp_path: Path) -> None:
         bare: "path: expected a robot with collision shapes",
         GRIPPER.replace("revolute", "floating"): "path: expected joints of the types revolute",
         GRIPPER.replace('mimic joint="close"', 'mimic joint="clos"'): "mimic: expected",
+        GRIPPER.replace('<child link="tip"/>', '<child link="tipp"/>'): "path: expected joints between links",
+        GRIPPER.replace(
+            '<link name="base"/>', '<link name="base"/><link name="lone"/>'
+        ): "path: expected one root link",
         GRIPPER.replace('"0 2 0.2"', '"0 0 0"'): "path: expected joints with an axis, got 'turn'",
         GRIPPER.replace('name="turn"', 'name="lift"'): "path: expected one joint of each name",
         GRIPPER.replace('<child link="tip"/>', '<child link="right"/>'): "path: expected one joint above each link",
