@@ -16,6 +16,7 @@ from ..laws.law import FIBRE, check_fibre
 from ..model.material import shape_gradients
 from ..model.system import System
 
+LEAST = 1e-6  # of the moduli: what rounding may make of 0
 ScenesFirst = Callable[[str, Any, tuple[int, ...]], Tensor]  # name, value, own shape -> [1 | B, ...]
 
 
@@ -46,6 +47,11 @@ def law_inputs(model: System, given: dict[str, Any], scenes_first: ScenesFirst) 
             check_fibre(a0)
         a0 = a0 / a0.square().sum(-1, keepdim=True).sqrt()
     mu, lam, _ = (m.reshape(1, 1) if m.dim() == 0 else m for m in law.at_rest(values))
+    if looks_at(mu):
+        size = LEAST * (mu.abs() + lam.abs()).detach()
+        for name, modulus in (("shear", mu.detach()), ("bulk", (lam + 2 / 3 * mu).detach())):
+            what = f"parameters with a {name} modulus at rest >= 0 Pa"
+            name_value("law", what, modulus, modulus >= -size, ("scene", "tet"))
     _refuse_concave(model, values)
     return LawInputs(values, a0, mu, lam)
 

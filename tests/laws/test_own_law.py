@@ -271,6 +271,8 @@ def test_inputs_and_refusals() -> None:
         dv.step(model, x, v, dv.VBD(0.01, 2, block="paper"))
     with pytest.raises(ValueError, match="k: expected finite values"):
         dv.step(model, x, v, solver, k=torch.tensor(float("nan"), dtype=F64))
+    with pytest.raises(ValueError, match="law: expected parameters with a shear modulus at rest >= 0 Pa, got -"):
+        dv.step(model, x, v, solver, mu=-1e6)
     with pytest.raises(ValueError, match="a0: expected directions of finite length > 0"):
         dv.step(model, x, v, solver, a0=torch.zeros(3, dtype=F64))
     assert "law(" in repr(model) and bool(dv.diagnose(model, x, solver).smallest_volume_ratio > 0.9)
