@@ -27,6 +27,7 @@ def scene_of(name: str, text: str) -> Scene:
     return scene
 
 
+@pytest.mark.hours  # another law is compiled
 @pytest.mark.parametrize("subspace", [None, "coarse"])
 def test_the_built_in_law_as_ones_own(subspace: Any) -> None:
     scene, own = SCENES["stacked"](), scene_of("stacked", STABLE)

@@ -43,6 +43,7 @@ def test_gradients_are_those_of_the_executed_sweeps(sweeps: int) -> None:
     both(model, dv.VBD(0.01, sweeps, relaxation=1.3), viscous(model), (model, dv.Unrolled()))
 
 
+@pytest.mark.hours  # another law is compiled
 @pytest.mark.parametrize("options", [{}, {"subspace": "coarse"}], ids=str)
 def test_the_built_in_law_as_ones_own(options: Any) -> None:
     own = model_of(text=STABLE)
