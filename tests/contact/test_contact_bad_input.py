@@ -180,7 +180,7 @@ def test_rollout_and_contact_functions() -> None:
     def rollout(value: Any) -> Any:
         return dv.rollout(model, x, 0 * x, steps=3, colliders=value, **STEP)
 
-    raises(lambda: rollout(lambda *_: points), "colliders", "callable")
+    raises(lambda: rollout(lambda *_: points.expand(2, 3)), "colliders", r"\[2, 3\]")
     raises(lambda: rollout(dv.per_step(points.expand(2, 1, 3))), "colliders", r"\[2, 1, 3\]")
     raises(lambda: rollout(dv.per_step(points.expand(3, 2, 3).contiguous())), "colliders", r"\[2, 3\]")
     raises(lambda: dv.contact.status("model"), "model", "str")
