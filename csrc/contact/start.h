@@ -14,7 +14,7 @@ constexpr double kWholeStart = 0.99;  // fraction from which a vertex counts as 
 
 template <class T>
 struct StartInputs {
-  AdvanceInputs<T> gate;  // its `move` is what `wanted` of the memory is
+  AdvanceInputs<T> gate;  // its `move` points to `wanted` of the memory
   const T *move, *rigid;  // [B, V, 3]; the rigid motion of each body, null without deformation radii
   const T *trust_radius, *deformation_radius;  // [B, bodies + 1]
   Batched<const T> floor;                      // [1 | B, floor_planes, kPlaneScalars]

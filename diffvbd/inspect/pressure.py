@@ -30,11 +30,11 @@ class PressureMap(NamedTuple):
 
 
 def pressure(forces: Forces, x: Tensor, triangles: Any) -> PressureMap:
-    """What a patch of tactile skin feels: pressure and shear of contact at each of its vertices.
+    """Pressure and shear of contact at each vertex of a patch of a surface, as tactile skin measures them.
 
     The force on a vertex is divided by the part of the patch around it. On a flat patch the pressures times their areas
-    sum up to the force that presses on it; a vertex at its border bears for its own side of the border alone, so end a
-    patch where nothing touches, or at an edge of the body. Differentiable in x and in forces.
+    sum up to the force that presses on it. A vertex at the border of a patch has forces of triangles outside, too, but
+    only the area inside: end a patch where nothing touches, or at an edge of the body. Differentiable in x and forces.
 
     Args:
         forces: Of :func:`diffvbd.contact.forces` at x.

@@ -184,11 +184,12 @@ class Robot:
 
 def _in_order(given: Description) -> list[Joint]:
     """Joints, parents before their children."""
-    for what, names in (("joint", [j.name for j in given.joints]), ("link", given.links),
-                        ("joint above", [j.child for j in given.joints])):  # fmt: skip
+    for rule, names in (("one joint of each name", [joint.name for joint in given.joints]),
+                        ("one link of each name", given.links),
+                        ("one joint above each link", [joint.child for joint in given.joints])):  # fmt: skip
         twice = [name for name in names if names.count(name) > 1]
         if twice:
-            fail("path", f"one {what} of each name" if what != "joint above" else "one joint above each link", twice[0])
+            fail("path", rule, twice[0])
     unknown = [joint.child for joint in given.joints if joint.child not in given.links]
     if unknown:
         fail("path", "joints between links of the file", repr(unknown[0]))
