@@ -393,9 +393,10 @@ def _increase_of_patches(inputs: IncreaseInputs, averaged: Averaged, x: Tensor, 
         return Rows.of(torch.where(body < 0, bodies.number, body), bodies.number)
 
     rows: Rows = model.derived("bodies of patches", by_body)
-    corners, ends = (ops.tet_gather(t.double(), *model._topology) for t in (x, to))
-    e, n = (c[..., 1:, :] - c[..., :1, :] for c in (corners, ends))
-    f = n - e
+    # from displacements: the rounding of edges would be that of a step of 1e-16 times the body
+    corners, steps = (ops.tet_gather(t, *model._topology) for t in (x.double(), to.double() - x.double()))
+    e, f = (c[..., 1:, :] - c[..., :1, :] for c in (corners, steps))
+    n = e + f
 
     def det(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
         return (a * torch.linalg.cross(b, c)).sum(-1)
