@@ -10,7 +10,18 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._common.checks import check_dtype, check_held, check_kind, fail, init_names_checked, vertex_mask, where_it_is
+from .._common.checks import (
+    check_broadcast,
+    check_count,
+    check_dtype,
+    check_held,
+    check_kind,
+    check_tensor,
+    fail,
+    init_names_checked,
+    vertex_mask,
+    where_it_is,
+)
 from .._common.constants import CONTACT, ELASTIC
 from .._common.context import is_captured, lasting, lasting_tensors
 from .._contact.barrier import Friction, PairBarrier
@@ -21,11 +32,12 @@ from ..energies import VERTEX_ENERGIES, Anchor, FloorBarrier, StableNeoHookean, 
 from ..laws import Law
 from ..mesh import TetMesh
 from .arguments import ELASTIC_LAWS, Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
-from .bodies import find_bodies, first_of_body
+from .bodies import Bodies, OtherBodies, find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
 from .material import lumped_mass, rest_metric
 from .moving import moving_bodies
 from .patches import Patches, patches_of
+from .rigid import RigidBodies, inertias, rigid_bodies
 from .solver import VBD
 
 PLACED = (VertexEnergy, Coupling)  # energies that hold tensors
@@ -50,6 +62,8 @@ class Model:
         pinned: Vertices that sweeps do not move: a bool mask [V] or indices.
         energies: At most one of each kind.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier.
+        rigid: Numbers of bodies, as in ``body``, that do not deform: they move by six unknowns each, their mass and
+            inertia are those of their tets, and their material plays no part. No vertex of theirs may be pinned.
         dtype, device: torch.float64 or torch.float32; where the tensors live.
 
     Attributes (torch tensors in the user's numbering, a copy at each access):
@@ -80,6 +94,7 @@ class Model:
         energies: Sequence[Energy] = (StableNeoHookean(),),
         colliders: Sequence[Collider] = (),
         *,
+        rigid: Sequence[int] = (),
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -99,6 +114,7 @@ class Model:
         check_isolated(tets, mask)
         self._set_energies(tuple(e.of_mesh(mesh, mask) if isinstance(e, Coupling) else e for e in self.energies))
         self._density = per_tet_density(density, mesh.num_tets)
+        self.rigid_bodies: RigidBodies | None = rigid_bodies(rigid, mesh, mask, self._density)
         self._given_contact = self.contact
         if self.contact is not None:  # defaults that follow from mesh and mass
             fitted = self.contact.of_scene(mesh, self._density.numpy(), mask.numpy())
@@ -109,12 +125,12 @@ class Model:
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = first_of_body(body)
         # those of the default solver: other solvers derive theirs (system.py)
-        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.may_correct, self.floor is not None)
+        self._bodies, self._other_bodies = self._find_bodies(points, tets, mask, self.may_correct)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         self._check_friction()
         self._arrange(points, tets, device)
         self._measure(points)
-        warn_of(mesh, pinned, mask, self.energies)
+        warn_of(mesh, pinned, mask, self._held, self.energies)
         self._place(dtype, device)
         self._executed_by(DEFAULT)  # now, since compiled code can look it up and not build it
 
@@ -163,14 +179,28 @@ class Model:
 
     @property
     def may_correct(self) -> bool:
-        """Whether bodies can have a rigid correction of their own. Pairs and friction have another one, and tets
-        without stiffness are no body."""
-        return not self.touches and any(isinstance(e, ELASTIC_LAWS) for e in self.energies)
+        """Whether bodies can have a rigid correction of their own. Pairs and friction have another one."""
+        return not self.touches and (self._is_elastic or self.rigid_bodies is not None)
+
+    @property
+    def _is_elastic(self) -> bool:
+        return any(isinstance(e, ELASTIC_LAWS) for e in self.energies)
+
+    def _find_bodies(self, points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> tuple[Bodies, OtherBodies]:
+        """Those that are corrected, and the others; on the CPU."""
+        if self.rigid_bodies is not None and not self._is_elastic:  # tets without stiffness are no body
+            pinned = pinned | ~self.rigid_bodies.mask.cpu()
+        return find_bodies(points, tets, pinned, correct, self.floor is not None)
 
     @property
     def inputs(self) -> Inputs:
         """The keywords that steps and rollouts take, with shapes, units and defaults; prints as a table."""
         return inputs_of(self)
+
+    @property
+    def _held(self) -> Tensor:
+        """Vertices that no sweep moves, bool [V]: those that are pinned or of rigid bodies."""
+        return self._pinned if self.rigid_bodies is None else self._pinned | self.rigid_bodies.mask
 
     @property
     def rest_scalars(self) -> Tensor:
@@ -245,7 +275,7 @@ class Model:
 
     def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
         """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
-        plan = ops.direct.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])  # see csrc/cpu/plan.h
+        plan = ops.direct.build_plan(points, tets, ~self._held, ops.LANES[device.type])  # see csrc/cpu/plan.h
         self._plan, self._color_ptr, self._color_vertices, star_ptr, star = plan
         self._topology = (tets, star_ptr, star)
         self._sizes = ops.plan_sizes(self._plan, device.type)
@@ -254,7 +284,7 @@ class Model:
         """Everything that follows from the rest positions, in float64."""
         rest, volume = rest_metric(ops.tet_gather(points[None], *self._topology))
         self._rest_points = points
-        self._mass = lumped_mass(self._density[None], volume, *self._topology)[0]
+        self._mass = self.mass_of(lumped_mass(self._density[None], volume, *self._topology))[0]
         self._rest = rest
         if self.contact is not None:  # potentials of bodies decide
             elastic = bool(self.energy_mask & ELASTIC)
@@ -273,6 +303,8 @@ class Model:
         self._set_energies(tuple(placed))
         if self.patches is not None:
             self.patches = self.patches.to(device)
+        if self.rigid_bodies is not None:
+            self.rigid_bodies = self.rigid_bodies.to(device, dtype)
         if hasattr(self, "_rest"):
             self._packed_rest = ops.pack_rest(self._rest, self._plan, self._sizes)
             del self._rest
@@ -315,6 +347,7 @@ class Model:
             "pinned": self._pinned.cpu() if self._pinned.any() else None,
             "energies": [e.placed(self.num_vertices, cpu) if isinstance(e, PLACED) else e for e in given],
             "colliders": self.colliders,
+            "rigid": () if self.rigid_bodies is None else self.rigid_bodies.numbers,
             "dtype": self.dtype,
             "device": self.device,
         }
@@ -337,6 +370,51 @@ class Model:
         self.energy_mask = self._mask(self.dtype, actual)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
+
+    def mass_of(self, lumped: Tensor) -> Tensor:
+        """Masses of vertices whose lumped ones are [..., V] [kg]: those of rigid bodies have their bodies' inertia."""
+        return lumped if self.rigid_bodies is None else self.rigid_bodies.weights * lumped
+
+    def wrench(self, x: Tensor, body: int, force: Any = None, torque: Any = None) -> Tensor:
+        """Forces on the vertices of a body that sum up to a force and to a torque about its center of mass, for the
+        input ``force``.
+
+            f_i = m_i (F / M + a x r_i),    a = I^-1 T
+
+        Every vertex is accelerated as by a rigid motion, so that a body, rigid or soft, is not deformed by them.
+
+        Args:
+            x: Positions [m], shape [..., V, 3]; those at the start of a step, where the wrench is to follow the body.
+            body: Its number, as in ``body``.
+            force: F [N], shape [3] or [..., 3]; None: zero.
+            torque: T [N m], likewise.
+
+        Returns:
+            Forces [N] [..., V, 3], zero on other bodies; differentiable in x, force and torque.
+
+        Raises:
+            ValueError, TypeError: Naming the argument, what was expected and what came.
+
+        Source: docs/method.md, section 14.
+        """
+        if not isinstance(x, Tensor) or x.dim() < 2 or x.shape[-2:] != (self.num_vertices, 3):
+            got = f"shape {list(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
+            fail("x", f"a tensor of shape [..., {self.num_vertices}, 3]", got)
+        check_tensor("x", x, self._mass)
+        labels = self.derived("labels", lambda: self.body)
+        body = check_count("body", body, maximum=self.mesh.num_bodies - 1)
+        rows = self.derived(f"vertices of body {body}", lambda: (labels == body).nonzero()[:, 0])
+        given = []
+        for name, value in (("force", force), ("torque", torque)):
+            value = torch.zeros(3).to(x) if value is None else torch.as_tensor(value, dtype=x.dtype, device=x.device)
+            given.append(check_broadcast(name, value, (*x.shape[:-2], 3), x.dim() - 2)[..., None, :])
+        m, at = self._mass[rows, None], x[..., rows, :]
+        total = m.sum()
+        arm = at - (m * at).sum(-2, keepdim=True) / total
+        inertia = inertias(m, arm).sum(-2).unflatten(-1, (3, 3))
+        turn = torch.linalg.solve(inertia, given[1][..., 0, :, None])[..., None, :, 0]
+        own = m * (given[0] / total + torch.linalg.cross(turn.expand_as(arm), arm))
+        return torch.zeros_like(x).index_copy(-2, rows, own)
 
     def derived(self, name: str, build: Callable[[], Any]) -> Any:
         """Something that follows from the Model alone, built at its first use and kept."""
@@ -378,9 +456,10 @@ class Model:
         return self._color_ptr.shape[0] - 1
 
     def __repr__(self) -> str:
+        rigid = "" if self.rigid_bodies is None else f"{len(self.rigid_bodies.numbers)} rigid, "
         return (
             f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
-            f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "
+            f"{rigid}{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "
             f"energies=({', '.join(map(repr, self.energies))})"
             f"{f', {len(self.colliders)} colliders' if self.colliders else ''}, {self.dtype}, {self.device})"
         )

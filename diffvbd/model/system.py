@@ -13,7 +13,6 @@ from .._common.checks import check_kind, check_positive, fail
 from .._common.constants import CONTACT, ELASTIC, EXACT_BLOCK, FILTER_ETA, PAPER_BLOCK, SATURATION_EPS
 from .._contact.surface import ContactSurface
 from ..ops import regimes
-from .bodies import find_bodies
 from .coarse import check_coupled, plan_of
 from .material import lumped_mass, rest_metric
 from .model import Model
@@ -43,7 +42,7 @@ class System(Model):
             self.energy_mask ^= EXACT_BLOCK | PAPER_BLOCK
         if self.rigid != self.may_correct:
             arrays = torch.from_numpy(self.mesh.points.copy()), self._topology[0].cpu(), self._pinned.cpu()
-            bodies, others = find_bodies(*arrays, self.rigid, self.floor is not None)
+            bodies, others = self._find_bodies(*arrays, self.rigid)
             self._bodies, self._other_bodies = bodies.to(self.device), others.to(self.device)
         if self.coarse is not None:
             self._arrange_coarse()
@@ -63,6 +62,8 @@ class System(Model):
                 check_positive(name, getattr(self, name), unit, self.dtype)
         if self.start == "inertia" and self.contact is not None:
             fail("start", '"auto" or "predictor" with a PairBarrier, whose steps approach y in substeps', '"inertia"')
+        if self.rigid_bodies is not None and self.solver.subspace is None:
+            fail("subspace", '"rigid" or "coarse" with rigid bodies', "None")
         if self.law is not None and self.block == "paper":
             fail("block", '"exact" with a law of your own', '"paper"')
         if self.coarse is None:
@@ -75,7 +76,7 @@ class System(Model):
         assert self.coarse is not None
         points = torch.from_numpy(self.mesh.points.copy())
         tets, *star = (t.cpu() for t in self._topology)
-        pinned, device = self._pinned.cpu(), self.device
+        pinned, device = self._held.cpu(), self.device
         rest, volume = rest_metric(ops.tet_gather(points[None], tets, *star))
         mass = lumped_mass(self._density.cpu().double()[None], volume, tets, *star)[0]
         given = (points, tets, pinned, mass, rest, self._plan.cpu())

@@ -294,6 +294,7 @@ def contact_step(
     masses = color_masses(scene)
     end = _collider_rows(scene, model.collider_points if colliders is None else colliders)
     begin = end if colliders_before is None else _collider_rows(scene, colliders_before)
+    rigid = () if model.rigid_bodies is None else model.rigid_bodies.numbers
     listed = [Pairs(scene, substep, None if order is None else order[r]) for r, substep in enumerate(substeps)]
 
     def rows(values: Tensor) -> Tensor:
@@ -314,6 +315,10 @@ def contact_step(
         now = begin + min(1.0, (r + 1) / prescribed_substeps) * (end - begin)
         move = remaining if prescribed_substeps == 1 else torch.where(pinned, displacement / prescribed_substeps,
                                                                       remaining)  # fmt: skip
+        for body in rigid:
+            own, m = model.body == body, scene.mass[..., None, model.body == body]
+            mean = (m * move[..., own]).sum(-1, keepdim=True) / m.sum(-1, keepdim=True)
+            move = torch.where(own, mean, move)
         u, fraction = rows(substep.u[:, model.body]), rows(substep.fractions[..., None])
         begun, at = state, torch.where(pinned, state + move, state + u + fraction * (move - u))
         forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
@@ -323,15 +328,26 @@ def contact_step(
         number = sweeps // count + (1 if r < sweeps % count else 0) if substep.sweeps is None else substep.sweeps
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
-            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, substep, bound)
+            between = list(substep.corrections[1:number]) if rigid else []  # two sweeps
+            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, substep, bound,
+                              partial(_between, renew, correct, between))  # fmt: skip
             renew(state)
-            for fractions in substep.corrections[1:]:  # of those that do not move again it is 0
+            for fractions in substep.corrections[1 + len(between) :]:  # of those that do not move again it is 0
                 state = correct(state, fractions)
         if substep.going is not None:
             state = torch.where(substep.going.reshape(*x.shape[:-2], 1, 1), state, begun)
         remaining = torch.where(rows(substep.truncated[..., None]) > 0, y - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()
     return x_new, (x_new - x) / time_step
+
+
+def _between(renew: Callable[[Tensor], None], correct: Correction, fractions: Sequence[Tensor], state: Tensor, done: int
+             ) -> Tensor:  # fmt: skip
+    """The state after the rigid correction that follows so many sweeps, where there is one."""
+    if not fractions:
+        return state
+    renew(state)
+    return correct(state, fractions[done - 1])
 
 
 def _collider_rows(scene: Scene, points: Any) -> Tensor:
@@ -356,6 +372,7 @@ def in_cycles(
     number: int,
     substep: Any,
     bound: Bounds | None = None,
+    between: Callable[[Tensor, int], Tensor] = lambda state, done: state,
 ) -> Tensor:
     """The state [..., 3, V] after so many sweeps.
 
@@ -370,6 +387,8 @@ def in_cycles(
     lengths: Any = substep.lengths
     done, corrected = 0, 0
     while done < number:
+        if done:
+            state = between(state, done)
         if bound is not None:
             bound.renew(state)
         if corrections is not None and done:
@@ -377,7 +396,8 @@ def in_cycles(
             corrected += 1
         alone = corrections is not None and done == 0  # a sweep before the first correction
         count = 1 if alone else min(every, number - done)
-        for _ in range(count):
+        for k in range(count):
+            state = between(state, done) if k else state
             own = None if limits is None else limits[done : done + 1]
             done += 1
             if bound is not None:

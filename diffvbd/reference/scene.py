@@ -25,32 +25,38 @@ class Color:
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything about a model that is an index: tets [4, T] in summation order, colors in sweep order."""
+    """Everything about a model that is an index: tets [4, T] in summation order, colors in sweep order. After those
+    that are swept come the vertices of rigid bodies, as one color."""
 
     tets: Tensor
     colors: tuple[Color, ...]
+    swept: int
     order: Tensor | None
 
 
 def build_layout(model: Any, tet_order: Tensor | None = None) -> Layout:
     """Index tensors of `model`; `tet_order` [T] permutes the tets and with them only the order of summation."""
     tets = model.tets if tet_order is None else model.tets[tet_order]
-    ptr = model.color_ptr.tolist()
-    swept = model.color_vertices
+    ends, swept, rigid = model.color_ptr, model.color_vertices, getattr(model, "rigid_bodies", None)
+    count = len(ends) - 1
+    if rigid is not None:
+        swept = torch.cat([swept, rigid.order.to(swept)])
+        ends = torch.cat([ends, ends.new_tensor([len(swept)])])
+    ptr = ends.tolist()
     position = torch.full((model.rest_points.shape[-2],), -1, dtype=torch.int64, device=tets.device)
     position[swept] = torch.arange(swept.numel(), device=tets.device)
 
     # Pairs in the order of the sweep; the stable sort keeps each star in the order of `tets`. Pinned vertices drop out.
     key, pair = torch.sort(position[tets].flatten(), stable=True)
     key, pair = key[key >= 0], pair[key >= 0]
-    bounds = torch.searchsorted(key, model.color_ptr.to(key.device)).tolist()
+    bounds = torch.searchsorted(key, ends.to(key.device)).tolist()
     colors = []
     for start, stop, first, last in zip(ptr[:-1], ptr[1:], bounds[:-1], bounds[1:], strict=True):
         tet = pair[first:last] // 4
         colors.append(
             Color(swept[start:stop], tet, pair[first:last] % 4, key[first:last] - start, tets[tet].T.reshape(-1))
         )
-    return Layout(tets.T.contiguous(), tuple(colors), tet_order)
+    return Layout(tets.T.contiguous(), tuple(colors), count, tet_order)
 
 
 def take(a: Tensor, index: Tensor) -> Tensor:
@@ -182,6 +188,8 @@ def build_scene(
     mass = corner_mass.new_zeros(*corner_mass.shape[:-1], points.shape[-1])
     for corner in layout.tets:
         mass = mass.index_add(-1, corner, corner_mass)
+    if getattr(model, "rigid_bodies", None) is not None:  # masses of their inertia
+        mass = mass * model.rigid_bodies.weights
     if stress_free is not None:  # dN/dX = grad N G^-1, and the volume is that of the grown tet
         by = torch.as_tensor(stress_free, dtype=like.dtype, device=like.device).movedim(-3, -1)  # [..., 3, 3, T]
         by = by if layout.order is None or by.shape[-1] == 1 else by[..., layout.order]

@@ -140,7 +140,7 @@ def stepper(
     renew = bound.renew if bound is not None else lambda state: None
     energies += floor_friction(scene, energies)
     masses = color_masses(scene)
-    correct = Correction(scene, energies)
+    correct, rigid = Correction(scene, energies), getattr(model, "rigid_bodies", None)
     shear, bulk = rates(scene)
     stiffer = replace(scene, mu=scene.mu + shear, lam=scene.lam + bulk)
     coarse = Coarse(stiffer, energies) if getattr(model, "coarse", None) is not None else None
@@ -170,6 +170,8 @@ def stepper(
         for body in correct.bodies:
             extrapolated, fraction = correct.extrapolation(body, take(x_prev, body), take(inertial - x_prev, body),
                                                            lookback)  # fmt: skip
+            if rigid is not None and bool(rigid.mask[body[0]]):
+                extrapolated, fraction = take(x_prev, body), torch.ones_like(fraction)
             begun, held = put(begun, body, extrapolated), [*held, fraction < 1]
         state = correct(begun, y, x_prev)
         if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):
@@ -360,7 +362,7 @@ def run_sweeps(
     targets = [take(y, color.vertices) for color in scene.layout.colors]
     for n in range(sweeps):
         limit = None if limits is None else limits[n]
-        for k, color in enumerate(scene.layout.colors):
+        for k, color in enumerate(scene.layout.colors[: scene.layout.swept]):
             if color.vertices.numel():
                 state = _update_color(scene, energies, k, masses[k], targets[k], state, x_prev, limit, relaxation)
     return state

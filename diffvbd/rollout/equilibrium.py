@@ -119,6 +119,9 @@ def equilibrium(
     lead, system = check_state(model, x, x), system_for(model, solver)
     if check_positive("tolerance", tolerance) >= 1:
         fail("tolerance", "a number in (0, 1)", tolerance)
+    if model.rigid_bodies is not None:
+        raise NotImplementedError("model: expected no rigid bodies in an equilibrium, got some: let them come to rest "
+                                  "in a rollout with drag=")  # fmt: skip
     limits = Limits(tolerance, check_count("max_iterations", max_iterations, 1), progress)
     if not is_word(on_failure, "raise", "warn"):
         fail("on_failure", '"raise" or "warn"', repr(on_failure))

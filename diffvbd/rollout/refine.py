@@ -476,7 +476,9 @@ def _halved(model: Model) -> Halved:
     tets, pinned = model.tets.cpu(), model.pinned.cpu()
     ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
     density = model.density.cpu().repeat_interleave(TETS)
-    changes = {"density": density, "pinned": torch.cat([pinned, pinned[ends].all(1)]) if pinned.any() else None}
+    rigid = () if model.rigid_bodies is None else model.rigid_bodies.numbers
+    pinned = torch.cat([pinned, pinned[ends].all(1)]) if pinned.any() else None
+    changes = {"density": density, "rigid": rigid, "pinned": pinned}
     fine = Model(subdivide(model.mesh), energies=model.replace().energies, colliders=model.colliders, dtype=model.dtype,
                  device=model.device, **changes)  # fmt: skip
     return Halved(fine, ends.to(model.device), model.num_vertices)

@@ -236,6 +236,7 @@ def prepare(
             name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
         try:
             mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
+            mass = model.mass_of(mass)
         except ValueError:
             name_value("density", "finite numbers > 0 kg/m^3", density, density > 0, SCENE_TET)
             name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
@@ -266,6 +267,8 @@ def prepare(
     if model._renews and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
         raise NotImplementedError(f"adjoint: expected ReverseSweep or Unrolled with {what_renews(model)}, got "
                                   "GlobalAdjoint")  # fmt: skip
+    if model.rigid_bodies is not None and isinstance(adjoint, GlobalAdjoint):
+        raise NotImplementedError("adjoint: expected ReverseSweep or Unrolled with rigid bodies, got GlobalAdjoint")
     averaged = None
     if model.patches is not None:
         if model.block == "paper":

@@ -178,9 +178,9 @@ class ContactStep:
             if r == 0:
                 self._lag_friction(self._pushing(detection.listed), was)
             rigid = motion.displacements.rigid if barrier.self_contact else self.none
-            start = start_substep(x, move, detection.u, rigid, detection.trust_radius, detection.deformation_radius,
-                                  self.planes, self.origin, was.detach(), now.detach(), surface.pinned, surface.body,
-                                  surface.unit, detection.listed)  # fmt: skip
+            start = start_substep(x, self._as_wholes(move), detection.u, rigid, detection.trust_radius,
+                                  detection.deformation_radius, self.planes, self.origin, was.detach(), now.detach(),
+                                  surface.pinned, surface.body, surface.unit, detection.listed)  # fmt: skip
             records.counts[r] = torch.cat([detection.counts[:3], start.infeasible])
             if self._reads(x):
                 self._check(r, records.counts[r].tolist(), records)
@@ -196,7 +196,8 @@ class ContactStep:
                 own = replaced(settings, sweeps=sweeps)
                 swept = swept_substep(self, x, swept_from, now, near, own, policy, debug_step)
                 records.swept.append(swept)
-                x, limits, lengths = swept
+                x, limits, lengths, between = swept
+                taken.extend(between)
                 x, fractions, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.substeps)
                 taken.extend(fractions)
                 # sweeps may have recovered what the start truncated, and corrections what sweeps did
@@ -252,6 +253,11 @@ class ContactStep:
                 resting = resting | self.increase_inputs.increases_potential(at, at + h2a)
         return displacement + torch.where(resting[..., None], 0.0, h2a), resting
 
+    def _as_wholes(self, move: Tensor) -> Tensor:
+        """Displacements [B, V, 3] with which a substep starts: a rigid body shifts, and its correction turns it."""
+        rigid = self.model.rigid_bodies
+        return move if rigid is None else rigid.translation(self.fields.mass, move)
+
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """The step with friction on a floor and without pairs: only the floor limits motion."""
         x, none = self.x_prev, no_pairs(self.x_prev, math.prod(self.x_prev.shape[:2]))
@@ -259,7 +265,8 @@ class ContactStep:
         body = labels[: x.shape[1]].long()
         scenes, bodies = len(x), len(free)
         far, nowhere = x.new_full((scenes, bodies + 1), FAR), x.new_zeros((scenes, bodies, 3))
-        start = start_substep(x, self.begun.y - x - broadcast(self.begun.h2a, x.shape), nowhere, self.none, far,
+        move = self._as_wholes(self.begun.y - x - broadcast(self.begun.h2a, x.shape))
+        start = start_substep(x, move, nowhere, self.none, far,
                               far, self.planes, self.origin, self.before, self.colliders, pinned, labels,
                               units(body, ~free), none)  # fmt: skip
         x = torch.where(free[body, None], start.x, self.begun.x_start)
@@ -426,6 +433,7 @@ class SweptSubstep(NamedTuple):
     x: Tensor  # [B, V, 3]
     limits: Tensor  # uint8 [B, K, V]
     lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
+    fractions: Sequence[Tensor] = ()  # of the rigid corrections between sweeps, [B, bodies] each
 
 
 def sweeps_of_substeps(sweeps: int, substeps: int) -> list[int]:
@@ -453,10 +461,13 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
     corrections, matrix = None, of.coarse_matrix
     numbers = settings.numbers
     within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
-    limits, lengths = [], []
-    for n, count in enumerate(cycles):
+    limits, lengths, fractions = [], [], []
+    for n, (corrects, count) in enumerate(cycles):
         ends = n + 1 == len(cycles)
-        if matrix is not None and n:
+        if of.model.rigid_bodies is not None and n:
+            x, taken, _ = corrected(of, x, collider, start, listed)
+            fractions += taken
+        if matrix is not None and corrects:
             if corrections is None or of.begun.renews:
                 fields = touching(of, x, collider, start, listed)
                 own = of.fields if of.begun.law is None else replaced(of.fields, **of.begun.renewed(x))
@@ -465,15 +476,20 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
             lengths.append(length)
         x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))
         limits.append(limit)
-    return SweptSubstep(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None)
+    return SweptSubstep(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None, fractions)
 
 
-def _cycles(model: System, sweeps: int) -> list[int]:
-    """Sweeps of each cycle of a substep; the first sweep stands alone. Without coarse corrections [sweeps]."""
-    if model.coarse is None or not model.coarse_geometry.bodies:
-        return [sweeps]
-    every, after = model.coarse.every, sweeps - 1
-    return [1, *(min(every, after - begun) for begun in range(0, after, every))]
+def _cycles(model: System, sweeps: int) -> list[tuple[bool, int]]:
+    """The cycles of a substep: whether a coarse correction begins it, and how many sweeps follow. With rigid bodies,
+    which are corrected between any two sweeps, each has one."""
+    counts = [sweeps]
+    if model.coarse is not None and model.coarse_geometry.bodies:  # the first sweep stands alone
+        every, after = model.coarse.every, sweeps - 1
+        counts = [1, *(min(every, after - begun) for begun in range(0, after, every))]
+    cycles = [(n > 0, count) for n, count in enumerate(counts)]
+    if model.rigid_bodies is None:
+        return cycles
+    return [(begins and k == 0, 1) for begins, count in cycles for k in range(count)]
 
 
 def of_going(substep: SweptSubstep, going: Tensor) -> SweptSubstep:

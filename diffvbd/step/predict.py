@@ -149,7 +149,12 @@ def begin(
     x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
         x_start = torch.where(prepared.euler[..., None], begins(lookback=LOOKBACK)[0], x_start)
-    return Begun(x_start, start, y, data, origin, (h * h) * acceleration, record, law)
+    begun = Begun(x_start, start, y, data, origin, (h * h) * acceleration, record, law)
+    if (rigid := model.rigid_bodies) is None or not model.corrects:
+        return begun
+    # from the shape that they have: a fraction of an extrapolation would change it
+    whole = replaced(begun, record=None).corrected(start, model, prepared)
+    return replaced(begun, x_start=torch.where(rigid.mask[:, None], whole, x_start))
 
 
 # --- start of a step --------------------------------------------------------------------------------------------------

@@ -73,10 +73,16 @@ def of_bodies(model: System) -> Norm:
     return norm
 
 
+def moving(at: IncrementalPotential, forces: Tensor) -> Tensor:
+    """Forces [B, V, 3] on what moves: none on pinned vertices, on a rigid body what moves it as a whole."""
+    rigid, forces = at.model.rigid_bodies, at.free * forces
+    return forces if rigid is None else rigid.balanced(at.x, at.mass[..., 0], forces)
+
+
 def left_over(at: IncrementalPotential, norm: Norm) -> tuple[Tensor, Tensor]:
     """Left-over force, |M (x - y) + h^2 dE/dx|, and its scale, |M (x - y)| + |h^2 dE/dx| [kg m], over
     the vertices that are not pinned; both [B, groups]."""
-    inertia, forces = at.free * at.inertia(), at.free * at.forces()
+    inertia, forces = moving(at, at.inertia()), moving(at, at.forces())
     return norm(inertia + forces), norm(inertia) + norm(forces)
 
 
@@ -125,7 +131,7 @@ def friction_left_over(at: IncrementalPotential) -> Tensor:
         return sums[..., 0]
     normal, friction = at.contact.on_vertices()
     acts = ((friction != 0).any(-1, keepdim=True) * at.free).double()
-    left = acts * (at.inertia() + at.forces()).double() / at.h**2
+    left = acts * moving(at, at.inertia() + at.forces()).double() / at.h**2
     size = normal.norm(dim=-1, keepdim=True)
     along = (left * normal).sum(-1, keepdim=True) / torch.where(size > 0, size.square(), 1.0)
     force = sums.index_add(1, labels, left - along * normal).norm(dim=-1)
@@ -211,8 +217,8 @@ def unsolved(model: System, solve: Solve, x: Tensor, known: dict[tuple[int, int]
         where = collider_state(model, solve.x, given["colliders"], given["colliders_before"])
         try:
             at = potential_of_step(model, end, begun, prepared, contact_of_step(model, begun, prepared, where))
-            inertia, elastic = at.free * at.inertia(), at.free * at.elastic()
-            forces = at.free * at.forces() if model.vertex_energies or where is not None else elastic
+            inertia, elastic = moving(at, at.inertia()), moving(at, at.elastic())
+            forces = moving(at, at.forces()) if model.vertex_energies or where is not None else elastic
         except ValueError:  # surfaces that touch; the next step says where
             return None
         left, norm, scene, body = inertia + forces, of_bodies(model), 0, 0

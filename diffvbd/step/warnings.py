@@ -82,7 +82,7 @@ def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) ->
     if not (looks_at(prepared.mu) and looks_at(prepared.lam)) or is_silent():
         return
     h, sweeps = prepared.time_step_and_sweeps
-    if not sweeps or not model.num_tets:
+    if not sweeps or not model.num_tets or not model.num_active:
         return
     warn_of_units(model, prepared.mu, prepared.lam, h)
     warn_of_thin_tets(model, prepared.mu, prepared.lam, h, sweeps)
