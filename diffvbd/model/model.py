@@ -451,6 +451,11 @@ class Model:
         return self._sizes[0]
 
     @property
+    def num_moving(self) -> int:
+        """Vertices that are not pinned: those that sweeps move, and those of rigid bodies."""
+        return self.num_active + (0 if self.rigid_bodies is None else len(self.rigid_bodies.order))
+
+    @property
     def num_colors(self) -> int:
         """Groups of vertices that a sweep updates one after another."""
         return self._color_ptr.shape[0] - 1

@@ -217,7 +217,7 @@ class ContactStep:
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.substeps < MOST_DETECTIONS:
-                asked = blocked.any(-1) | (truncated.sum(-1) > TRUNCATED * self.model.num_active)  # still truncated
+                asked = blocked.any(-1) | (truncated.sum(-1) > TRUNCATED * self.model.num_moving)  # still truncated
                 asked = asked & ~self._inverted(x)  # another body might pass through an inverted one
                 going = asked[:, None, None] if going is None else going & asked[:, None, None]
                 self.substeps += int(going.any())

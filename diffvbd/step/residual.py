@@ -290,9 +290,9 @@ def truncated_fraction(model: System) -> Tensor:
     """Share of the vertices that pairs held up in the Model's latest step [-], of the worst scene; a number on the
     Model's device, which is not waited for."""
     outcome = outcomes.get(model.model)
-    if outcome is None or outcome.truncated.numel() == 0 or model.num_active == 0:
+    if outcome is None or outcome.truncated.numel() == 0 or model.num_moving == 0:
         return torch.zeros((), device=model.device)
-    return outcome.truncated.sum(-1).amax() / model.num_active
+    return outcome.truncated.sum(-1).amax() / model.num_moving
 
 
 def what_helps(model: System) -> str:
