@@ -91,6 +91,6 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     """Modules that are imported at their first use, so that ``dir`` shows what a scene is written with."""
-    if name in ("distributed", "results", "robots", "testing"):
+    if name in ("distributed", "envs", "results", "robots", "testing"):
         return _importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

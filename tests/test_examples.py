@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import unittest.mock
 import warnings
 
 import pytest
@@ -19,12 +20,13 @@ EXPECTED = {
     "soft_gripper": [(7.0, 10.0), (2.0, 6.0), (1.0, 2.5)],
     "train_policy": [(0.12, 0.25), (0.0, 0.05)],
     "custom_energy": [(19.99, 20.01), (20, 20)],
+    "train_env": [(-15.0, 0.0), (20.0, 200.0)],
     "tendon_finger": [(34.0, 37.0), (46.0, 49.0), (1.3, 1.6), (1.9, 2.2), (0.0, 0.1)],
 }
 
 
 def run(name: str, capsys: pytest.CaptureFixture[str]) -> str:
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), unittest.mock.patch("sys.argv", [name]):  # without those of pytest
         warnings.simplefilter("error")
         runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     return capsys.readouterr().out

@@ -13,7 +13,7 @@ PYTHON = (
     "_version", "_common", "distributed", "energies", "laws", "mesh", "reference", "ops", "embedding", "couplings",
     "_contact", "model", "adjoint",
     "step", "rollout", "inspect", "contact", "results", "colliders", "robots", "solvers", "losses", "viz", "testing",
-    "", "tasks", "cli", "__main__",
+    "", "envs", "tasks", "cli", "__main__",
 )  # fmt: skip
 CPP = ("core", "energies", "sweep", "contact", "subspace", "cpu", "cuda", "bind")
 
