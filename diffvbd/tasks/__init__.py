@@ -16,6 +16,7 @@ from diffvbd.tasks import (
     dress,
     fit_real_mesh,
     learn_controller,
+    lift,
     million_cubes,
     throw,
 )
@@ -90,6 +91,7 @@ TASKS = {
     ),
     "flag-wind": Task("wind in eight windows that moves a flag as observed", cloth.flag_wind),
     "learn-controller": Task("train a network that drives a soft arm to where it must be", learn_controller.problem),
+    "lift": Task("lift a soft beam with two fingers of a robot that press no more than they must", lift.problem),
     "million-cubes": Task(
         "launch a million small cubes that meet in a ring at one moment",
         million_cubes.problem,

@@ -8,27 +8,15 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd.testing.robot_scenes import ARM_MJCF
 
 mujoco = pytest.importorskip("mujoco")
-ARM = """<mujoco><compiler angle="radian"/><asset><mesh name="wedge" vertex="0 0 0 0.05 0 0 0 0.04 0 0 0 0.03"/></asset>
-<worldbody><geom name="table" type="box" size="0.3 0.3 0.01" pos="0 0 -0.2"/>
-<body name="arm" pos="0.1 0 0.3" quat="0.9 0.1 0.2 0.3">
-<joint name="yaw" axis="0 0 2" range="-1 1" ref="0.2" pos="0.01 0.02 0"/>
-<joint name="slide" type="slide" axis="1 1 0" ref="0.05"/>
-<geom type="capsule" size="0.02 0.1" pos="0 0 0.1" euler="0.3 0 0"/>
-<geom type="sphere" size="0.1" contype="0" conaffinity="0"/>
-<body name="hand" pos="0 0 0.25"><geom type="cylinder" size="0.03 0.02"/>
-<geom type="ellipsoid" size="0.02 0.03 0.04" pos="0 0.1 0"/>
-<body name="left" pos="0.05 0 0"><joint name="close" type="slide" axis="-1 0 0"/><geom type="mesh" mesh="wedge"/></body>
-<body name="right" pos="-0.05 0 0"><joint name="follow" type="slide" axis="1 0 0" ref="0.01"/>
-<geom name="pad" type="box" size="0.01 0.02 0.03"/></body></body></body></worldbody>
-<equality><joint joint1="follow" joint2="close" polycoef="0.002 0.5 0 0 0"/></equality></mujoco>"""
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     file = tmp_path / "arm.xml"
-    file.write_text(ARM, encoding="utf-8")
+    file.write_text(ARM_MJCF, encoding="utf-8")
     return file
 
 
@@ -54,11 +42,11 @@ def test_bodies_move_as_mujoco_says(path: Path) -> None:
 
 def test_bad_input(tmp_path: Path) -> None:
     file = tmp_path / "other.xml"
-    plane = ARM.replace('type="box" size="0.3 0.3 0.01"', 'type="plane" size="1 1 1"')
+    plane = ARM_MJCF.replace('type="box" size="0.3 0.3 0.01"', 'type="plane" size="1 1 1"')
     cases = {
         "<mujoc/>": "path: expected an MJCF file",
-        ARM.replace('type="slide" axis="1 1 0" ref="0.05"', 'type="ball"'): "hinge and slide",
-        ARM.replace("0.002 0.5 0 0 0", "0.002 0.5 1 0 0"): "equalities of joints that are linear",
+        ARM_MJCF.replace('type="slide" axis="1 1 0" ref="0.05"', 'type="ball"'): "hinge and slide",
+        ARM_MJCF.replace("0.002 0.5 0 0 0", "0.002 0.5 1 0 0"): "equalities of joints that are linear",
         plane: "a plane or height field of 'world'",
     }
     for text, message in cases.items():

@@ -10,37 +10,17 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd._contact.pair_forces import corner_points, near_pairs, pair_energy
 from diffvbd.testing import relative_error
+from diffvbd.testing.robot_scenes import ARM_URDF, barrier_energy
 
 yourdfpy = pytest.importorskip("yourdfpy")
 F64 = torch.float64
-LINK = '<link name="{}"><collision><origin xyz="{}" rpy="{}"/><geometry>{}</geometry></collision></link>'
-JOINT = ('<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><origin xyz="{}" rpy="{}"/><axis xyz="{}"/>'
-         "{}</joint>")  # fmt: skip
-LIMIT = '<limit lower="{}" upper="{}" effort="10" velocity="1"/>'
-# an arm of two joints over a hand of two fingers, of which the second follows the first
-GRIPPER = "\n".join([
-    '<?xml version="1.0"?><robot name="gripper">', '<link name="base"/>',
-    LINK.format("arm", "0 0.1 0", "0 0 0", '<cylinder radius="0.02" length="0.15"/>'),
-    LINK.format("hand", "0 0 0", "0.1 0 0", '<box size="0.2 0.03 0.05"/>'),
-    LINK.format("left", "0 -0.06 0", "0 0 0", '<box size="0.02 0.1 0.05"/>'),
-    LINK.format("right", "0 -0.06 0", "0 0 0", '<box size="0.02 0.1 0.05"/>'),
-    LINK.format("tip", "0 0 0.01", "0 0 0", '<sphere radius="0.004"/>'),
-    JOINT.format("lift", "prismatic", "base", "arm", "0 0.4 0", "0 0 0", "0 1 0", LIMIT.format(-0.2, 0.3)),
-    JOINT.format("turn", "revolute", "arm", "hand", "0 -0.1 0", "0 0 0", "0 2 0.2", LIMIT.format(-1, 1)),
-    JOINT.format("close", "prismatic", "hand", "left", "-0.08 0 0", "0 0 0", "1 0 0", LIMIT.format(0, 0.07)),
-    JOINT.format("follow", "prismatic", "hand", "right", "0.08 0 0", "0 0 0", "-1 0 0",
-                 LIMIT.format(0, 0.07) + '<mimic joint="close" multiplier="1.0" offset="0.0005"/>'),
-    JOINT.format("weld", "fixed", "left", "tip", "0 -0.13 0", "0.3 0.1 -0.2", "1 0 0", ""),
-    "</robot>",
-])  # fmt: skip
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     file = tmp_path / "gripper.urdf"
-    file.write_text(GRIPPER, encoding="utf-8")
+    file.write_text(ARM_URDF, encoding="utf-8")
     return file
 
 
@@ -101,11 +81,7 @@ def test_contact_is_read_as_joint_torques(path: Path) -> None:
     assert torch.allclose(robot.torques(q.expand(4, 1, 3), many, about), torques.expand(4, 2, 3), rtol=1e-9)
 
     def energy(q: Tensor) -> float:
-        points, surface = robot(q), model.surface_of_contact
-        near = near_pairs(x[None], None, points[None], points[None], surface, model.contact)
-        kappa = torch.tensor([model.contact.kappa], dtype=F64)
-        corners = near.positions(corner_points(x[None], None, points[None]))
-        return float(pair_energy(near, corners, kappa).sum())
+        return float(barrier_energy(model, x, robot(q)))
 
     for k, name in enumerate(robot.joints):
         way = 1e-7 * torch.eye(3, dtype=F64)[k]
@@ -146,20 +122,20 @@ def test_bad_input(path: Path, tmp_path: Path) -> None:
     for base in (2 * torch.eye(4), torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), torch.eye(3)):
         with pytest.raises(ValueError, match="base: expected a pose"):
             dv.robots.load(path, base)
-    other, bare = tmp_path / "other.urdf", GRIPPER.replace("collision>", "visual>")
+    other, bare = tmp_path / "other.urdf", ARM_URDF.replace("collision>", "visual>")
     cases = {
         "<mujoco/>": "path: expected",
         bare: "path: expected a robot with collision shapes",
-        GRIPPER.replace("revolute", "floating"): "path: expected joints of the types revolute",
-        GRIPPER.replace('mimic joint="close"', 'mimic joint="clos"'): "mimic: expected",
-        GRIPPER.replace('<child link="tip"/>', '<child link="tipp"/>'): "path: expected joints between links",
-        GRIPPER.replace(
+        ARM_URDF.replace("revolute", "floating"): "path: expected joints of the types revolute",
+        ARM_URDF.replace('mimic joint="close"', 'mimic joint="clos"'): "mimic: expected",
+        ARM_URDF.replace('<child link="tip"/>', '<child link="tipp"/>'): "path: expected joints between links",
+        ARM_URDF.replace(
             '<link name="base"/>', '<link name="base"/><link name="lone"/>'
         ): "path: expected one root link",
-        GRIPPER.replace('"0 2 0.2"', '"0 0 0"'): "path: expected joints with an axis, got 'turn'",
-        GRIPPER.replace('name="turn"', 'name="lift"'): "path: expected one joint of each name",
-        GRIPPER.replace('<child link="tip"/>', '<child link="right"/>'): "path: expected one joint above each link",
-        GRIPPER.replace(
+        ARM_URDF.replace('"0 2 0.2"', '"0 0 0"'): "path: expected joints with an axis, got 'turn'",
+        ARM_URDF.replace('name="turn"', 'name="lift"'): "path: expected one joint of each name",
+        ARM_URDF.replace('<child link="tip"/>', '<child link="right"/>'): "path: expected one joint above each link",
+        ARM_URDF.replace(
             '<sphere radius="0.004"/>', '<mesh filename="none.stl"/>'
         ): "path: expected a mesh .* 'none.stl'",
     }

@@ -49,6 +49,7 @@ GRADIENTS = [
     *(("million-cubes", k, 1e-4, "coarse_difference") for k in range(2)),  # tiny against that of the velocity
     ("cover-the-spot", 0, 1e-8, "kinked_difference"),
     ("throw", 0, 1e-6, "kinked_difference"),
+    ("lift", 0, 1e-6, "kinked_difference"),
 ]
 
 
@@ -212,6 +213,17 @@ def test_cut_is_the_dress_of_that_size_in_the_same_cloth(size: float) -> None:
     neck = torch.tensor([0.0, 1.45, 0.0], dtype=torch.float64)
     points = cut(torch.tensor(one.points), torch.tensor(size, dtype=torch.float64), neck)
     torch.testing.assert_close(points, torch.tensor(other.points), rtol=0.0, atol=tolerance("geometry"))
+
+
+# --- a beam that is lifted --------------------------------------------------------------------------------------------
+
+
+def test_quick_run_lifts_what_lay_on_the_ground(tmp_path: Path) -> None:
+    pytest.importorskip("yourdfpy")
+    result = check_fall("lift", tmp_path, factor=0.1, iterations=6)
+    found = result.findings
+    assert found["initial_squeeze"] < found["slip_limit"] < found["recovered_squeeze"] < 2 * found["slip_limit"]
+    assert found["initial_rise"] < 0.001 and found["recovered_rise"] > 0.02
 
 
 # --- disks that cover a target ----------------------------------------------------------------------------------------
