@@ -13,7 +13,7 @@
 
 namespace diffvbd::contact {
 
-constexpr int kTrials = 3, kHalvings = 2;  // fractions 1, 1/4, 1/16 before 0
+constexpr int kTrials = 6, kHalvings = 2;  // fractions 1, 1/4, ..., 1/1024 before 0
 
 // Memory of a correction beyond that of its trials, by body [B, bodies] and by place [B, bodies].
 struct RigidMemory {
