@@ -13,7 +13,18 @@ from torch import Tensor
 
 import diffvbd as dv
 
-from .._common.checks import check_bool, check_count, check_dtype, check_number, check_positive, check_tensor, fail
+from .._common.checks import (
+    check_bool,
+    check_count,
+    check_dtype,
+    check_number,
+    check_positive,
+    check_tensor,
+    fail,
+    name_value,
+    real_array,
+)
+from .._common.context import looks_at
 from ..step.warnings import proven
 
 State = dict[str, Tensor]  # by name, each of shape [B, ...]
@@ -85,8 +96,7 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
         self._graph: torch.cuda.CUDAGraph | None = None
         self.rest = self._settled()
         self.state: State = self._begun(self._random())
-        with torch.no_grad():
-            size = self.observe(self.state).shape[-1]
+        size = self._observed()
         numbers = np.float64 if dtype == torch.float64 else np.float32
         self.single_action_space = Box(-1.0, 1.0, (self.actions,), numbers)
         self.single_observation_space = Box(-np.inf, np.inf, (size,), numbers)
@@ -134,17 +144,21 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
             options: ``{"mask": bool [B]}``: only these scenes begin anew, the others stay as they are, to the bit.
                 ``"reset_mask"``, the name in gymnasium's own environments, does the same.
         """
-        if seed is not None:
-            self._generator.manual_seed(check_count("seed", seed))
-        given = dict(options or {})
-        mask = given.pop("mask", given.pop("reset_mask", None))
-        if given:
+        if not isinstance(options, dict | None):
+            raise TypeError(f"options: expected a dict, got {type(options).__name__}")
+        seed = None if seed is None else check_count("seed", seed, maximum=2**63 - 1)
+        if len(given := dict(options or {})) > 1 or not set(given) <= {"mask", "reset_mask"}:
             fail("options", "mask alone", ", ".join(map(repr, given)))
-        begun = self._begun(self._random())
+        mask = next(iter(given.values()), None)
         if mask is not None:
-            mask = torch.as_tensor(mask, device=self.model.device)
+            mask = mask if isinstance(mask, Tensor) else torch.from_numpy(np.asarray(mask, bool))
             if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
                 fail("options", f"a bool mask of shape [{self.num_envs}]", f"{mask.dtype} of shape {list(mask.shape)}")
+            mask = mask.to(self.model.device)
+        if seed is not None:
+            self._generator.manual_seed(seed)
+        begun = self._begun(self._random())
+        if mask is not None:
             begun = _chosen(mask, begun, self.state)
         if self._graph is None:
             self.state = begun
@@ -167,10 +181,12 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
         """
         like = self.state["x"]
         if isinstance(actions, np.ndarray):
-            actions = torch.as_tensor(actions, dtype=like.dtype, device=like.device)
+            actions = real_array("actions", actions, "an array of numbers").to(like)
         actions = check_tensor("actions", actions, like, "a tensor or an array")
         if actions.shape != (self.num_envs, self.actions):
             fail("actions", f"shape {[self.num_envs, self.actions]}", list(actions.shape))
+        if looks_at(actions):
+            name_value("actions", "numbers", actions.detach(), ~torch.isnan(actions.detach()), ("scene", "action"))
         if self.differentiable:
             self.state, results = self._advanced(self.state, actions, self._random())
         else:
@@ -240,6 +256,28 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
         return results
 
     # --- episodes -----------------------------------------------------------------------------------------------------
+
+    def _observed(self) -> int:
+        """Size of an observation; raises where a method of the subclass returns another shape or dtype than it
+        must."""
+        with torch.no_grad():
+            seen = self.observe(self.state)
+            found = {"observe": (seen, 2), "reward": (self.reward(self.state, self.state, self._no_action()), 1)}
+            found |= {f"start: {name}": (value, value.dim()) for name, value in self.state.items()}
+        for name, (value, dims) in found.items():
+            if value.dim() != dims or not value.dim() or len(value) != self.num_envs:
+                wanted = f"{self.num_envs} scenes in {dims} dimension{'s' * (dims > 1)}"
+                fail(f"{type(self).__name__}.{name}", wanted, f"shape {list(value.shape)}")
+            if value.is_floating_point() and value.dtype != self.model.dtype:
+                fail(f"{type(self).__name__}.{name}", str(self.model.dtype), str(value.dtype))
+        failed = self.failed(self.state)
+        if failed.dtype != torch.bool or failed.shape != (self.num_envs,):
+            fail(f"{type(self).__name__}.failed", f"bool of shape [{self.num_envs}]",
+                 f"{failed.dtype} of shape {list(failed.shape)}")  # fmt: skip
+        return seen.shape[-1]
+
+    def _no_action(self) -> Tensor:
+        return self.model.rest_points.new_zeros((self.num_envs, self.actions))
 
     def _random(self) -> Tensor:
         """Numbers for a new episode of each scene. They are drawn in each step and outside of graphs, so that they

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from .. import ops
 from .._common.checks import (
-    check_broadcast,
     check_count,
     check_dtype,
     check_held,
@@ -19,11 +18,13 @@ from .._common.checks import (
     check_tensor,
     fail,
     init_names_checked,
+    name_value,
+    real_array,
     vertex_mask,
     where_it_is,
 )
 from .._common.constants import CONTACT, ELASTIC
-from .._common.context import is_captured, lasting, lasting_tensors
+from .._common.context import is_captured, lasting, lasting_tensors, looks_at
 from .._contact.barrier import Friction, PairBarrier
 from .._contact.colliders import Collider
 from .._contact.surface import ContactSurface, build_surface, check_colliders
@@ -236,8 +237,8 @@ class Model:
     def body(self) -> Tensor:
         """Body of each vertex, counted from 0, int64 [V]."""
         if self.surface_of_contact is None:
-            labels = np.unique(self.mesh.body, return_inverse=True)[1].reshape(-1)
-            return torch.from_numpy(labels).to(self.device)
+            return self.derived("bodies of vertices", lambda: torch.from_numpy(
+                np.unique(self.mesh.body, return_inverse=True)[1].reshape(-1)).to(self.device)).clone()  # fmt: skip
         return self.surface_of_contact.body[: self.num_vertices].to(torch.int64)
 
     @property
@@ -284,7 +285,7 @@ class Model:
         """Everything that follows from the rest positions, in float64."""
         rest, volume = rest_metric(ops.tet_gather(points[None], *self._topology))
         self._rest_points = points
-        self._mass = self.mass_of(lumped_mass(self._density[None], volume, *self._topology))[0]
+        self._mass = self.mass_of(self._density[None], volume)[0]
         self._rest = rest
         if self.contact is not None:  # potentials of bodies decide
             elastic = bool(self.energy_mask & ELASTIC)
@@ -371,9 +372,10 @@ class Model:
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
 
-    def mass_of(self, lumped: Tensor) -> Tensor:
-        """Masses of vertices whose lumped ones are [..., V] [kg]: those of rigid bodies have their bodies' inertia."""
-        return lumped if self.rigid_bodies is None else self.rigid_bodies.weights * lumped
+    def mass_of(self, density: Tensor, volume: Tensor) -> Tensor:
+        """Masses of the vertices [B, V] [kg] of tets [B, T]: lumped, and of rigid bodies with their inertia."""
+        mass = lumped_mass(density, volume, *self._topology)
+        return mass if self.rigid_bodies is None else self.rigid_bodies.masses(mass, density * volume)
 
     def wrench(self, x: Tensor, body: int, force: Any = None, torque: Any = None) -> Tensor:
         """Forces on the vertices of a body that sum up to a force and to a torque about its center of mass, for the
@@ -384,13 +386,15 @@ class Model:
         Every vertex is accelerated as by a rigid motion, so that a body, rigid or soft, is not deformed by them.
 
         Args:
-            x: Positions [m], shape [..., V, 3]; those at the start of a step, where the wrench is to follow the body.
+            x: Positions [m], shape [..., V, 3]. Pass those of each step: with old ones the arms are those of an old
+                pose. A torque that follows a turning body is of second order in h with ``x + h * v`` alone.
             body: Its number, as in ``body``.
             force: F [N], shape [3] or [..., 3]; None: zero.
             torque: T [N m], likewise.
 
         Returns:
-            Forces [N] [..., V, 3], zero on other bodies; differentiable in x, force and torque.
+            Forces [N] [..., V, 3] along the axes of the world, zero on other bodies; differentiable in x, force and
+            torque.
 
         Raises:
             ValueError, TypeError: Naming the argument, what was expected and what came.
@@ -404,10 +408,23 @@ class Model:
         labels = self.derived("labels", lambda: self.body)
         body = check_count("body", body, maximum=self.mesh.num_bodies - 1)
         rows = self.derived(f"vertices of body {body}", lambda: (labels == body).nonzero()[:, 0])
+        if bool(self._pinned.cpu()[rows.cpu()].any()):
+            fail("body", "one without pinned vertices, which a force does not move", f"body {body}")
         given = []
         for name, value in (("force", force), ("torque", torque)):
-            value = torch.zeros(3).to(x) if value is None else torch.as_tensor(value, dtype=x.dtype, device=x.device)
-            given.append(check_broadcast(name, value, (*x.shape[:-2], 3), x.dim() - 2)[..., None, :])
+            value = torch.zeros(3, dtype=x.dtype, device=x.device) if value is None else value
+            value = value if isinstance(value, Tensor) else real_array(name, value, "three numbers").to(x)
+            check_tensor(name, value, x, owner="that of x")
+            if (
+                not value.dim()
+                or value.shape[-1] != 3
+                or value.dim() >= x.dim()
+                or not all(a in (1, b) for a, b in zip(value.shape[-2::-1], x.shape[-3::-1], strict=False))
+            ):
+                fail(name, f"shape [3], or [..., 3] of x's scenes {list(x.shape[:-2])}", f"shape {list(value.shape)}")
+            if looks_at(value):
+                name_value(name, "finite numbers", value.detach(), torch.isfinite(value.detach()))
+            given.append(value[..., None, :])
         m, at = self._mass[rows, None], x[..., rows, :]
         total = m.sum()
         arm = at - (m * at).sum(-2, keepdim=True) / total

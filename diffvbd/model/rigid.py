@@ -15,7 +15,20 @@ from ..mesh import TetMesh, arrays
 from ..ops.sums import Rows
 
 LEAST = 0.01  # factor of a lumped mass
-EXACT = 1e-9  # relative error of masses, centers and inertias from which on a body counts as having its own
+EXACT = 1e-9  # relative error of masses, centers and inertias up to which they count as right
+
+
+class Masses(NamedTuple):
+    """How the masses of the vertices of a rigid body, n of them, follow from the masses of its tets, t of them: the
+    lumped ones, and what makes mass, center and inertia those of the tets, for any density. With one far from the
+    Model's some may be negative, which sums over the body alone do not mind."""
+
+    vertices: Tensor  # int64 [n]
+    tets: Tensor  # int64 [t]
+    factor: Tensor  # [n], of the lumped masses
+    terms: Tensor  # [n, 10], polynomials of degree 2 at the vertices
+    integrals: Tensor  # [t, 10], their means over the tets
+    change: Tensor  # [n, 10], of the masses for what is missing of the integrals
 
 
 class RigidBodies(NamedTuple):
@@ -25,11 +38,22 @@ class RigidBodies(NamedTuple):
     mask: Tensor  # bool [V], their vertices
     order: Tensor  # int64 [n], the same, body by body
     rows: Rows  # n, by body
-    weights: Tensor  # [V], of the lumped masses; 1 elsewhere
+    of_tets: tuple[Masses, ...]
 
     def to(self, device: torch.device, dtype: torch.dtype) -> RigidBodies:
-        moved = (self.mask.to(device), self.order.to(device), self.rows.to(device), self.weights.to(device, dtype))
-        return RigidBodies(self.numbers, *moved)
+        def placed(t: Tensor) -> Tensor:
+            return t.to(device, dtype) if t.is_floating_point() else t.to(device)
+
+        masses = tuple(Masses(*map(placed, m)) for m in self.of_tets)
+        return RigidBodies(self.numbers, placed(self.mask), placed(self.order), self.rows.to(device), masses)
+
+    def masses(self, lumped: Tensor, of_tets: Tensor) -> Tensor:
+        """Lumped masses [B, V] with those of rigid bodies exchanged, of tets of masses [B, T]; linear in these."""
+        for m in self.of_tets:
+            own = m.factor.to(lumped) * lumped[:, m.vertices]
+            missing = of_tets[:, m.tets] @ m.integrals.to(lumped) - own @ m.terms.to(lumped)
+            lumped = lumped.index_copy(1, m.vertices, own + missing @ m.change.to(lumped).T)
+        return lumped
 
     def translation(self, mass: Tensor, displacement: Tensor) -> Tensor:
         """Displacements [B, V, 3] with those of each rigid body replaced by their mean over its mass [1 | B, V]."""
@@ -76,8 +100,7 @@ def rigid_bodies(given: Any, mesh: TetMesh, pinned: Tensor, density: Tensor) -> 
         return None
     label = np.unique(mesh.body, return_inverse=True)[1].reshape(-1)
     parts = arrays.connected(mesh.tets, mesh.num_vertices)
-    numbers, of = [], np.full(mesh.num_vertices, -1)
-    weights = np.ones(mesh.num_vertices)
+    numbers, of, masses = [], np.full(mesh.num_vertices, -1), []
     for number in given:
         number = check_count("rigid", number, maximum=mesh.num_bodies - 1)
         if number in numbers:
@@ -88,43 +111,43 @@ def rigid_bodies(given: Any, mesh: TetMesh, pinned: Tensor, density: Tensor) -> 
         if (parts[vertices] != parts[vertices[0]]).any():
             fail("rigid", "bodies whose tets are connected", f"body {number}, which has loose parts")
         of[vertices] = len(numbers)
-        weights[vertices] = _weights(number, mesh, vertices, density.numpy())
+        masses.append(_masses(number, mesh, vertices, density.numpy()))
         numbers.append(number)
     mask = torch.from_numpy(of >= 0)
     order = torch.from_numpy(np.argsort(np.where(of < 0, len(numbers), of), kind="stable")[: int(mask.sum())])
-    rows = Rows.of(torch.from_numpy(of)[order], len(numbers))
-    return RigidBodies(tuple(numbers), mask, order, rows, torch.from_numpy(weights))
+    return RigidBodies(tuple(numbers), mask, order, Rows.of(torch.from_numpy(of)[order], len(numbers)), tuple(masses))
 
 
-def _weights(number: int, mesh: TetMesh, vertices: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Factors of the lumped masses of a body with which mass, center and inertia are those of its tets, near 1 and not
-    below LEAST. Where the vertices lie so that there are none, they are 1."""
-    rows = np.isin(mesh.tets[:, 0], vertices)
-    tets, m = mesh.tets[rows], density[rows] * mesh.volume[rows]
+def _masses(number: int, mesh: TetMesh, vertices: np.ndarray, density: np.ndarray) -> Masses:
+    """Of all masses with the right mass, center and inertia those nearest to the lumped ones, and none below a share
+    LEAST of its own, with the Model's density. Where the vertices lie so that there are none, the lumped ones."""
+    tets = np.flatnonzero(np.isin(mesh.tets[:, 0], vertices))
+    m = density[tets] * mesh.volume[tets]
     low, high = mesh.points[vertices].min(0), mesh.points[vertices].max(0)
     x = (mesh.points - (low + high) / 2) / max(float((high - low).max()), 1e-300)
-    mass = np.bincount(tets.reshape(-1), np.repeat(m / 4, 4), len(x))[vertices]
+    corners = mesh.tets[tets]
+    mass = np.bincount(corners.reshape(-1), np.repeat(m / 4, 4), len(x))[vertices]
 
     def terms(p: np.ndarray) -> np.ndarray:
         a, b, c = p.T
         return np.stack([np.ones_like(a), a, b, c, a * a, a * b, a * c, b * b, b * c, c * c], 1)
 
     # squares are integrated exactly by a tet's corners, of weight 1/20 each, and its center, of weight 4/5
-    corners = x[tets]
-    wanted = m @ (terms(corners.reshape(-1, 3)).reshape(-1, 4, 10).sum(1) / 20 + 0.8 * terms(corners.mean(1)))
-    own = terms(x[vertices])
-    factors, free = np.full(len(mass), LEAST), np.ones(len(mass), bool)
+    at = x[corners]
+    integrals = terms(at.reshape(-1, 3)).reshape(-1, 4, 10).sum(1) / 20 + 0.8 * terms(at.mean(1))
+    own, wanted = terms(x[vertices]), m @ integrals
+    factor, free, change = np.ones(len(mass)), np.ones(len(mass), bool), np.zeros_like(own)
     while free.any():
-        m, a = mass[free], own[free]
-        missing = wanted - (mass * np.where(free, 1.0, LEAST)) @ own
-        factors[free] = 1 + a @ (np.linalg.pinv(a.T @ (m[:, None] * a), hermitian=True) @ missing)
-        if not (factors < LEAST).any():
+        weighted = np.where(free, mass, 0.0)[:, None] * own
+        change = weighted @ np.linalg.pinv(own.T @ weighted, hermitian=True)
+        made = factor * mass + change @ (wanted - (factor * mass) @ own)
+        if not (free & (made < LEAST * mass)).any():
             break
-        free &= factors >= LEAST
-        factors[~free] = LEAST
-    if np.abs((mass * factors) @ own - wanted).max() < EXACT * wanted[0]:
-        return factors
-    off = np.abs(mass @ own - wanted)[4:].max() / (wanted[4] + wanted[7] + wanted[9])
-    warn(f"rigid: body {number} has its mass at its vertices, by which its inertia is up to {off:.0%} of itself off; "
-         "with more vertices inside it is exact")  # fmt: skip
-    return np.ones(len(vertices))
+        free &= made >= LEAST * mass
+        factor[~free] = LEAST
+    if not np.abs((factor * mass + change @ (wanted - (factor * mass) @ own)) @ own - wanted).max() < EXACT * wanted[0]:
+        factor, change = np.ones(len(mass)), np.zeros_like(own)
+        off = np.abs(mass @ own - wanted)[4:].max() / max(wanted[[4, 7, 9]].min(), 1e-300)
+        warn(f"rigid: the inertia of body {number} is wrong by up to {off:.0%}, since no vertex, or too few, lie "
+             "inside it; a mesh with three or more points along each edge has the exact one")  # fmt: skip
+    return Masses(*map(torch.from_numpy, (vertices, tets, factor, own, integrals, change)))

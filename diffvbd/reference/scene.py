@@ -189,7 +189,9 @@ def build_scene(
     for corner in layout.tets:
         mass = mass.index_add(-1, corner, corner_mass)
     if getattr(model, "rigid_bodies", None) is not None:  # masses of their inertia
-        mass = mass * model.rigid_bodies.weights
+        own = 4 * corner_mass if layout.order is None else 4 * corner_mass[..., layout.order.argsort()]
+        rows = (a.reshape(-1, a.shape[-1]) for a in (mass, own))
+        mass = model.rigid_bodies.masses(*rows).reshape(mass.shape)
     if stress_free is not None:  # dN/dX = grad N G^-1, and the volume is that of the grown tet
         by = torch.as_tensor(stress_free, dtype=like.dtype, device=like.device).movedim(-3, -1)  # [..., 3, 3, T]
         by = by if layout.order is None or by.shape[-1] == 1 else by[..., layout.order]

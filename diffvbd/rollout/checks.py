@@ -218,7 +218,7 @@ def look_at_end(asked: bool | None, model: System, integrator: Integrator, x: Te
     if steps == 0 or x.numel() == 0 or is_silent() or not (looks_at(x) or may_copy(x)):
         return None
     looked = asked is not False and (asked or (not x.is_cuda and steps >= LEAST_STEPS))
-    looked = bool(looked and settings.sweeps and model.num_active and model.energy_mask & ELASTIC)
+    looked = bool(looked and settings.sweeps and model.num_moving and model.energy_mask & ELASTIC)
     count = 0 if not looked or model.contact is not None else max(1, min(MOST, steps // EVERY))
     at = frozenset(round(steps * k / count) for k in range(1, count + 1))
     return EndLook(model, integrator, (x, v), steps, settings.numbers.time_step, looked, at)

@@ -79,6 +79,7 @@ def memory(
     per_step += scenes * coarse_scalars(model, sweeps) * item
     if model.couplings:  # each sweep has its own start and record, and free bodies a correction of their own
         per_step += scenes * sweeps * (23 if model.corrects else 12) * model.num_vertices * item
+    per_step += scenes * corrections_between(model, sweeps) * item
     if model.patches is not None:  # each sweep has its own start and law
         per_step += scenes * sweeps * (9 * model.num_tets + 3 * model.num_vertices) * item
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
@@ -221,17 +222,25 @@ def choose_schedule(checkpoint_every: int | BinomialCheckpoints | Literal["auto"
     if checkpoint_every != "auto":
         return checkpoint_every, adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
+    own = 0  # of a step, beside its tape
+    if model.rigid_bodies is not None:
+        own = scenes * (9 * model.num_vertices + corrections_between(model, sweeps)) * model._mass.element_size()
     if not isinstance(adjoint, TapedSweep):  # a step of GlobalAdjoint keeps a few states and no tape
         kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
         return None if inside or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
     candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
     for tape in candidates:
         policy = TapedSweep(tape).policy(0, 0, 0, model.device)
-        if steps * row * ops.tape_rows(policy, model.energy_mask) <= TAPE_BUDGET:
+        if steps * (row * ops.tape_rows(policy, model.energy_mask) + own) <= TAPE_BUDGET:
             return None, TapedSweep(tape)
     if inside:
         return None, TapedSweep(candidates[-1])
     return max(1, math.isqrt(steps)), adjoint
+
+
+def corrections_between(model: System, sweeps: int) -> int:
+    """Scalars of a scene that a step keeps of the rigid corrections between its sweeps: the states about each."""
+    return 6 * model.num_vertices * max(0, sweeps - 1) if model.rigid_bodies is not None and model.touches else 0
 
 
 def run_segments(run: Run, steps: int, state: State, every: int | BinomialCheckpoints | None) -> Segment:

@@ -110,7 +110,7 @@ def solve(
     lead, system, scheme = check_state(model, x, v), system_for(model, solver), solver.integrator
     if isinstance(scheme, BDF2):
         fail("solver", "ImplicitEuler() or SDIRK2() in a step: BDF2() needs the step before", "BDF2()")
-    if adjoint is None and not (model.touches or model._renews):
+    if adjoint is None and not (model.touches or model._renews or model.rigid_bodies):
         adjoint = GlobalAdjoint()
     adjoint = check_adjoint(adjoint, solver.tape)
     if check_positive("tolerance", tolerance) >= 1:

@@ -274,6 +274,8 @@ def check_elastic(model: Model) -> None:
         fail("model", "a StableNeoHookean as its only energy", f"{names or 'none'}")
     if model.patches is not None:
         fail("model", "a StableNeoHookean without patches", repr(model.energies[0]))
+    if model.rigid_bodies is not None:
+        fail("model", "no rigid bodies", f"{len(model.rigid_bodies.numbers)}")
 
 
 def _shaped(parameters: Tensors) -> Tensors:

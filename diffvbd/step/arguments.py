@@ -34,7 +34,7 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..couplings import COUPLINGS, Coupling
 from ..energies import VERTEX_ENERGIES
 from ..model.inputs import VISCOSITIES, inputs_of, parameters_of
-from ..model.material import deformed, determinant, lumped_mass, moduli_of, rest_metric
+from ..model.material import deformed, determinant, moduli_of, rest_metric
 from ..model.model import Model
 from ..model.patches import Averaged, uniform
 from ..model.solver import SDIRK2, Integrator
@@ -235,8 +235,7 @@ def prepare(
             name_value("density", "finite numbers > 0 kg/m^3", density, density > 0, SCENE_TET)
             name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
         try:
-            mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
-            mass = model.mass_of(mass)
+            mass = model.mass_of(ops.broadcast(density, shape), ops.broadcast(volume, shape))
         except ValueError:
             name_value("density", "finite numbers > 0 kg/m^3", density, density > 0, SCENE_TET)
             name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
@@ -365,7 +364,7 @@ def check_staged(integrator: Integrator, given: dict[str, Any]) -> None:
 def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:
     """Raises where ``prescribed`` would move a vertex that is not pinned: a row that is not read and is neither x,
     nor one of the ``others``, nor the Model's rest position, nor NaN."""
-    if prescribed is None or model.num_active == 0:
+    if prescribed is None or model.num_moving == 0:
         return
     value = broadcastable("prescribed", prescribed, x).detach()
     if value.dim() < 2 or value.shape[-2] != model.num_vertices or not looks_at(value):

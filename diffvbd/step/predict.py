@@ -111,8 +111,8 @@ def begin(
         # A pinned vertex is moved by no force, whatever stands there.
         total = torch.where(model._pinned[:, None], torch.zeros_like(total), total)
         weight = ops.broadcast(prepared.mass, (flat[0], flat[1]))[..., None]
-        # A vertex without mass is isolated and pinned: no force moves it.
-        acceleration = acceleration + total / torch.where(weight > 0, weight, torch.ones_like(weight))
+        # A vertex without mass is isolated and pinned: no force moves it. Those of a rigid body may be negative.
+        acceleration = acceleration + total / torch.where(weight != 0, weight, torch.ones_like(weight))
     # float32 computes about a point of each body, where positions are small and their spacing fine
     origin = None
     if model.dtype == torch.float32 and model.num_vertices:
