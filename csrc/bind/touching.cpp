@@ -19,16 +19,19 @@ struct Correcting {
   }
 };
 
+// majorizes: friction has the stiffness of the block of a vertex, with which no motion is too long, and not its exact
+// derivative.
+//
 // One correction of the bodies of a mask, or, if that is empty, of all; and of those that touch them. The state after
 // the admissible fraction of each motion [scenes, V, 3]; that fraction [scenes, bodies], zero where none was sought
 // or found; whether a body has a motion; whether it was blocked, in a scene where some blocked body has moved on;
 // whether it was solved for alone, since too many touch; and the translation that it did not take [m].
 DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
-                 double friction_eps, In moving) {
+                 double friction_eps, bool majorizes, In moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
-    Correcting<T> work(f, {data_count, time_step, friction_eps}, device, true);
+    Correcting<T> work(f, {data_count, time_step, friction_eps, majorizes}, device, true);
     contact::RigidStep<T>& s = work.step;
     const int64_t b = x.size(0), n = s.in.bodies();
     const bool all = moving.dim() == 1 && moving.size(0) == 0;
@@ -49,14 +52,14 @@ DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Int
 // rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus the contribution of each
 // listed pair to that of kappa, and of lag.
 DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors fraction, In x_bar,
-                 Ints data_count, double time_step, double friction_eps, bool wants_data) {
+                 Ints data_count, double time_step, double friction_eps, bool majorizes, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
   require(fraction.size() == at.size() && !at.empty(),
           "diffvbd::contact_rigid_reverse: expected as many at as fraction, one at least");
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    Correcting<T> memory(f, {data_count, time_step, friction_eps}, device, false);
+    Correcting<T> memory(f, {data_count, time_step, friction_eps, majorizes}, device, false);
     contact::RigidStep<T>& s = memory.step;
     const int64_t b = read.b, v = read.v, corners = s.in.gate.corners, n = s.in.bodies();
     const WorkTensors pairs_out(f, device);

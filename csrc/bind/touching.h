@@ -10,6 +10,7 @@ namespace diffvbd {
 struct TouchingSettings {
   Ints data_count;
   double time_step, friction_eps;
+  bool majorizes = false;  // friction
 };
 
 template <class T>
@@ -44,6 +45,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const TouchingS
     in.floor_lag = read.batch("floor_lag", t.floor_lag, v * in.planes * contact::kFloorLag);
   }
   in.friction_eps = 0 < q.friction_eps ? q.friction_eps : 1;
+  in.friction_bend = q.majorizes ? 0 : 1;
   return in;
 }
 

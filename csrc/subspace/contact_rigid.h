@@ -61,7 +61,8 @@ struct RigidInputs {
   const bool* moving;                 // [B, bodies], or null: all move
   int32_t planes;
   double friction_eps;
-  bool bends;  // bodies do not move rigidly (contact_coarse.h): pairs within one act, too
+  double friction_bend;  // of the derivative of friction along its slip: 1 is exact, 0 majorises
+  bool bends;            // bodies do not move rigidly (contact_coarse.h): pairs within one act, too
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {
@@ -280,7 +281,7 @@ DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T
     g += (a.size * f.value) * a.tangential;
     add_diagonal(H, a.size * f.value);
     add_outer(H, -a.size * f.value, a.n);
-    add_outer(H, a.size * f.curvature, a.tangential);
+    add_outer(H, in.friction_bend * a.size * f.curvature, a.tangential);
   }
 }
 
@@ -364,7 +365,7 @@ DIFFVBD_FN bool lagged_force(const RigidInputs<T>& in, int64_t pair, const At& a
   out.force = (load * f.value) * u + (damping * approach) * n;
   out.stiffness = diagonal(load * f.value);
   add_outer(out.stiffness, damping - load * f.value, n);
-  add_outer(out.stiffness, load * f.curvature, u);
+  add_outer(out.stiffness, in.friction_bend * load * f.curvature, u);
   return true;
 }
 

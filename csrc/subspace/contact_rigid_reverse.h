@@ -197,12 +197,13 @@ DIFFVBD_FN FrictionRate<R> friction_rate_of(const Vec3<R>& u, double eps) {
 }
 
 // The virtual work by P of friction with a load of 1 after a motion Q. d: the motion since the start of the step, of
-// which u is tangential to n. Force and stiffness at u, times Q.
+// which u is tangential to n. Force and stiffness at u, times Q. bend: RigidInputs::friction_bend.
 template <class R>
-DIFFVBD_FN R friction_work(const Vec3<R>& n, const Vec3<R>& d, const Vec3<R>& P, const Vec3<R>& Q, double eps) {
+DIFFVBD_FN R friction_work(const Vec3<R>& n, const Vec3<R>& d, const Vec3<R>& P, const Vec3<R>& Q, double eps,
+                           double bend) {
   const Vec3<R> u = d - dot(n, d) * n, slip = Q - dot(n, Q) * n;
   const FrictionRate<R> f = friction_rate_of(u, eps);
-  return f.value * dot(u + slip, P) + f.curvature * dot(u, P) * dot(u, Q);
+  return f.value * dot(u + slip, P) + R(bend) * f.curvature * dot(u, P) * dot(u, Q);
 }
 DIFFVBD_FN Vec3<Dual<double>> dual_of(const Vector& a, int direction) {
   return {{a.x, double(direction == 0)}, {a.y, double(direction == 1)}, {a.z, double(direction == 2)}};
@@ -220,10 +221,15 @@ struct LaggedWork {
   bool acts;
   PairMotions m;
   Vector since[4], n, d;  // since: how each corner has moved
-  double w[4], load, damping, h, eps;
+  double w[4], load, damping, h, eps, bend;
 
   DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, d{}, h(in.scene.time_step), eps(in.friction_eps) {
+      : acts(pair < in.first_lagged(in.scene.scenes)),
+        m{},
+        d{},
+        h(in.scene.time_step),
+        eps(in.friction_eps),
+        bend(in.friction_bend) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force: above dhat, or by a coefficient of zero
@@ -250,7 +256,7 @@ struct LaggedWork {
     const R along = dot(by_n, by_d), approach = along < R(0) ? along : R(0), fraction = R(m.fraction);
     const R damped = R(A) * (approach + fraction * dot(by_n, Q)) * dot(by_n, P);
     if (L == 0) return damped;
-    return damped + R(L) * friction_work(by_n, by_d, P, fraction * Q, eps);
+    return damped + R(L) * friction_work(by_n, by_d, P, fraction * Q, eps, bend);
   }
 
   // Stores the rows of the corners [4, 9], and adds to lag_bar [9].
@@ -315,14 +321,15 @@ DIFFVBD_FN void motion_adjoint(const double* motion, double fraction, const Vect
 // Of friction on one plane of a floor, the derivatives of the work by the travel since the start of the step, and by
 // what is lagged [4]: load [N] and normal.
 DIFFVBD_FN Vector friction_adjoint(const double* lag, const Vector& travel, const Vector& P, const Vector& Q, double h2,
-                                   double eps, double* by_lag) {
+                                   double eps, double bend, double* by_lag) {
   const Vector n = vector_at(lag + 1);
   const auto derived = [&](int direction) {
     return h2 * lag[0] *
-           friction_work(dual_of(n, direction - 3), dual_of(travel, direction), dual_of(P, -1), dual_of(Q, -1), eps)
+           friction_work(dual_of(n, direction - 3), dual_of(travel, direction), dual_of(P, -1), dual_of(Q, -1), eps,
+                         bend)
                .derivative;
   };
-  by_lag[0] = h2 * friction_work(n, travel, P, Q, eps);
+  by_lag[0] = h2 * friction_work(n, travel, P, Q, eps, bend);
   for (int i = 0; i < 3; ++i) by_lag[1 + i] = derived(3 + i);
   return {derived(0), derived(1), derived(2)};
 }
@@ -342,7 +349,7 @@ DIFFVBD_FN void add_friction_adjoint(const RigidInputs<T>& in, const rigid::Body
     const T* given = contact::floor_lag(in, b, v, k);
     double lag[kFloorLag], by_lag[kFloorLag];
     for (int i = 0; i < kFloorLag; ++i) lag[i] = given[i];
-    const Vector by_travel = friction_adjoint(lag, travel, P, Q, h2, in.friction_eps, by_lag);
+    const Vector by_travel = friction_adjoint(lag, travel, P, Q, h2, in.friction_eps, in.friction_bend, by_lag);
     out.x -= by_travel, out.x_prev += by_travel;
     for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
   }

@@ -276,14 +276,15 @@ class Corrected(NamedTuple):
 
 
 def rigid_correct(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
-                  moving: Tensor | None = None) -> Corrected:  # fmt: skip
+                  majorizes: bool, moving: Tensor | None = None) -> Corrected:  # fmt: skip
     """State after the admissible fraction of one Newton step of the step's potential over a turn and a shift of every
     body (csrc/subspace/rigid_step.h).
 
-    friction_eps: [m], 0 without friction.  moving: bool [B, bodies]: these move, and those that touch them; or None.
+    friction_eps: [m], 0 without friction.  majorizes: Whether friction has the stiffness of a vertex's block.
+    moving: bool [B, bodies]: these move, and those that touch them; or None.
     """
     moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
-    return Corrected(*raw.contact_rigid_correct(*fields, data_count, time_step, friction_eps, moving))
+    return Corrected(*raw.contact_rigid_correct(*fields, data_count, time_step, friction_eps, majorizes, moving))
 
 
 class RigidAdjoints(NamedTuple):
@@ -302,12 +303,12 @@ class RigidAdjoints(NamedTuple):
 
 
 def rigid_reverse(fields: TouchingFields, at: Sequence[Tensor], fraction: Sequence[Tensor], x_bar: Tensor,
-                  data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
-                  ) -> RigidAdjoints:  # fmt: skip
+                  data_count: Sequence[int], time_step: float, friction_eps: float, majorizes: bool,
+                  wants_data: bool) -> RigidAdjoints:  # fmt: skip
     """Adjoint of corrections, each from ``at`` [B, V, 3] by its fraction, of the state x_bar [B, V, 3] after the last
     one. fields: Of all corrections, but for x."""
     out = raw.contact_rigid_reverse(*fields, list(at), list(fraction), x_bar.contiguous(), data_count, time_step,
-                                    friction_eps, wants_data)  # fmt: skip
+                                    friction_eps, majorizes, wants_data)  # fmt: skip
     return adjoints_of(out, data_count, wants_data)
 
 

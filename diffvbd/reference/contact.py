@@ -133,7 +133,7 @@ class PairBarrier:
     counts_negative = True  # where faces are edges: blocks may be indefinite
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
 
-    def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def on_corners(self, x: Tensor, majorizes: bool = False) -> tuple[Tensor, Tensor]:
         """Of the rigid correction: forces on the corners [Q, 4, 3] and what their updates add [Q, 4, 4, 3, 3]."""
         p = self.pairs
         gap, slope, e, turn = p.measures(corner_points(x, self.colliders), torch.arange(len(p.kind), device=x.device))
@@ -220,8 +220,8 @@ class LaggedPairForces:
 
     turns_its_body = True
 
-    def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """As those of the barrier, of friction exactly."""
+    def on_corners(self, x: Tensor, majorizes: bool = False) -> tuple[Tensor, Tensor]:
+        """As those of the barrier, of friction exactly or, where it majorizes, with the stiffness of a block."""
         along, slip, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
         rate, n = self.h * self.damping, self.normal
         force, outer = (rate * along)[:, None] * n, n[:, :, None] * n[:, None]
@@ -231,7 +231,8 @@ class LaggedPairForces:
             _, first, bend = smoothed(slip, self.reach)
             force = force + (load * first)[:, None] * u
             stiffness = stiffness + (load * first)[:, None, None] * (torch.eye(3).to(x) - outer)
-            stiffness = stiffness + (load * bend)[:, None, None] * u[:, :, None] * u[:, None]
+            if not majorizes:
+                stiffness = stiffness + (load * bend)[:, None, None] * u[:, :, None] * u[:, None]
         both = weights[:, :, None, None, None] * weights[:, None, :, None, None]
         return weights[..., None] * force[:, None], both * stiffness[:, None, None]
 
@@ -347,7 +348,7 @@ def _between(renew: Callable[[Tensor], None], correct: Correction, fractions: Se
     if not fractions:
         return state
     renew(state)
-    return correct(state, fractions[done - 1])
+    return correct(state, fractions[done - 1], majorizes=True)
 
 
 def _collider_rows(scene: Scene, points: Any) -> Tensor:

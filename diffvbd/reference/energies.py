@@ -460,13 +460,15 @@ class FloorFriction:
         across = tangential6(self.floor.normal)
         return torch.cat(((weight * slip).sum(-3), (weight * across).sum(-3)), -2)
 
-    def on_vertices(self, x: Tensor, x_prev: Tensor, vertices: Any = slice(None)) -> tuple[Tensor, Tensor]:
-        """Gradient [..., 3, V] and its exact derivative [..., 6, V], of some vertices."""
+    def on_vertices(
+        self, x: Tensor, x_prev: Tensor, vertices: Any = slice(None), bend: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Gradient [..., 3, V] and its exact derivative [..., 6, V], of some vertices; without ``bend`` as block()."""
         weight, slip = self._full(x, x_prev, vertices)
-        _, rate, bend = smoothed(slip, self.reach)
+        _, rate, curvature = smoothed(slip, self.reach)
         across, along = tangential6(self.floor.normal), outer6(slip)
-        rate, bend = (weight * rate).unsqueeze(-2), (weight * bend).unsqueeze(-2)
-        return (rate * slip).sum(-3), (rate * across + bend * along).sum(-3)
+        rate, more = (weight * rate).unsqueeze(-2), (weight * curvature).unsqueeze(-2)
+        return (rate * slip).sum(-3), (rate * across + (more * along if bend else 0)).sum(-3)
 
     def exact_block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         """As block, with that derivative, which corrections take."""

@@ -27,8 +27,9 @@ class Correction:
         pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
         self.free = ~pinned.to(y.device)
 
-    def __call__(self, x: Tensor, fraction: Tensor) -> Tensor:
-        """The state [..., 3, V] after each body [B, bodies] has taken its fraction of its motion."""
+    def __call__(self, x: Tensor, fraction: Tensor, majorizes: bool = False) -> Tensor:
+        """The state [..., 3, V] after each body [B, bodies] has taken its fraction of its motion. majorizes: Whether
+        friction has the stiffness of a vertex's block."""
         lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(fraction), -1, 3)
         mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(fraction), -1)
         total = mass.new_zeros(len(fraction), self.count).index_add(1, self.body, mass)
@@ -49,10 +50,10 @@ class Correction:
         matrix = x.new_zeros(len(fraction), self.count, self.count, 6, 6)
         matrix = matrix.index_put((_scenes(len(fraction), at), at, at), blocks, accumulate=True)
         for term in self.forces:
-            force, stiffness = term.on_corners(x)
+            force, stiffness = term.on_corners(x, majorizes)
             g, matrix = self._add(term.pairs, term.turns_its_body, force, stiffness, jacobian, g, matrix)
         for floor in self.floors:
-            force, stiffness = floor.on_vertices(x, self.x_prev)
+            force, stiffness = floor.on_vertices(x, self.x_prev, bend=not majorizes)
             pull = jacobian.mT @ force.transpose(-1, -2).reshape(*jacobian.shape[:2], 3, 1)
             g = g.index_add(1, self.body, pull[..., 0])
             pressed = jacobian.mT @ _full(stiffness).reshape(*jacobian.shape[:2], 3, 3) @ jacobian

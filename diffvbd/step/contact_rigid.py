@@ -29,13 +29,14 @@ class Corrections(NamedTuple):
 
 
 def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float, least: int = 1,
-            most: int = 1) -> Corrections:  # fmt: skip
+            most: int = 1, majorizes: bool = False) -> Corrections:  # fmt: skip
     """State after rigid corrections of every free body, each by an admissible step fraction, and after those of blocked
     bodies, or solved for alone, that follow until there are ``most``. friction_eps: [m], 0 without friction.
+    majorizes: As of rigid_correct().
     Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*[t.contiguous() for t in fields])
     kept = torch.is_grad_enabled() and any([t.requires_grad for t in fields])
-    x, back, *made = _correct(*fields, model, time_step, friction_eps, least, most, kept)
+    x, back, *made = _correct(*fields, model, time_step, friction_eps, majorizes, least, most, kept)
     return Corrections(x, [fraction.to(x.dtype) for fraction in (made[::2] if kept else made)], back)
 
 
@@ -56,10 +57,10 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
-    fields, (model, time_step, friction_eps, least, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
+    fields, (model, *numbers, least, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
     made, back, moving, captured = [], fields.x, None, is_captured(fields.x)
     for count in range(1, most + 1):
-        end = rigid_correct(fields, model._data_count, time_step, friction_eps, moving)
+        end = rigid_correct(fields, model._data_count, *numbers, moving)
         made.append(end.fraction)
         back = end.remaining if moving is None else torch.where(end.moved, end.remaining, back)
         fields = replaced(fields, x=end.x)
@@ -74,9 +75,9 @@ def _run(*args: Any) -> tuple[Tensor, ...]:
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     """Adjoints of the fields. saved: These, and of each correction its fraction, between two of them the state."""
-    f, made, (model, time_step, friction_eps) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
+    f, made, (model, *numbers) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
     wants = dict(zip(f._fields, needs, strict=True))
-    own = rigid_reverse(f, [f.x, *made[1::2]], made[::2], bars[0], model._data_count, time_step, friction_eps,
+    own = rigid_reverse(f, [f.x, *made[1::2]], made[::2], bars[0], model._data_count, *numbers,
                         wants["energy_data"])._asdict()  # fmt: skip
     by_kappa = own.pop("by_kappa")
     if wants["kappa"]:
@@ -84,9 +85,9 @@ def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequ
     return [own.get(name) for name in f._fields]
 
 
-# Fields; model, time_step, friction_eps, least, most, kept.
+# Fields; model, time_step, friction_eps, majorizes, least, most, kept.
 _correct = ops.Differentiable(
-    _run, _reverse, arguments=_FIELDS + 6, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
+    _run, _reverse, arguments=_FIELDS + 7, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
     rest=lambda inputs: inputs[_FIELDS:-3],
 )  # fmt: skip
 
@@ -105,12 +106,12 @@ MOST_CORRECTIONS = 5
 BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
 
-def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, least: int = 1, most: int = 1
-              ) -> Corrections:  # fmt: skip
-    """State after the rigid corrections of a step; least and most as of correct()."""
+def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, least: int = 1, most: int = 1,
+              majorizes: bool = False) -> Corrections:  # fmt: skip
+    """State after the rigid corrections of a step; least, most and majorizes as of correct()."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
-    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, least, most)
+    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, least, most, majorizes)
 
 
 def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs) -> ops.TouchingFields:

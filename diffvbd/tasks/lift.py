@@ -176,10 +176,11 @@ class Lift:
         self.motions: dict[str, Tensor] = {}  # of the findings, for pictures
 
     def joints(self, closing: Tensor, rise: Tensor) -> Tensor:
-        """Positions [steps + 1, 2] [m] that reach these at the ends of the windows [windows]."""
+        """Positions [steps + 1, 2] [m] that reach these at the ends of the windows [windows], within their limits."""
         paths = (unit * self.steps @ torch.cat([p[:1], p.diff()])
                  for unit, p in zip(UNITS, (closing, rise), strict=True))  # fmt: skip
-        return self.grip.positions(*paths)
+        low, high = self.grip.robot.limits.to(self.steps).T
+        return torch.maximum(torch.minimum(self.grip.positions(*paths), high), low)
 
     def loss(self) -> Tensor:
         grip = self.grip
