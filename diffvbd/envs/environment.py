@@ -90,6 +90,9 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
             "episode_steps", self.episode_steps if episode_steps is None else episode_steps, 1
         )
         self.model = self.build(dtype, device)
+        self._drawn = [
+            name for name in ("mu", "lam", "friction") if name in self.model.inputs
+        ]  # rigid bodies lack some
         self.solver = dv.VBD(self.time_step, self.sweeps if sweeps is None else sweeps)
         self._generator = torch.Generator(self.model.device)
         self._generator.seed()
@@ -106,7 +109,7 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
     # --- what a subclass defines --------------------------------------------------------------------------------------
 
     def build(self, dtype: torch.dtype, device: str | torch.device) -> dv.Model:
-        """The scene, with friction, and constants of the subclass."""
+        """The scene, and constants of the subclass."""
         raise NotImplementedError
 
     def moduli(self, young: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,7 +211,7 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
         """State after a step in which ended episodes begin anew; observations, rewards, ends, and last observations."""
         action = action.clamp(-1.0, 1.0)
         inputs, changed = self.act(state, action)
-        given: dict[str, Any] = {**inputs, **{name: state[name] for name in ("mu", "lam", "friction")}}
+        given: dict[str, Any] = {**inputs, **{name: state[name] for name in self._drawn}}
         with proven():  # the numbers of a class were tried; each new modulus would be tried again
             x, v = dv.step(self.model, state["x"], state["v"], self.solver, **given)
         after = {**state, **changed, "x": x, "v": v, "steps": state["steps"] + 1}
@@ -301,10 +304,10 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
         """On the CPU, where one scene is fastest."""
         model, young = self.model.to("cpu"), self.model.rest_points.new_full((1,), sum(self.young) / 2)
         x, (mu, lam) = model.rest_points[None], (value.cpu() for value in self.moduli(young))
-        v = torch.zeros_like(x)
+        v, given = torch.zeros_like(x), dict[str, Any](mu=mu, lam=lam) if "mu" in self._drawn else {}
         with proven():
             for _ in range(SETTLING):
-                x, v = dv.step(model, x, v, self.solver, mu=mu, lam=lam)
+                x, v = dv.step(model, x, v, self.solver, **given)
         return x[0].to(self.model.device)
 
 

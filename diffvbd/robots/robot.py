@@ -75,6 +75,10 @@ class Robot:
         axes = np.array([joint.axis for joint in joints], dtype=np.float64).reshape(-1, 3)
         lengths = np.linalg.norm(axes, axis=1, keepdims=True)
         for joint, length in zip(joints, lengths[:, 0].tolist(), strict=True):
+            if not np.isfinite([*np.ravel(joint.origin), *joint.axis, joint.factor, joint.offset]).all():
+                fail("path", "joints of finite numbers", f"{joint.name!r}, which has others")
+            if not joint.limits[0] <= joint.limits[1]:
+                fail("path", "a least position of a joint before the largest", f"{joint.limits} of {joint.name!r}")
             if joint.kind != "fixed" and not length > 0:
                 fail("path", "joints with an axis", f"{joint.name!r}, whose axis is 0")
         self._axes = torch.from_numpy(axes / np.where(lengths > 0, lengths, 1.0))
@@ -82,6 +86,9 @@ class Robot:
         self.links = tuple(surfaces)
         if not self.links:
             fail("path", "a robot with collision shapes", "none")
+        for name, (points, triangles) in surfaces.items():
+            if not len(triangles) or not np.isfinite(points).all():
+                fail("path", "collision shapes of finite size > 0", f"one of link {name!r}")
         self._points = [torch.from_numpy(surfaces[name][0]) for name in self.links]  # of each link, in its frame
         ends = np.cumsum([0, *map(len, self._points)]).tolist()
         self.rows = tuple(map(slice, ends[:-1], ends[1:]))

@@ -57,10 +57,10 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
-    fields, (model, *numbers, least, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
+    fields, (model, h, eps, majorizes, least, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
     made, back, moving, captured = [], fields.x, None, is_captured(fields.x)
     for count in range(1, most + 1):
-        end = rigid_correct(fields, model._data_count, *numbers, moving)
+        end = rigid_correct(fields, model._data_count, h, eps, majorizes, moving)
         made.append(end.fraction)
         back = end.remaining if moving is None else torch.where(end.moved, end.remaining, back)
         fields = replaced(fields, x=end.x)
@@ -75,9 +75,9 @@ def _run(*args: Any) -> tuple[Tensor, ...]:
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     """Adjoints of the fields. saved: These, and of each correction its fraction, between two of them the state."""
-    f, made, (model, *numbers) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
+    f, made, (model, h, eps, majorizes) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS:], rest
     wants = dict(zip(f._fields, needs, strict=True))
-    own = rigid_reverse(f, [f.x, *made[1::2]], made[::2], bars[0], model._data_count, *numbers,
+    own = rigid_reverse(f, [f.x, *made[1::2]], made[::2], bars[0], model._data_count, h, eps, majorizes,
                         wants["energy_data"])._asdict()  # fmt: skip
     by_kappa = own.pop("by_kappa")
     if wants["kappa"]:

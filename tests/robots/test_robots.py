@@ -134,6 +134,9 @@ def test_bad_input(path: Path, tmp_path: Path) -> None:
         ): "path: expected one root link",
         ARM_URDF.replace('"0 2 0.2"', '"0 0 0"'): "path: expected joints with an axis, got 'turn'",
         ARM_URDF.replace('name="turn"', 'name="lift"'): "path: expected one joint of each name",
+        ARM_URDF.replace("0 0.4 0", "0 nan 0"): "path: expected joints of finite numbers, got 'lift'",
+        ARM_URDF.replace('lower="-1"', 'lower="2"'): "path: expected a least position of a joint before the largest",
+        ARM_URDF.replace('radius="0.004"', 'radius="0"'): "path: expected collision shapes of finite size > 0",
         ARM_URDF.replace('<child link="tip"/>', '<child link="right"/>'): "path: expected one joint above each link",
         ARM_URDF.replace(
             '<sphere radius="0.004"/>', '<mesh filename="none.stl"/>'
