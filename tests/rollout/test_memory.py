@@ -97,6 +97,21 @@ def test_bytes_of_one_step_with_coarse_corrections(floor: bool, wanted: str) -> 
     assert_near(predicted["kept"] - frame, measured)
 
 
+@pytest.mark.parametrize("rigid", [(1,), (0, 1)])
+def test_bytes_of_corrections_between_sweeps(rigid: tuple[int, ...]) -> None:
+    """Rigid bodies that touch: what 20 more sweeps keep; and a long rollout of them has checkpoints."""
+    lower, upper = (dv.mesh.box(5, 0.1, split="kuhn").translate((0.0, y, 0.0)) for y in (0.0, 0.103))
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(self_contact=False))
+    model = dv.Model(dv.mesh.join([lower, upper]), energies=energies, rigid=rigid)
+    x, few, more = model.rest_points.requires_grad_(), dv.VBD(0.005, 4), dv.VBD(0.005, 24)
+    first, second = (
+        saved_bytes(lambda s=s: dv.step(model, x, 0 * x.detach(), s, mu=1e4, lam=1e4)) for s in (few, more)
+    )
+    predicted = dv.memory(model, more)["step"] - dv.memory(model, few)["step"]
+    assert_near(predicted, second - first)
+    assert dv.memory(model, more, steps=10**6)["kept"] < 2**31
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize(("tape", "scalars"), [("full", 9), ("compact", 3), ("recompute", 0)])
 def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype: torch.dtype) -> None:
