@@ -75,8 +75,10 @@ def measured(card: Card, kind: type[envs.Environment], scenes: int) -> Row:
         rewards = [env.step(action)[1].sum() for action in leaf.unbind()]
         torch.autograd.grad(torch.stack(rewards).sum(), leaf)
 
-    span = timed(card, gradient)
-    peak = card.peak(gradient)
+    try:
+        span, peak = timed(card, gradient), card.peak(gradient)
+    except torch.OutOfMemoryError as error:
+        return {"forward": scenes / forward, "gradient": None, "gradient_gib": None, "why": str(error).split(".")[0]}
     return {"forward": scenes / forward, "gradient": HORIZON * scenes / span,
             "gradient_gib": None if peak is None else peak / 2**30}  # fmt: skip
 

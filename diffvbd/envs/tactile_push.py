@@ -50,7 +50,7 @@ class TactilePush(Environment):
         energies = (
             dv.StableNeoHookean(),
             dv.FloorBarrier(height=0.0, kappa=400.0, dhat=DHAT),
-            dv.PairBarrier(kappa=400.0, dhat=DHAT, self_contact=False, reach=0.016, detections=1, capacity=15000),
+            dv.PairBarrier(kappa=400.0, dhat=DHAT, self_contact=False, reach=0.016, detections=1, capacity=3000),
             dv.Friction(0.45, velocity=0.02),
         )
         held = mesh.points[:, 0] < -0.0037 - PAD[0]

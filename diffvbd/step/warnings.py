@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._common.checks import input_name
 from .._common.constants import ELASTIC
 from .._common.context import inside, is_silent, looks_at, unheard
 from .._common.messages import page, warn
+from ..model.inputs import parameter_of
 from ..model.material import inside_out, thinness
 from ..model.model import Model
 from ..model.solver import VBD, Integrator
@@ -31,6 +33,7 @@ THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 TOO_STIFF = 0.55  # times aspect^2: so much too stiff were sheets of one layer, from 3.4 to 24
 MOST_BODIES = 8  # whose bending is looked at
 BENT = 0.01  # of the height of a tet, by which a body is no longer an affine image of its rest shape
+STIFF_JOINT = 0.25  # stiffness of springs between two rigid bodies over m / h^2, from which on 20 sweeps lose momentum
 SOFTEST = 10.0  # [Pa] Young's modulus; soft gels have 100 Pa or more
 LONGEST_STEP = 1.0  # [s]
 ALIKE = 8  # moduli that differ by less than 2^(1/8) are measured once
@@ -82,6 +85,8 @@ def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) ->
     if not (looks_at(prepared.mu) and looks_at(prepared.lam)) or is_silent():
         return
     h, sweeps = prepared.time_step_and_sweeps
+    if model.rigid_bodies is not None and model.couplings:
+        warn_of_joints(model, prepared, h)
     if not sweeps or not model.num_tets or not model.num_active:
         return
     warn_of_units(model, prepared.mu, prepared.lam, h)
@@ -90,6 +95,27 @@ def warn_of_sweeps(model: System, prepared: Prepared, integrator: Integrator) ->
         return
     if message := growth_message(model, prepared, integrator):
         warn(message)
+
+
+def warn_of_joints(model: System, prepared: Prepared, h: float) -> None:
+    """Warns of springs and tendons between two rigid bodies that are stiff for a step: each sweep moves either body as
+    if the other one stayed, so that both are held back."""
+    assert model.rigid_bodies is not None
+    body, worst = model.body.cpu(), 0.0
+    mass = torch.zeros(model.mesh.num_bodies, dtype=torch.float64).index_add(0, body, model._mass.double().cpu())
+    for energy in model.couplings:
+        if "stiffness" not in energy.parameters:
+            continue
+        ends = body[energy.joins()[0]]
+        rigid = torch.isin(ends, torch.tensor(model.rigid_bodies.numbers)).all(1) & (ends[:, 0] != ends[:, 1])
+        stiffness = parameter_of(model, prepared.parameters, input_name(energy, "stiffness"))
+        if bool(rigid.any()) and stiffness is not None and looks_at(stiffness):
+            least = float(mass[ends[rigid]].min())
+            worst = max(worst, h * h * float(stiffness.detach().max()) / least)
+    if worst > STIFF_JOINT:
+        warn(f"springs: between rigid bodies a stiffness of {worst:.2g} m / h^2, with m the lighter mass, holds both "
+             f"back like a place, whatever the gap; take at most {STIFF_JOINT:g} m / h^2 and 20 sweeps, or one body; "
+             + page("rigid-bodies.md"))  # fmt: skip
 
 
 def growth_message(model: System, prepared: Prepared, integrator: Integrator) -> str:

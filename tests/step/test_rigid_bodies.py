@@ -2,6 +2,7 @@
 Euler's equations say, and its gradients are those of the executed step. On floors, springs and in contact alike."""
 
 import re
+import warnings
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,28 @@ def test_bad_bodies_are_named(given: Any, message: str) -> None:
     mesh = dv.mesh.join([BRICK, BRICK.translate((1.0, 0.0, 0.0))])
     with pytest.raises((ValueError, TypeError), match=re.escape(message)):
         dv.Model(mesh, pinned=mesh.points[:, 0] > 1.05, rigid=given)
+
+
+@pytest.mark.parametrize(("stiffness", "lost"), [(1e3, 1e-5), (1e6, 0.3)])
+def test_stiff_joints_between_rigid_bodies_are_warned_of(stiffness: float, lost: float) -> None:
+    """Two bars on a hinge; one turns about it. With stiff springs they lose momentum, which a warning says."""
+    bar = dv.mesh.box((5, 3, 3), (0.2, 0.03, 0.03))
+    mesh = dv.mesh.join([bar, bar.translate((0.2, 0.0, 0.0))])
+    ends = [[int(np.square(mesh.points[rows] - p).sum(1).argmin()) + 45 * k for p in ((0.2, 0, 0), (0.2, 0, 0.03))]
+            for k, rows in enumerate((slice(0, 45), slice(45, 90)))]  # fmt: skip
+    springs = dv.Springs(*map(dv.Embedding.of_vertices, ends), stiffness=stiffness)
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), springs), rigid=[0, 1])
+    x, v = model.rest_points, torch.zeros(90, 3, dtype=F64)
+    arm = x[:45] - torch.tensor([0.2, 0.015, 0.0], dtype=F64)
+    v[:45] = torch.linalg.cross(torch.tensor([0.0, 0.0, 5.0], dtype=F64).expand_as(arm), arm)
+    solver = dv.VBD(0.002, 20, integrator=dv.BDF2())
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        motion = dv.rollout(model, x, v, solver, steps=100, gravity=(0.0, 0.0, 0.0), mu=1e5, lam=1e5)
+    momentum = (model.mass[:, None] * motion.v).sum(1)
+    loses = bool((momentum - momentum[0]).norm(dim=-1).max() > lost * momentum[0].norm())
+    warned = any("springs: between rigid bodies a stiffness of" in str(w.message) for w in said)
+    assert warned == loses == (stiffness > 1e5)
 
 
 def test_what_is_refused() -> None:
