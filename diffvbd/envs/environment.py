@@ -36,7 +36,7 @@ WARM_UP = 3  # steps before a capture: kernels are loaded, and the Model keeps w
 class Environment(VectorEnv[Tensor, Tensor, Tensor]):
     """B scenes of one Model that are stepped together. A subclass says what actions do and what is rewarded.
 
-    The interface is that of :class:`gymnasium.vector.VectorEnv`, with tensors of the Model's dtype and device in place
+    The interface is that of ``gymnasium.vector.VectorEnv``, with tensors of the Model's dtype and device in place
     of arrays. A scene whose episode ends begins anew in the same step (``AutoresetMode.SAME_STEP``): ``step`` returns
     the first observation of the next episode, and ``info["final_obs"]`` has the last one of this. So every action has
     an effect, and nothing waits for the device to learn which scenes end.

@@ -469,7 +469,7 @@ class Model:
 
     @property
     def num_moving(self) -> int:
-        """Vertices that are not pinned: those that sweeps move, and those of rigid bodies."""
+        """Vertices that are not pinned, which sweeps or rigid bodies move."""
         return self.num_active + (0 if self.rigid_bodies is None else len(self.rigid_bodies.order))
 
     @property
