@@ -405,10 +405,9 @@ class Model:
             got = f"shape {list(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
             fail("x", f"a tensor of shape [..., {self.num_vertices}, 3]", got)
         check_tensor("x", x, self._mass)
-        labels = self.derived("labels", lambda: self.body)
         body = check_count("body", body, maximum=self.mesh.num_bodies - 1)
-        rows = self.derived(f"vertices of body {body}", lambda: (labels == body).nonzero()[:, 0])
-        if bool(self._pinned.cpu()[rows.cpu()].any()):
+        rows = self.derived(f"vertices of body {body}", lambda: (self.body == body).nonzero()[:, 0])
+        if self.derived(f"pins of body {body}", lambda: bool(self._pinned[rows].any())):
             fail("body", "one without pinned vertices, which a force does not move", f"body {body}")
         given = []
         for name, value in (("force", force), ("torque", torque)):

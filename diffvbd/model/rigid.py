@@ -12,7 +12,7 @@ from torch import Tensor
 from .._common.checks import check_count, fail
 from .._common.messages import warn
 from ..mesh import TetMesh, arrays
-from ..ops.sums import Rows
+from ..ops.sums import Rows, one_thread
 
 LEAST = 0.01  # factor of a lumped mass
 EXACT = 1e-9  # relative error of masses, centers and inertias up to which they count as right
@@ -51,8 +51,9 @@ class RigidBodies(NamedTuple):
         """Lumped masses [B, V] with those of rigid bodies exchanged, of tets of masses [B, T]; linear in these."""
         for m in self.of_tets:
             own = m.factor.to(lumped) * lumped[:, m.vertices]
-            missing = of_tets[:, m.tets] @ m.integrals.to(lumped) - own @ m.terms.to(lumped)
-            lumped = lumped.index_copy(1, m.vertices, own + missing @ m.change.to(lumped).T)
+            with one_thread(lumped):
+                missing = of_tets[:, m.tets] @ m.integrals.to(lumped) - own @ m.terms.to(lumped)
+                lumped = lumped.index_copy(1, m.vertices, own + missing @ m.change.to(lumped).T)
         return lumped
 
     def translation(self, mass: Tensor, displacement: Tensor) -> Tensor:
@@ -94,7 +95,7 @@ def rigid_bodies(given: Any, mesh: TetMesh, pinned: Tensor, density: Tensor) -> 
     Raises:
         ValueError, TypeError: Where ``given`` is no sequence of bodies that may move as wholes.
     """
-    if not isinstance(given, Sequence) or isinstance(given, str):
+    if not isinstance(given, Sequence) or isinstance(given, str | bytes):
         raise TypeError(f"rigid: expected a sequence of numbers of bodies, got {type(given).__name__}")
     if not given:
         return None
