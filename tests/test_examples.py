@@ -35,7 +35,11 @@ def run(name: str, capsys: pytest.CaptureFixture[str]) -> str:
 QUICK = ["first_gradient", "stiffness_field", "identify_material", "contact_drop", "custom_energy"]
 
 
-@pytest.mark.parametrize("name", quick_and_slow(QUICK, EXPECTED))
+LONG = "train_env"  # which trains for 20 seconds; tests/envs holds its gradients
+
+
+@pytest.mark.parametrize("name", [*quick_and_slow(QUICK, [name for name in EXPECTED if name != LONG]),
+                                  pytest.param(LONG, marks=pytest.mark.hours)])  # fmt: skip
 def test_an_example_prints_the_right_numbers(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = run(name, capsys)
     numbers = [float(text) for text in NUMBER.findall(printed)]

@@ -32,7 +32,7 @@ SCENES = (
     (60.0, 20.0, 3, 2, "plane", True, 1 / 120),
     (60.0, 40.0, 2, 3, "floor", False, 1 / 60),
 )
-SMOOTH = {(6, 8): 5, (7, 2): 1, (7, 8): 9}  # three steps of as many sweeps lie at a kink, of these not
+SMOOTH = {(5, 8): 5, (6, 8): 5, (7, 2): 1, (7, 8): 9}  # three steps of as many sweeps lie at a kink, of these not
 
 
 class Scene(NamedTuple):

@@ -222,7 +222,8 @@ def test_quick_run_lifts_what_lay_on_the_ground(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy")
     result = check_fall("lift", tmp_path, factor=0.1, iterations=6)
     found = result.findings
-    assert found["initial_squeeze"] < found["slip_limit"] < found["recovered_squeeze"] < 2 * found["slip_limit"]
+    squeezes = [found[f"{name}_squeeze"] / found["slip_limit"] for name in ("initial", "recovered")]
+    assert squeezes[0] < 0.5 and 0.95 < squeezes[1] < 2
     assert found["initial_rise"] < 0.001 and found["recovered_rise"] > 0.02
 
 
