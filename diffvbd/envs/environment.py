@@ -68,7 +68,7 @@ class Environment(VectorEnv[Tensor, Tensor, Tensor]):
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
     actions: ClassVar[int]  # of a scene, each in [-1, 1]
-    draws: ClassVar[int] = 0  # random numbers with which an episode begins, beside material and friction
+    draws: ClassVar[int] = 0  # random numbers with which an episode begins, besides material and friction
     time_step: ClassVar[float] = 1 / 60  # [s]
     sweeps: int = 20
     episode_steps: int = 120

@@ -100,16 +100,16 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
     return density.expand(num_tets).clone()
 
 
-def warn_of(mesh: TetMesh, given: Any, pinned: Tensor, held: Tensor, energies: tuple[Energy, ...]) -> None:
-    """Warns (UserWarning) of what is legal and seldom meant. ``given``: pinned as it was given; ``held``: vertices that
-    no sweep moves."""
+def warn_of(mesh: TetMesh, given: Any, pinned: Tensor, unswept: Tensor, energies: tuple[Energy, ...]) -> None:
+    """Warns (UserWarning) of what is legal and seldom meant. ``given``: pinned as it was given; ``unswept``: vertices
+    that no sweep moves."""
     if size := _size_message(mesh):
         warn(size)
     if given is not None and mesh.num_vertices and not bool(pinned.any()):
         warn(f"pinned: none of {mesh.num_vertices} vertices is pinned, so all are free, as with pinned=None")
     if mesh.num_vertices and bool(pinned.all()):
         warn(f"pinned: all {mesh.num_vertices} vertices are pinned, so nothing moves but what prescribed moves")
-    if not any(isinstance(e, ELASTIC_LAWS) for e in energies) and mesh.num_tets and not bool(held.all()):
+    if not any(isinstance(e, ELASTIC_LAWS) for e in energies) and mesh.num_tets and not bool(unswept.all()):
         warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
 
 

@@ -131,7 +131,7 @@ class Model:
         self._check_friction()
         self._arrange(points, tets, device)
         self._measure(points)
-        warn_of(mesh, pinned, mask, self._held, self.energies)
+        warn_of(mesh, pinned, mask, self._unswept, self.energies)
         self._place(dtype, device)
         self._executed_by(DEFAULT)  # now, since compiled code can look it up and not build it
 
@@ -199,7 +199,7 @@ class Model:
         return inputs_of(self)
 
     @property
-    def _held(self) -> Tensor:
+    def _unswept(self) -> Tensor:
         """Vertices that no sweep moves, bool [V]: those that are pinned or of rigid bodies."""
         return self._pinned if self.rigid_bodies is None else self._pinned | self.rigid_bodies.mask
 
@@ -276,7 +276,7 @@ class Model:
 
     def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
         """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
-        plan = ops.direct.build_plan(points, tets, ~self._held, ops.LANES[device.type])  # see csrc/cpu/plan.h
+        plan = ops.direct.build_plan(points, tets, ~self._unswept, ops.LANES[device.type])  # see csrc/cpu/plan.h
         self._plan, self._color_ptr, self._color_vertices, star_ptr, star = plan
         self._topology = (tets, star_ptr, star)
         self._sizes = ops.plan_sizes(self._plan, device.type)

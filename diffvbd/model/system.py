@@ -76,7 +76,7 @@ class System(Model):
         assert self.coarse is not None
         points = torch.from_numpy(self.mesh.points.copy())
         tets, *star = (t.cpu() for t in self._topology)
-        pinned, device = self._held.cpu(), self.device
+        pinned, device = self._unswept.cpu(), self.device
         rest, volume = rest_metric(ops.tet_gather(points[None], tets, *star))
         mass = lumped_mass(self._density.cpu().double()[None], volume, tets, *star)[0]
         given = (points, tets, pinned, mass, rest, self._plan.cpu())

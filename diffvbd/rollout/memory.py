@@ -222,7 +222,7 @@ def choose_schedule(checkpoint_every: int | BinomialCheckpoints | Literal["auto"
     if checkpoint_every != "auto":
         return checkpoint_every, adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
-    own = 0  # of a step, beside its tape
+    own = 0  # bytes of a step besides its tape
     if model.rigid_bodies is not None:
         own = scenes * (9 * model.num_vertices + corrections_between(model, sweeps)) * model._mass.element_size()
     if not isinstance(adjoint, TapedSweep):  # a step of GlobalAdjoint keeps a few states and no tape

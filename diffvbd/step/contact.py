@@ -465,7 +465,7 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
     for n, (corrects, count) in enumerate(cycles):
         ends = n + 1 == len(cycles)
         if of.model.rigid_bodies is not None and n:
-            # with the exact derivative of friction that reverses most of a motion is refused; the last ones have it
+            # Where friction reverses, its exact derivative makes a motion too long, and most of it is refused.
             x, taken, _ = corrected(of, x, collider, start, listed, majorizes=True)
             fractions += taken
         if matrix is not None and corrects:

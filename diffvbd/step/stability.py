@@ -96,7 +96,7 @@ def _part_of(model: System, crossed: Tensor) -> _Part:
     if model.num_tets <= MOST_TETS:
         if plain:
             return _Part(model, None)
-        return _Part(model.derived("elastic", lambda: _elastic(model, model.mesh, model._held.cpu(), None)), None)
+        return _Part(model.derived("elastic", lambda: _elastic(model, model.mesh, model._unswept.cpu(), None)), None)
     worst = int(crossed.argmax())
 
     def build() -> _Part:
@@ -106,7 +106,7 @@ def _part_of(model: System, crossed: Tensor) -> _Part:
         used, corners = np.unique(tets[rows], return_inverse=True)
         outside = np.ones(len(tets), dtype=bool)
         outside[rows] = False
-        pinned = model._held.cpu().numpy().copy()
+        pinned = model._unswept.cpu().numpy().copy()
         pinned[tets[outside]] = True
         mesh = TetMesh(points[used], corners.reshape(-1, 4))
         return _Part(_elastic(model, mesh, torch.from_numpy(pinned[used]), rows), rows)
