@@ -93,7 +93,6 @@ RULES: dict[str, Callable[[], Any]] = {
     "more substeps while vertices are truncated": lambda: numbers(contact, MOST_DETECTIONS=0),
     "substeps that invert a tet are taken back": lambda: numbers(contact.ContactStep, _inverted=lambda self, x: (
         torch.zeros(len(x), dtype=torch.bool, device=x.device))),
-    "own radii of the sweeps": lambda: numbers(contact, radii_of_sweeps=lambda m, s, b, start, *_: start.trust_radius),
 }  # fmt: skip
 
 

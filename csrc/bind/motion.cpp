@@ -41,8 +41,7 @@ DIFFVBD_OPERATOR(Out<3>, contact_motion, In x, In origin, In mass, In move, In g
 // bodies + 1], see contact/trust_region.h. pinned [N]; floor: planes in the data of FloorBarrier, or empty.
 DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move, In pinned, In order, In ptr,
                  In displacements, In sums, In floor, In collider, In collider_next, In planes, In body, In radius,
-                 In most, In most_alone, In most_own, In least_own, double dhat, double fraction, double least,
-                 bool self_contact) {
+                 In most, In most_own, double dhat, double fraction, double least, bool self_contact) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
@@ -53,7 +52,7 @@ DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move,
             "contact: expected body of shape [N], N >= vertices, and at most 2^31 corner points in all scenes");
     const Tensor island = device.empty({b, bodies}, ScalarType::Int), u = device.empty({b, bodies, 3}),
                  trust_radius = device.empty({b, bodies + 1}), deformation_radius = device.empty({b, bodies + 1}),
-                 memory = device.empty({b * (1 + bodies)});
+                 memory = device.empty({b});
     contact::IslandInputs<T>& of = in.islands;
     of.x = in.motion.x, of.move = in.motion.move, of.origin = read.vectors_or_null("origin", origin);
     of.mass = in.motion.mass.data, of.mass_scene = in.motion.mass.scene;
@@ -67,46 +66,16 @@ DIFFVBD_OPERATOR(Out<4>, contact_trust_radii, In x, In origin, In mass, In move,
     of.half = static_cast<T>(dhat / 2), of.floor = floor_of(read, floor), of.floor_planes = planes_of(floor);
     in.displacements = read.like("displacements", displacements, contact::kDisplacements * rows),
     in.sums = read.like("sums", sums, 4 * rows);
-    in.most = read.like("most", most, bodies), in.most_alone = read.like("most_alone", most_alone, bodies);
-    in.most_own = read.like("most_own", most_own, bodies), in.least_own = read.like("least_own", least_own, bodies);
+    in.most = read.like("most", most, bodies), in.most_own = read.like("most_own", most_own, bodies);
     in.fraction = static_cast<T>(fraction), in.least = static_cast<T>(least);
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
     contact::RadiusWork<T> work{};
-    work.pushed = data<T>(memory), work.most = work.pushed + b;
+    work.pushed = data<T>(memory);
     work.island = data<int32_t>(island), work.u = data<T>(u);
     work.trust_radius = data<T>(trust_radius), work.deformation_radius = data<T>(deformation_radius);
     DIFFVBD_ON_CUDA(const Tensor searched = device.bytes(cuda::islands_workspace_bytes<T>(of));)
     DIFFVBD_RUN(device, find_trust_radii<T>, in, work DIFFVBD_ON_CUDA(, searched.data_ptr()));
     return Out<4>(island, u, trust_radius, deformation_radius);
-  });
-}
-
-// Trust-region radii of the sweeps [scenes, vertices], see contact/trust_region.h; deformation_center and
-// deformation_radius may be empty. more: factor of the truncated displacement and the stretch; least: smallest radius
-// [m].
-DIFFVBD_OPERATOR(Tensor, contact_sweep_radii, In x, In start, In begin, In move, In gravity_move, In apart,
-                 In stretched, In center, In trust_radius, In deformation_center, In deformation_radius, In pinned,
-                 In body_order, In body_ptr, double more, double least) {
-  const Device device(x);
-  return dispatch_float(x, [&]<class T>(T) {
-    const Reader<T> read(x);
-    contact::SweepRadiusInputs<T> in{};
-    read.by_body(in, body_order, body_ptr);
-    in.x = read.positions(), in.start = read.vectors("start", start), in.begin = read.vectors("begin", begin);
-    in.move = read.vectors("move", move), in.gravity_move = read.vectors("gravity_move", gravity_move);
-    in.apart = read.like("apart", apart, in.scenes * in.bodies);
-    in.stretched = read.like("stretched", stretched, in.scenes * in.bodies);
-    in.center = read.vectors("center", center), in.trust_radius = read.of_vertices("trust_radius", trust_radius);
-    if (deformation_radius.numel() > 0) {
-      in.deformation_center = read.vectors("deformation_center", deformation_center),
-      in.deformation_radius = read.of_vertices("deformation_radius", deformation_radius);
-    }
-    in.pinned = read.flags("pinned", pinned, read.v, true);
-    in.more = static_cast<T>(more), in.least = static_cast<T>(least);
-    Tensor out = device.empty({in.scenes, in.vertices});
-    const Tensor wishes = device.empty({in.scenes, in.bodies}), most = device.empty({in.scenes});
-    DIFFVBD_RUN(device, sweep_radii<T>, in, data<T>(wishes), data<T>(most), data<T>(out));
-    return out;
   });
 }
 

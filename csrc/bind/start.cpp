@@ -45,20 +45,21 @@ DIFFVBD_OPERATOR(Out<8>, contact_start, In x, In move, In u, In rigid, In trust_
     const Tensor start = device.like_x(), center = device.like_x(), own_center = device.empty({own ? b : 0, v, 3}),
                  radius = device.empty({b, v}), own_radius = device.empty({own ? b : 0, v}),
                  fraction = device.empty({b, v}), truncated = device.empty({b, v}, ScalarType::Bool),
-                 infeasible = device.empty({1}, ScalarType::Long);
+                 infeasible = device.zeros({b}, ScalarType::Long);
     s.out = {data<T>(start),
              data<T>(center),
              data<T>(radius),
              data_or_null<T>(own_radius),
              data<T>(fraction),
              data<bool>(truncated),
-             data_or_null<T>(own_center)};
+             data_or_null<T>(own_center),
+             data<int64_t>(infeasible)};
 #ifdef USE_CUDA
     const Tensor work = device.bytes(cuda::advance_workspace_bytes<T>(gate, pairs.size(0)));
-    DIFFVBD_RUN(device, start_substep<T>, s, pairs.size(0), data<int64_t>(infeasible), work.data_ptr(),
+    DIFFVBD_RUN(device, start_substep<T>, s, pairs.size(0), work.data_ptr(),
                 device.attribute(cudaDevAttrMultiProcessorCount));
 #else
-    *data<int64_t>(infeasible) = start_substep<T>(s);
+    start_substep<T>(s);
 #endif
     return Out<8>(start, center, own_center, radius, own_radius, fraction, truncated, infeasible);
   });

@@ -202,7 +202,7 @@ struct Surfaces {
 };
 
 // The result of a detection; N corner points a scene. Unused rows of pairs and entries of `entry` are -1.
-constexpr int kPairRow = 6, kConstants = 8, kNearRow = 5, kNearValues = 8, kCounts = 4;
+constexpr int kPairRow = 6, kConstants = 8, kNearRow = 5, kNearValues = 8, kCounts = 3;
 template <class T>
 struct Detected {
   int64_t capacity;
@@ -211,8 +211,8 @@ struct Detected {
   int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
   int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
   T* near_values;         // [B, N, 8]  weights, normal, gap
-  int64_t* counts;        // [4]  pairs that the list needs, pairs that touch, first key of those or -1, 0
-  T* smallest;            // [B]  smallest gap [m]
+  int64_t* counts;        // [3]  pairs that the list needs, pairs that touch, first key of those or -1
+  T* smallest;            // [B]  smallest gap [m], at most 0 where something touches
 };
 
 // A corner point of a scene, at x + o.

@@ -50,6 +50,7 @@ struct StartOutputs {
   T* fraction;
   bool* truncated;
   T* deformation_center;  // [B, V, 3] or null
+  int64_t* infeasible;    // [B]  pairs that hinder what is prescribed, zero at first
 };
 
 template <class T>

@@ -40,16 +40,15 @@ int64_t count(int64_t n, int64_t grain, const F& f) {
   return total;
 }
 
-// fraction of each unit
+// fraction of each unit; infeasible [B]: zero at first
 template <class T>
-int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
+void advance(const AdvanceInputs<T>& in, T* fraction, int64_t* infeasible) {
   const int64_t rows = in.scenes * in.vertices, units = in.units();
   const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
   std::vector<T> now(units);
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
   std::vector<uint8_t> far(pairs);  // in all rounds of a move
   AdvanceState<T> s{fraction, now.data(), blocked.data(), stamp.data(), failed.data(), true};
-  int64_t infeasible = 0;
   // Shared by all pairs of a vertex.
   std::vector<Motion<T>> motion(rows);
   std::vector<T> bound(rows);
@@ -115,7 +114,13 @@ int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
     if (s.first && !clean) {
       look();
-      infeasible = count(pairs, kPairGrain, [&](int64_t i) { return !far[i] && !test_pair(in, s, i, 0); });
+      for_each(
+          pairs,
+          [&](int64_t i) {
+            if (far[i] || test_pair(in, s, i, 0)) return;
+            __atomic_fetch_add(infeasible + in.listed.pairs[kPairRow * i + 5], 1, __ATOMIC_RELAXED);
+          },
+          kPairGrain);
     }
     bool open = false;
     for (int64_t i = 0; i < units; ++i) {
@@ -124,18 +129,16 @@ int64_t advance(const AdvanceInputs<T>& in, T* fraction) {
     }
     if (!open) break;
   }
-  return infeasible;
 }
 
 }  // namespace
 
 template <class T>
-int64_t start_substep(const StartStep<T>& s) {
+void start_substep(const StartStep<T>& s) {
   const auto each = [&](const auto& phase) { for_each(s.items(), [&](int64_t row) { phase(s, row); }, kPairGrain); };
   each(ClearUnit{}), each(LimitStart{}), each(WantStart{});
-  const int64_t infeasible = advance(s.in.gate, s.m.passed);
+  advance(s.in.gate, s.m.passed, s.out.infeasible);
   each(EndStart{});
-  return infeasible;
 }
 
 template <class T>
@@ -145,7 +148,7 @@ void refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants) {
 
 template void refresh_gaps<float>(const GapInputs<float>&, int64_t, float*);
 template void refresh_gaps<double>(const GapInputs<double>&, int64_t, double*);
-template int64_t start_substep<float>(const StartStep<float>&);
-template int64_t start_substep<double>(const StartStep<double>&);
+template void start_substep<float>(const StartStep<float>&);
+template void start_substep<double>(const StartStep<double>&);
 
 }  // namespace diffvbd

@@ -6,9 +6,8 @@
 
 namespace diffvbd {
 
-// returns the number of pairs that make the prescribed motion infeasible
 template <class T>
-int64_t start_substep(const contact::StartStep<T>& s);
+void start_substep(const contact::StartStep<T>& s);
 
 // constants [pairs, 8]
 template <class T>

@@ -163,7 +163,7 @@ class SceneDetection {
       store_near_pair(in_, scene_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
                       out.near_values + kNearValues * (row + i));
     });
-    T smallest = reach_;
+    T smallest = touching_ == 0 ? reach_ : std::min(reach_, T(0));
     for (const Near<T>& near : near_) smallest = std::min(smallest, near.gap.load(std::memory_order_relaxed));
     out.smallest[scene_] = smallest;
   }
@@ -306,7 +306,7 @@ std::vector<uint64_t> detect(const Surfaces<T>& in, const Detected<T>& out) {
     touches += touching[b], first = std::min(first, first_touching[b]);
   }
   out.counts[0] = static_cast<int64_t>(keys.size()), out.counts[1] = touches;
-  out.counts[2] = first == kNoKey ? -1 : static_cast<int64_t>(first), out.counts[3] = 0;
+  out.counts[2] = first == kNoKey ? -1 : static_cast<int64_t>(first);
   return keys;
 }
 

@@ -144,20 +144,6 @@ void energy_increase(const coarse::IncreaseInputs<T>& in, double* out) {
 // --- contact
 // ----------------------------------------------------------------------------------------------------------
 
-// wishes [B, bodies] and most [B]: memory
-template <class T>
-void sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* trust_radii) {
-  const int64_t grain = pieces_per_thread(in.bodies > 0 ? in.vertices / in.bodies : 0);
-  for_items(in.scenes, in.bodies, grain, [&](int64_t scene, int32_t body) {
-    const int64_t i = scene * in.bodies + body;
-    wishes[i] = contact::wish_of_body(in, contact::displacements_of_body(in, scene, body, 0, 1), i);
-  });
-  for (int64_t s = 0; s < in.scenes; ++s) most[s] = contact::most_of_scene(in, wishes, s, 0, 1);
-  for_items(in.scenes, in.vertices, kGrain, [&](int64_t scene, int32_t v) {
-    trust_radii[scene * in.vertices + v] = contact::sweep_radius(in, most[scene], scene, v);
-  });
-}
-
 // Positions in the user's numbering.
 template <class T>
 struct UserPositions {

@@ -160,19 +160,12 @@ void find_motion(const MotionInputs<T>& in, T* rigid, T* displacements, T* sums)
 template <class T>
 void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
   const int64_t scenes = in.motion.scenes;
-  const auto each = [&](const auto& f) {
-    for (int64_t i = 0; i < scenes * in.motion.bodies; ++i) {
-      f(i / in.motion.bodies, static_cast<int32_t>(i % in.motion.bodies));
-    }
-  };
   const Threads one(false);
   in.islands.trust_radius = work.trust_radius;
   for (int64_t scene = 0; scene < scenes; ++scene) prepare_scene(in, scene, one, work);
-  each([&](int64_t scene, int32_t body) { wish_of_body(in, scene, body, work); });
-  bool looks = false;
-  each([&](int64_t scene, int32_t body) { looks = looks || wants_more(in, work, scene, body); });
-  if (looks) find_islands(in.islands, work.island);
-  each([&](int64_t scene, int32_t body) { radius_among_others(in, work, scene, body, looks); });
+  for (int64_t i = 0; i < scenes * in.motion.bodies; ++i) {
+    radius_alone(in, i / in.motion.bodies, static_cast<int32_t>(i % in.motion.bodies), work);
+  }
   find_islands(in.islands, work.island);
   for (int round = 0; round < kRadiusRounds; ++round) {
     for_bodies<MovingBody>(

@@ -125,7 +125,7 @@ struct NearPairs {
 };
 
 // All moves and rounds of some scenes. Most scenes end after the first round, which only the device knows. motions:
-// memory for all vertices.
+// memory for all vertices. infeasible [B]: zero at first.
 template <class T, class Team, class Pairs>
 __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceState<T> s, Motion<T>* motions,
                                const Range& scenes, const Pairs& pairs, unsigned long long* infeasible) {
@@ -167,7 +167,8 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
     if (s.first && !clean) {
       team.sync();
       look(0);
-      pairs.each_failing(team, in, s, 0, [&](int64_t) { atomicAdd(infeasible, 1ULL); });
+      pairs.each_failing(team, in, s, 0,
+                         [&](int64_t i) { atomicAdd(infeasible + in.listed.pairs[kPairRow * i + 5], 1ULL); });
       team.sync();
     }
     bool open = false;
@@ -179,7 +180,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
   }
 }
 
-// One cooperative launch. infeasible [1]: zero at first.
+// One cooperative launch.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, unsigned* flags,
@@ -188,8 +189,7 @@ __global__ void __launch_bounds__(kThreads)
   advance_scenes(GridTeam{flags}, in, s, motions, {0, in.scenes}, pairs, infeasible);
 }
 
-// A cluster for each small scene. near, planes: memory for all listed pairs. infeasible: zero at first where there are
-// several scenes.
+// A cluster for each small scene. near, planes: memory for all listed pairs.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
     scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, int32_t* near,
@@ -199,7 +199,6 @@ __global__ void __launch_bounds__(kThreads, 2)
   __shared__ Answers answers;
   Cluster cluster = Cluster::all();
   const int64_t scene = blockIdx.x / cluster.size;
-  if (in.scenes == 1 && blockIdx.x == 0 && threadIdx.x == 0) *infeasible = 0;  // before the first synchronization
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
   if (cluster.leaves(in.vertices + own.end - own.begin)) return;
@@ -245,20 +244,15 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* fraction, i
                     int multiprocessors, cudaStream_t stream) {
   const int64_t rows = in.scenes * in.vertices;
   const bool clusters = has_block_each(in.vertices, in.scenes, capacity);
-  std::vector<Span> zeros{{infeasible, sizeof(*infeasible)}};
-  if (rows == 0) return clear(zeros, stream);
+  if (rows == 0) return cudaSuccess;
   AdvanceWork<T> work(in, capacity, clusters, workspace);
   work.state.fraction = fraction, work.state.first = true;
   auto* found = reinterpret_cast<unsigned long long*>(infeasible);
   if (clusters) {
-    if (in.scenes > 1) {  // a single scene clears it itself
-      if (auto error = clear(zeros, stream)) return error;
-    }
     return launch_clusters(scene_kernel<T>, in.scenes, capacity, kThreads, stream, in, work.state, work.motions,
                            work.near, work.planes, found);
   }
-  zeros.push_back({work.flags, kFlags * sizeof(unsigned)});
-  if (auto error = clear(zeros, stream)) return error;
+  if (auto error = clear({{work.flags, kFlags * sizeof(unsigned)}}, stream)) return error;
   AdvanceInputs<T> inputs = in;
   const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
   int resident = 0;
@@ -278,13 +272,13 @@ int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
 }
 
 template <class T>
-cudaError_t start_substep(const StartStep<T>& s, int64_t capacity, int64_t* infeasible, void* workspace,
-                          int multiprocessors, cudaStream_t stream) {
+cudaError_t start_substep(const StartStep<T>& s, int64_t capacity, void* workspace, int multiprocessors,
+                          cudaStream_t stream) {
   const auto each = [&](const auto& phase) {
     if (s.items() > 0) start_kernel<<<blocks_for(s.items(), kThreads), kThreads, 0, stream>>>(phase, s);
   };
   each(ClearUnit{}), each(LimitStart{}), each(WantStart{});
-  if (auto error = advance(s.in.gate, capacity, s.m.passed, infeasible, workspace, multiprocessors, stream)) {
+  if (auto error = advance(s.in.gate, capacity, s.m.passed, s.out.infeasible, workspace, multiprocessors, stream)) {
     return error;
   }
   each(EndStart{});

@@ -64,10 +64,10 @@ cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, vo
 template <class T>
 int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in, int64_t capacity);
 
-// infeasible [1] as on the CPU. capacity: of the list of pairs.
+// capacity: of the list of pairs.
 template <class T>
-cudaError_t start_substep(const contact::StartStep<T>& s, int64_t capacity, int64_t* infeasible, void* workspace,
-                          int multiprocessors, cudaStream_t stream);
+cudaError_t start_substep(const contact::StartStep<T>& s, int64_t capacity, void* workspace, int multiprocessors,
+                          cudaStream_t stream);
 
 // constants [pairs, 8] (contact/pair_list.h).
 template <class T>
@@ -85,9 +85,5 @@ cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T
 template <class T>
 cudaError_t find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work, void* islands,
                              cudaStream_t stream);
-
-// radii [B, V]; wishes [B, bodies], most [B]: workspace
-template <class T>
-cudaError_t sweep_radii(const contact::SweepRadiusInputs<T>& in, T* wishes, T* most, T* radii, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -88,9 +88,11 @@ struct Search {
   const Workspace<T>& work;
   int64_t capacity;
 
-  __device__ void touch(uint64_t key) const {
+  // A pair without a gap, or a point that is not finite, so that its scene is not taken for valid.
+  __device__ void touch(int64_t scene, uint64_t key = kNoKey) const {
     atomicAdd(&work.touching[0], 1ULL);
     lower(&work.touching[1], static_cast<unsigned long long>(key));
+    lower(work.smallest + scene, ordered(T(0)));
   }
 
   __device__ void look_at(const Candidate& c, const PairGap<T>& of) const {
@@ -115,7 +117,7 @@ struct Search {
     const Constants<T> constants = constants_of(in, c);
     if (!constants.admitted) return;
     const uint64_t key = key_of(in, c);
-    if (!(gap > T(0) && begins > T(0))) touch(key);
+    if (!(gap > T(0) && begins > T(0))) touch(c.scene, key);
     if (gap != gap) return;
     const Ordered<T> bits = ordered(gap);
     for (int k = 0; k < 4; ++k) {
@@ -124,9 +126,6 @@ struct Search {
     }
     if (is_listed(in, c, least, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
-
-  // A point that is not finite counts as touching, so that the scene is not taken for valid.
-  __device__ void count_nonfinite() const { atomicAdd(&work.touching[0], 1ULL); }
 
   // Query q: first those of points, then those of edges, in the order of the forest.
   struct Query {
@@ -212,7 +211,7 @@ __global__ void __launch_bounds__(kThreads)
   const auto q = search.query(i < queries ? i : queries - 1);
   bool walks = i < queries;
   if (walks && is_empty(q.box)) {
-    if (!listing && q.kind == kPointTriangle) search.count_nonfinite();
+    if (!listing && q.kind == kPointTriangle) search.touch(q.scene);
     walks = false;
   }
   // Each pair of edges once: an edge looks to its right in the tree.
@@ -335,7 +334,7 @@ __global__ void __launch_bounds__(kThreads)
   const Search<T, listing> search{in, work, capacity};
   const auto q = search.query(i);
   if (is_empty(q.box)) {
-    if (!listing && q.kind == kPointTriangle && lane == 0) search.count_nonfinite();
+    if (!listing && q.kind == kPointTriangle && lane == 0) search.touch(q.scene);
     return;
   }
   const typename Search<T, listing>::Near near(search, q);
@@ -534,7 +533,7 @@ __global__ void finish_kernel(int64_t scenes, Workspace<T> work, Detected<T> out
   if (i < scenes) out.smallest[i] = value_of<T>(work.smallest[i]);
   if (i != 0) return;
   out.counts[0] = static_cast<int64_t>(*work.listed), out.counts[1] = static_cast<int64_t>(work.touching[0]);
-  out.counts[2] = static_cast<int64_t>(work.touching[1]), out.counts[3] = 0;  // kNoKey is -1
+  out.counts[2] = static_cast<int64_t>(work.touching[1]);  // kNoKey is -1
 }
 
 // Sorted rows and entries of many pairs, and ptr.

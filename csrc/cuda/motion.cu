@@ -60,15 +60,13 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// A thread for each body: the radii that bodies ask for, or those among others.
-template <class T, bool first>
+// A thread for each body.
+template <class T>
 __global__ void __launch_bounds__(kThreads)
-    radii_kernel(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work) {
+    radii_alone(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work) {
   const int64_t place = own_item(kThreads), bodies = in.motion.bodies;
   if (place >= in.motion.scenes * bodies) return;
-  const int64_t scene = place / bodies;
-  const auto body = static_cast<int32_t>(place % bodies);
-  first ? wish_of_body(in, scene, body, work) : radius_among_others(in, work, scene, body, true);
+  radius_alone(in, place / bodies, static_cast<int32_t>(place % bodies), work);
 }
 
 // All radii of a small scene, by a block with a warp for each of its bodies in turn. It ends once no radius changes.
@@ -90,29 +88,20 @@ __global__ void __launch_bounds__(kThreads)
   const auto radius = [&](int32_t body) { return radius_at(in, work.trust_radius, scene, body); };
   prepare_scene(in, scene, team, work);
   __syncthreads();
-  islands.each(in.motion.bodies, [&](int32_t body) { wish_of_body(in, scene, body, work); });
+  islands.each(in.motion.bodies, [&](int32_t body) { radius_alone(in, scene, body, work); });
   __syncthreads();
   islands.bound();
   bool changes = true;
-  for (int round = -1;; ++round) {  // -1: radii among other bodies; then next to islands
-    if (changes) islands.find(work.island);
+  for (int round = 0; changes; ++round) {
+    islands.find(work.island);
     if (round == kRadiusRounds) break;
     changes = false;
-    if (round < 0) {
-      islands.each(in.motion.bodies, [&](int32_t body) {
-        const T before = radius(body);
-        radius_among_others(in, work, scene, body, true);
-        changes = changes || !(radius(body) == before);
-      });
-    } else {
-      for_each_body([&](const MovingBody<T>& b, const auto& by) {
-        const T before = by.leads() ? radius(b.body) : T(0);  // only the leader writes it
-        radius_beside_island(in, b, by, work);
-        if (by.leads()) changes = changes || !(radius(b.body) == before);
-      });
-    }
+    for_each_body([&](const MovingBody<T>& b, const auto& by) {
+      const T before = by.leads() ? radius(b.body) : T(0);  // only the leader writes it
+      radius_beside_island(in, b, by, work);
+      if (by.leads()) changes = changes || !(radius(b.body) == before);
+    });
     changes = __syncthreads_or(changes);
-    if (0 <= round && !changes) break;
   }
   for_each_body([&](const MovingBody<T>& b, const auto& by) { write_translation(in, b, by, work); });
   finish_radii(in, scene, team, work);
@@ -139,11 +128,8 @@ cudaError_t find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work, void
   }
   each_scene<T, true><<<scenes, kThreads, 0, stream>>>(in, work);
   if (bodies > 0) {
-    const unsigned blocks = blocks_for(bodies, kThreads);
-    radii_kernel<T, true><<<blocks, kThreads, 0, stream>>>(in, work);
+    radii_alone<T><<<blocks_for(bodies, kThreads), kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
-    radii_kernel<T, false><<<blocks, kThreads, 0, stream>>>(in, work);
-    if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     for (int round = 0; round < kRadiusRounds; ++round) {
       if (const auto error = for_bodies(in.motion, IslandRadius<T>{in, work}, stream)) return error;
       if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;

@@ -24,8 +24,8 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
         pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, measure,
         hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
-        near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [4] int64
-        (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
+        near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [3] int64
+        (pairs needed, pairs without a gap, key of one); smallest gap [B], at most 0 where pairs have none.
     """
     s = surface
     trust_radius, deformation_radius = (

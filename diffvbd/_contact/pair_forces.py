@@ -92,7 +92,7 @@ def near_pairs(
         capacity = max(surface.capacity * x.shape[0], LEAST_CAPACITY)
         while True:
             pairs, constants, *_, counts, _ = detect(x, shift, was, now, surface, barrier, capacity, reach, reach)
-            needed, touching, key, _ = counts.tolist()
+            needed, touching, key = counts.tolist()
             if needed <= capacity:
                 break
             capacity = needed

@@ -16,13 +16,9 @@ from .._contact.faces import faces_of, mean_area, sharp_edges, vertex_areas
 from ..mesh import TetMesh
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
-# Radii without a given reach, in mean edges of the body: the trust-region radius where one body moves and where several
-# do; the deformation radius at least and at most, and that of a pinned body, whose every motion is a deformation.
-# Larger radii list more pairs.
-MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
-LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_PINNED = 0.2, 0.3, 0.75
-# Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
-COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
+# Bounds of the trust-region radius without a given reach, and of the deformation radius, in mean edges of the body:
+# larger radii list more pairs.
+MOST_EDGES, MOST_EDGES_OWN = 2.0, 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +47,7 @@ class ContactSurface:
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
     max_trust_radius: Tensor  # [bodies] [m]: bound of the trust-region radius
-    max_trust_radius_alone: Tensor  # [bodies] [m]: the same where no other body is near
-    max_deformation_radius: Tensor  # [bodies] [m]: bounds of the deformation radius
-    min_deformation_radius: (
-        Tensor  # [bodies] [m]: and is given there in any case, because hardly any two sides of a body are so close
-    )
+    max_deformation_radius: Tensor  # [bodies] [m]: bound of the deformation radius
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
@@ -114,13 +106,9 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     pinned_bodies = torch.from_numpy(pinned_vertices > 0)
     moving_bodies = pinned_vertices < np.bincount(label, minlength=bodies)
     partly_pinned = torch.from_numpy(((pinned_vertices > 0) & moving_bodies)[label])
-    alone = moving_bodies.sum() <= 1 or not barrier.between_bodies
-    own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
-                      MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
-    max_trust_radius_alone = MOST_EDGES * edge
-    max_trust_radius = max_trust_radius_alone if alone else MOST_EDGES_BETWEEN * edge
+    max_trust_radius = MOST_EDGES * edge
     if barrier.reach is not None:
-        max_trust_radius = max_trust_radius_alone = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
+        max_trust_radius = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
 
     surface_vertices = len(points[0])
 
@@ -159,9 +147,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         bodies=bodies,
         rows=tuple(rows),
         max_trust_radius=max_trust_radius,
-        max_trust_radius_alone=max_trust_radius_alone,
-        max_deformation_radius=torch.where(pinned_bodies, MOST_EDGES_PINNED, own) * edge,
-        min_deformation_radius=LEAST_EDGES_OWN * edge,
+        max_deformation_radius=MOST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * surface_vertices,
     )
 

@@ -70,12 +70,11 @@ def status(model: Model) -> Status:
     outcome = outcomes.get(model)
     if outcome is None:
         fail("model", "one that has taken a step with a PairBarrier", "none so far")
-    counts = outcome.counts
     return Status(
-        pairs=int(counts[:, 0].max()),
+        pairs=int(outcome.counts[:, 0].max()),
         capacity=outcome.capacity,
-        touching=int(counts[:, 1].sum()),
-        infeasible=int(counts[:, 3].sum()),
+        touching=int(outcome.counts[:, 1].sum()),
+        infeasible=int(outcome.infeasible.sum()),
         truncated=outcome.truncated.sum(-1).tolist(),
         smallest_gap=outcome.smallest.min(0).values.tolist(),
     )

@@ -33,8 +33,8 @@ class Detection(NamedTuple):
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
     near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
     near_values: Tensor  # [B, N, 8]  its weights, normal and gap [m]; without one, zeros and how far was looked
-    counts: Tensor  # [4] int64  pairs that the list needs, pairs that touch, smallest key of those or -1, 0
-    smallest: Tensor  # [B]  smallest gap, or how far was looked [m]
+    counts: Tensor  # [3] int64  pairs that the list needs, pairs that touch, smallest key of those or -1
+    smallest: Tensor  # [B]  smallest gap, at most 0 where pairs touch, or how far was looked [m]
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
@@ -156,7 +156,7 @@ class TrustRadii(NamedTuple):
 def contact_trust_radii(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, pinned: Tensor, order: Tensor,
                         ptr: Tensor, displacements: Displacements, floor: Tensor, collider: Tensor,
                         collider_next: Tensor, planes: Tensor, body: Tensor, radius: Tensor, most: Tensor,
-                        most_alone: Tensor, most_own: Tensor, least_own: Tensor, dhat: float, fraction: float,
+                        most_own: Tensor, dhat: float, fraction: float,
                         least: float, self_contact: bool) -> TrustRadii:  # fmt: skip
     """Trust-region radii from the wanted displacements. A body that does not move relative to its neighbours gets a
     small radius and lists few pairs. An island translates by the mean of ``move`` over the mass of its free vertices:
@@ -168,40 +168,16 @@ def contact_trust_radii(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, p
         displacements: Result of :func:`contact_motion`.
         floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
         collider, collider_next, planes, body, radius: As for :func:`contact_detect`.
-        most, most_alone, most_own, least_own: Bounds of the radii of each body [NB] [m], see ContactSurface.
+        most, most_own: Bounds of both radii of each body [NB] [m], see ContactSurface.
         dhat: [m].  fraction, least: Radius over a body's displacement relative to its island, and what is added [m].
         self_contact: Whether a body has pairs of its own, and so a deformation radius.
     """
     return TrustRadii(
         *raw.contact_trust_radii(
             x, origin, mass, move, pinned, order, ptr, displacements.longest, displacements.sums, floor, collider,
-            collider_next, planes, body, radius, most, most_alone, most_own, least_own, dhat, fraction, least,
-            self_contact,
+            collider_next, planes, body, radius, most, most_own, dhat, fraction, least, self_contact,
         )
     )  # fmt: skip
-
-
-def sweep_radii(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, gravity_move: Tensor, apart: Tensor,
-                stretched: Tensor, center: Tensor, trust_radius: Tensor, deformation_center: Tensor,
-                deformation_radius: Tensor, pinned: Tensor, body_order: Tensor, body_ptr: Tensor, more: float,
-                least: float) -> Tensor:  # fmt: skip
-    """Trust-region radius of each vertex in the sweeps, about x, [B, V] [m]; 0 where pinned, NaN where an input is.
-
-    A body asks for the sum of its gravity move, its deformation, its last correction, and ``more`` times its truncated
-    displacement and its stretch. A vertex gets ``least`` and the largest radius that a body of its scene asks for, but
-    stays within its trust region of the substep. Not differentiable; results repeat to the bit.
-
-    Args:
-        x, start: [B, V, 3] [m], positions before the sweeps, and those after the start of the substep.
-        begin, move, gravity_move: [B, V, 3] [m], positions before the substep, and wanted displacements.
-        apart, stretched: [B, bodies] [m], as of :func:`contact_motion`.
-        center, trust_radius, deformation_center, deformation_radius: [B, V, 3] and [B, V] [m], center and radius of the
-            trust region, and the same relative to the body's rigid motion; empty without pairs within bodies.
-        pinned: [V] or more, bool.  body_order, body_ptr: Vertices by body [V], and the first of each [bodies + 1].
-    """
-    return raw.contact_sweep_radii(x, start, begin, move, gravity_move, apart, stretched, center, trust_radius,
-                                   deformation_center, deformation_radius, pinned, body_order, body_ptr, more,
-                                   least)  # fmt: skip
 
 
 # --- the start of a substep -------------------------------------------------------------------------------------------
@@ -217,7 +193,7 @@ class SubstepStart(NamedTuple):
     own_radius: Tensor  # [B, V]  of the deformation [m], or empty
     fractions: Tensor  # [B, V]  fraction of its displacement that each vertex went
     truncated: Tensor  # [B, V] bool: pairs or radii have truncated the displacement
-    infeasible: Tensor  # [1] int64: pairs that hinder what is prescribed
+    infeasible: Tensor  # [B] int64: pairs that hinder what is prescribed
 
 
 def start_substep(x: Tensor, move: Tensor, u: Tensor, rigid: Tensor, trust_radius: Tensor, deformation_radius: Tensor,

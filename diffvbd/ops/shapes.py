@@ -172,7 +172,7 @@ def _contact_start(a: Any) -> Any:
     own = scenes if a.rigid.dim() == 3 else 0
     return (torch.empty_like(a.x), torch.empty_like(a.x), new(a.x, own, vertices, 3), new(a.x, scenes, vertices),
             new(a.x, own, vertices), new(a.x, scenes, vertices), new(a.x, scenes, vertices, dtype=torch.bool),
-            new(a.x, 1, dtype=LONG))  # fmt: skip
+            new(a.x, scenes, dtype=LONG))  # fmt: skip
 
 
 def _contact_trust_radii(a: Any) -> Any:
@@ -243,7 +243,6 @@ TABLE: dict[str, Row] = {
     "contact_motion": lambda a: (torch.empty_like(a.x), new(a.x, len(DISPLACEMENTS), a.x.shape[0], _bodies(a)),
                                  new(a.x, a.x.shape[0], _bodies(a), 4)),
     "contact_trust_radii": _contact_trust_radii,
-    "contact_sweep_radii": lambda a: new(a.x, *a.x.shape[:2]),
     "contact_start": _contact_start,
     "contact_refresh_gaps": lambda a: torch.empty_like(a.constants),
     "contact_compact": _contact_compact,

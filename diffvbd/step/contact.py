@@ -26,11 +26,16 @@ from ..model.material import inside_out
 from ..model.model import Model
 from ..model.system import System
 from ..ops import SweepSettings, broadcast
-from ..ops import contact as ops_contact
 from ..ops import contact as ops_start
 from ..ops.autograd import no_transforms
-from ..ops.contact import SubstepStart, TrustRadii, contact_trust_radii, start_substep, sweep_radii
-from ..ops.fields import DISPLACEMENTS
+from ..ops.contact import (
+    Displacements,
+    SubstepStart,
+    TrustRadii,
+    contact_motion,
+    contact_trust_radii,
+    start_substep,
+)
 from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
@@ -167,28 +172,24 @@ class ContactStep:
             move = remaining
             if pins and planned > 1:
                 move = torch.where(pinned, displacement / planned, remaining)
-            motion = motion_of(surface, x, self.origin, self.fields.mass, move, h2a)
-            within = self._trust_radii(x, was, now, motion)
-            detection = self._detect(x, was, now, within)
+            detection = self.detect(x, was, now, move, h2a)
             sweeps = sweeps_of_substep(settings.sweeps, planned, r)
             records.found.append(detection)
-            records.counts.append(detection.counts)
             if self._reads(x):  # before any work
-                self._check(r, records.counts[r].tolist(), records)
+                self._check(r, detection.counts.tolist(), 0, records)
             if r == 0:
                 self._lag_friction(self._pushing(detection.listed), was)
-            rigid = motion.displacements.rigid if barrier.self_contact else self.none
-            start = start_substep(x, self._as_wholes(move), detection.u, rigid, detection.trust_radius,
+            start = start_substep(x, self._as_wholes(move), detection.u, detection.rigid, detection.trust_radius,
                                   detection.deformation_radius, self.planes, self.origin, was.detach(), now.detach(),
                                   surface.pinned, surface.body, surface.unit, detection.listed)  # fmt: skip
-            records.counts[r] = torch.cat([detection.counts[:3], start.infeasible])
+            records.infeasible.append(start.infeasible)
             if self._reads(x):
-                self._check(r, records.counts[r].tolist(), records)
+                self._check(r, detection.counts.tolist(), int(start.infeasible.sum()), records)
             begin = x
             x, taken, _ = corrected(self, start.x, now, start, detection.listed)
             if barrier.self_contact:
                 start = replaced(start, own_center=start.own_center + (x - start.x).detach())
-            trust_radius = radii_of_sweeps(motion, surface, barrier, start, x, begin)
+            trust_radius = radii_of_sweeps(start, x.detach(), self.model._pinned)
             near, kept = self._refreshed(detection.listed, x, now, trust_radius)
             swept_from = replaced(start, center=x.detach(), trust_radius=trust_radius)
             limits, lengths, blocked, truncated = None, None, start.truncated, start.truncated
@@ -301,42 +302,37 @@ class ContactStep:
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
                      checked=self.begun.law is None)[:2]  # fmt: skip
 
-    def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> Detection:
-        """Pairs that can matter for a motion from x."""
-        return self._detect(x, was, now, self._trust_radii(x, was, now, motion))
-
-    def _trust_radii(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> TrustRadii:
-        assert self.surface is not None and self.barrier is not None
-        return trust_radii(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now,
-                           self.planes)  # fmt: skip
-
     @torch.no_grad()
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: TrustRadii) -> Detection:
+    def detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, gravity_move: Tensor) -> Detection:
+        """Pairs that can matter for displacements from x [B, V, 3] [m], as of trust_radii()."""
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
-        x, trust_radius, deformation_radius = x.detach(), within.trust_radius, within.deformation_radius
+        wanted, within = trust_radii(surface, barrier, x, self.origin, self.fields.mass, move, gravity_move, was, now,
+                                     self.planes)  # fmt: skip
+        radii = within.trust_radius, within.deformation_radius
         *index, corners, values, counts, smallest = search.detect(
-            x, self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, trust_radius,
-            deformation_radius,
-        )  # fmt: skip
-        return Detection(Pairs(*index), corners, values, counts, smallest, within.u, trust_radius, deformation_radius)
+            x.detach(), self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, *radii
+        )
+        rigid = wanted.rigid if barrier.self_contact else self.none
+        return Detection(Pairs(*index), corners, values, counts, smallest, rigid, within.u, *radii)
 
-    def _record(self, records: Records) -> Tensor:
-        """Records the outcome of the step; its counts [substeps, 4]."""
+    def _record(self, records: Records) -> Outcome:
+        """Records the outcome of the step."""
         outcomes[self.model.model] = outcome = records.outcome(self.capacity, self.x_prev)
-        return outcome.counts
+        return outcome
 
     def _judged(self, x: Tensor, records: Records) -> Tensor:
-        """x; NaN where a captured step, which cannot raise, is not valid."""
-        table = self._record(records)
+        """x; NaN in the scenes in which a captured step, which cannot raise, is not valid."""
+        outcome = self._record(records)
         record_substeps(self.model, x, records.swept)
         if is_captured(x):
-            needed, touching, _, infeasible = table.unbind(1)
-            good = ((needed <= self.capacity) & (touching + infeasible == 0)).all()
-            return torch.where(good, x, torch.nan)
+            fits = outcome.counts[:, 0] <= self.capacity  # a list that is not complete lacks pairs of any scene
+            good = fits[:, None] & (outcome.smallest > 0) & (outcome.infeasible == 0)
+            return torch.where(good.all(0)[:, None, None], x, torch.nan)
         if x.is_cuda:
-            for r, row in enumerate(table.tolist()):
-                self._check(r, row, records)
+            infeasible = outcome.infeasible.sum(1, keepdim=True)
+            for r, (*row, count) in enumerate(torch.cat([outcome.counts, infeasible], 1).tolist()):
+                self._check(r, row, count, records)
         return self._finite(x)
 
     def _finite(self, x: Tensor) -> Tensor:
@@ -355,11 +351,11 @@ class ContactStep:
             return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, LEAST_CAPACITY if scenes and barrier.capacity is None else 0)
 
-    def _check(self, r: int, counts: list[int], records: Records) -> None:
+    def _check(self, r: int, counts: list[int], infeasible: int, records: Records) -> None:
         """Raises where a detection found more pairs than fit, surfaces that touch, or infeasible prescribed motion."""
         surface = self.surface
         assert surface is not None and self.barrier is not None
-        needed, touching, pair, infeasible = counts
+        needed, touching, pair = counts
         if needed > self.capacity or touching or infeasible:
             self._record(records)  # the status of a step that raises says why
         scenes = self.x_prev.shape[0]
@@ -521,8 +517,9 @@ class Detection(NamedTuple):
             [B N + 1] and ``entry`` [4 capacity].
         near_corners: Corner points and kind of the nearest pair of each corner point, int [B, N, 5]; -1: none.
         near_values: Its weights, normal and gap [m], [B, N, 8].
-        counts: int64 [4]: pairs that the list needs, pairs that touch, key of one of those or -1, 0.
-        smallest: Smallest gap of each scene, or the search distance [m], [B].
+        counts: int64 [3]: pairs that the list needs, pairs that touch, key of one of those or -1.
+        smallest: Smallest gap of each scene, at most 0 where pairs touch, or the search distance [m], [B].
+        rigid: Rigid motion of each body, a displacement [B, V, 3] [m]; empty where bodies have no pairs of their own.
         u: Translation of each body's island, rounded to a grid [B, bodies, 3] [m].
         trust_radius: Trust-region radius of each body relative to its island, and the largest [m], [B, bodies + 1].
         deformation_radius: The same relative to the body's rigid motion [m].
@@ -542,6 +539,7 @@ class Detection(NamedTuple):
     near_values: Tensor
     counts: Tensor
     smallest: Tensor
+    rigid: Tensor
     u: Tensor
     trust_radius: Tensor
     deformation_radius: Tensor
@@ -560,7 +558,8 @@ class Detection(NamedTuple):
 class Outcome(NamedTuple):
     """Record of the latest step of a Model, on its device; read by diffvbd.contact.status."""
 
-    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, infeasible pairs
+    counts: Tensor  # [R, 3] int64: pairs needed, touching pairs, key of one or -1
+    infeasible: Tensor  # [R, B] int64: pairs that hinder what is prescribed; a step that has raised may lack rows
     capacity: int  # pairs of all scenes
     truncated: Tensor  # [B, V] bool: limited in the last sweep or, without sweeps, at the start
     smallest: Tensor  # [R, B] [m]
@@ -579,15 +578,16 @@ class Records:
 
     def __init__(self) -> None:
         self.found: list[Detection] = []
-        self.counts: list[Tensor] = []
+        self.infeasible: list[Tensor] = []
         self.swept: list[SweptSubstep] = []
         self.truncated: Tensor | None = None  # until the first substep ends
 
     def outcome(self, capacity: int, x: Tensor) -> Outcome:
         """capacity: Pairs of all scenes that fit.  x: [B, V, 3] at the start of the step."""
-        smallest, counts = _stack([d.smallest for d in self.found]), _stack(self.counts)
+        counts, smallest = (_stack([getattr(d, name) for d in self.found]) for name in ("counts", "smallest"))
+        infeasible = _stack(self.infeasible) if self.infeasible else torch.zeros_like(smallest, dtype=torch.int64)
         truncated = torch.zeros_like(x[..., 0], dtype=torch.bool) if self.truncated is None else self.truncated
-        return Outcome(counts, capacity, truncated, smallest)
+        return Outcome(counts, infeasible, capacity, truncated, smallest)
 
 
 def _stack(rows: list[Tensor]) -> Tensor:
@@ -672,71 +672,39 @@ LEAST_RADIUS = 1.0  # of dhat, added to it: a compressed barrier may push so far
 
 
 @torch.no_grad()
-def trust_radii(motion: Motion, surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor,
-                was: Tensor, now: Tensor, floor: Tensor) -> TrustRadii:  # fmt: skip
-    """Trust-region radii of bodies until pairs are found again. Index data.
+def trust_radii(
+    surface: ContactSurface,
+    barrier: PairBarrier,
+    x: Tensor,
+    origin: Tensor,
+    mass: Tensor,
+    move: Tensor,
+    gravity_move: Tensor,
+    was: Tensor,
+    now: Tensor,
+    floor: Tensor,
+) -> tuple[Displacements, TrustRadii]:
+    """Wanted displacements by body, and trust-region radii until pairs are found again. Index data.
 
     Args:
-        motion: Wanted displacements.  x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
+        x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
+        move, gravity_move: Wanted displacements [B, V, 3] [m], and h^2 a, which corrections and sweeps add.
         was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or empty.
     """
     s, dhat = surface, barrier.dhat
-    return contact_trust_radii(
-        x.detach(), origin, mass.detach().contiguous(), motion.move, s.pinned, s.body_order,
-        s.body_ptr, motion.displacements, floor, was.detach(), now.detach(), s.planes, s.body, s.radius,
-        s.max_trust_radius, s.max_trust_radius_alone, s.max_deformation_radius, s.min_deformation_radius, dhat,
-        RADIUS_FACTOR, LEAST_RADIUS * dhat, barrier.self_contact,
-    )  # fmt: skip
-
-
-@torch.no_grad()
-def radii_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrier, start: SubstepStart, x: Tensor,
-                    begin: Tensor) -> Tensor:  # fmt: skip
-    """Trust-region radii of the sweeps [B, V] [m]. They allow for barriers, weight, the elastic recovery of
-    deformation, and truncated displacements. The largest of a scene counts, since bodies push one another. Index data.
-
-    Args:
-        motion: Wanted displacements of the substep.  start: Its start, whose trust regions bound the sum.
-        x, begin: Positions before the sweeps, and before the substep, [B, V, 3] [m].
-    """
-    s = surface
-    x, led, begin = [t.detach().contiguous() for t in (x, start.x, begin)]
-    return sweep_radii(
-        x, led, begin, motion.move, motion.gravity_move, motion.apart, motion.stretched, start.center,
-        start.trust_radius, start.own_center, start.own_radius, s.pinned, s.body_order, s.body_ptr, RADIUS_FACTOR,
-        LEAST_RADIUS * barrier.dhat,
-    )  # fmt: skip
-
-
-# --- intended motion of bodies ----------------------------------------------------------------------------------------
-
-
-class Motion(NamedTuple):
-    """Wanted displacements of a substep. Index data."""
-
-    move: Tensor  # [B, V, 3] [m]
-    gravity_move: Tensor  # [B, V, 3] [m]: h^2 a, which corrections and sweeps add
-    displacements: ops_contact.Displacements
-
-    @property
-    def apart(self) -> Tensor:
-        """Longest displacement of a free vertex relative to the rigid motion of its body [B, bodies] [m]."""
-        return self.displacements.longest[DISPLACEMENTS.index("apart")]
-
-    @property
-    def stretched(self) -> Tensor:
-        """Distance by which the straight paths of a rotation, or of a fraction of it, take a vertex of each body from
-        the rotated body [B, bodies] [m]."""
-        return self.displacements.longest[DISPLACEMENTS.index("stretched")]
-
-
-def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, gravity_move: Tensor
-              ) -> Motion:  # fmt: skip
-    """Wanted displacements by kind.
-
-    Args:
-        x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].  move, gravity_move: [B, V, 3] [m].
-    """
     x, mass, move, gravity_move = [t.detach().contiguous() for t in (x, mass, move, gravity_move)]
-    index = (surface.pinned, surface.pinned_bodies, surface.body_order, surface.body_ptr)
-    return Motion(move, gravity_move, ops_contact.contact_motion(x, origin, mass, move, gravity_move, *index))
+    bodies = s.body_order, s.body_ptr
+    wanted = contact_motion(x, origin, mass, move, gravity_move, s.pinned, s.pinned_bodies, *bodies)
+    return wanted, contact_trust_radii(
+        x, origin, mass, move, s.pinned, *bodies, wanted, floor, was.detach(), now.detach(), s.planes, s.body, s.radius,
+        s.max_trust_radius, s.max_deformation_radius, dhat, RADIUS_FACTOR, LEAST_RADIUS * dhat, barrier.self_contact,
+    )  # fmt: skip
+
+
+def radii_of_sweeps(start: SubstepStart, x: Tensor, pinned: Tensor) -> Tensor:
+    """Trust-region radii of the sweeps about x [B, V, 3], [B, V] [m]: what is left of those of the substep. 0 where
+    pinned, bool [V]. Index data."""
+    left = start.trust_radius - (x - start.center).norm(dim=-1)
+    if start.own_radius.numel() > 0:
+        left = torch.minimum(left, start.own_radius - (x - start.own_center).norm(dim=-1))
+    return torch.where(pinned, 0.0, left).clamp(min=0.0)

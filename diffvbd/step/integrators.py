@@ -27,7 +27,7 @@ from ..model.system import System
 from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import STAGED, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse import coarse_mass
-from .contact import ContactStep, motion_of
+from .contact import ContactStep
 from .damping import Reference, damped
 from .predict import Begun, begin
 
@@ -340,9 +340,7 @@ def _near_pairs(model: System, begun: Begun, prepared: Prepared, displacement: T
                 ) -> Tensor:  # fmt: skip
     step = ContactStep(model, begun, prepared, before, after)
     assert step.surface is not None
-    motion = motion_of(step.surface, step.x_prev, step.origin, step.fields.mass, displacement,
-                       torch.zeros_like(displacement))  # fmt: skip
-    found = step.detect(step.x_prev, step.before, step.colliders, motion)
+    found = step.detect(step.x_prev, step.before, step.colliders, displacement, torch.zeros_like(displacement))
     displacements = torch.cat([displacement, after - before], 1)
     *corner, kind, scene = found.listed.pairs.long().unbind(-1)
     rows = torch.arange(len(kind), device=displacement.device)

@@ -36,21 +36,20 @@ def test_only_fast_motion_beside_others_takes_more_than_one(dtype: torch.dtype, 
             v = torch.zeros_like(v)
             v[:, 1] = -speed
         out = []
-        for _ in range(3):
+        for _ in range(STEPS):
             with dv.record("contact") as found:
-                x, v = dv.step(model, x, v, dv.VBD(1 / 60, 4), **MATERIAL)
+                x, v = dv.step(model, x, v, dv.VBD(1 / 60, 10), **MATERIAL)
             out.append(len(found))
             assert len(dv.contact.intersections(model, x)) == 0
         return out
 
-    assert counts(0.5, False) == [1, 1, 1]
-    assert counts(20.0, True) == [1, 1, 1]
+    assert counts(0.5, False) == counts(20.0, True) == [1] * STEPS
     fast = counts(10.0, False)
-    assert fast[0] > fast[-1]  # slower after the impact
+    assert max(fast) > fast[-1] == 1  # slower after the impact
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("speed", "sweeps"), ((5.0, 1), (5.0, 10), (7.0, 1), (7.0, 10)))
+@pytest.mark.parametrize(("speed", "sweeps"), ((5.0, 1), (5.0, 10), (10.0, 1), (10.0, 10)))
 def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) -> None:
     def lost(**options: Any) -> float:
         model, x, v = meeting(speed, device, **options)
@@ -62,7 +61,7 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
         return float(((mass * v).sum(0) - first).norm() / first.norm())
 
     assert lost() <= MOST_DETECTIONS * STEPS * tolerance("momentum")
-    if (speed, sweeps) == (7.0, 10):
+    if (speed, sweeps) == (10.0, 10):
         assert lost(detections=1) > 0.01
 
 
