@@ -91,8 +91,6 @@ RULES: dict[str, Callable[[], Any]] = {
     "rigid correction before the sweeps": no_first_correction,
     "more rigid corrections after the sweeps": lambda: numbers(contact_rigid, MOST_CORRECTIONS=1),
     "more substeps while vertices are truncated": lambda: numbers(contact, MOST_DETECTIONS=0),
-    "substeps that invert a tet are taken back": lambda: numbers(contact.ContactStep, _inverted=lambda self, x: (
-        torch.zeros(len(x), dtype=torch.bool, device=x.device))),
 }  # fmt: skip
 
 

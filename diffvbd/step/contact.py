@@ -22,7 +22,6 @@ from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
 from ..adjoint.contact import Pairs, floor_coefficients, friction_lag, no_pairs, some_of
 from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
 from ..model.inputs import parameter_of
-from ..model.material import inside_out
 from ..model.model import Model
 from ..model.system import System
 from ..ops import SweepSettings, broadcast
@@ -205,7 +204,6 @@ class ContactStep:
                 blocked = is_blocked(self, x, back)
                 truncated = (limits[:, -1] > 0) | blocked
             if going is not None:  # other scenes stay as they are: the same bits in any batch
-                going = going & ~self._inverted(x)[:, None, None]
                 records.swept[-1] = of_going(records.swept[-1], going)
                 assert records.truncated is not None
                 x, truncated = torch.where(going, x, begin), torch.where(going[..., 0], truncated, records.truncated)
@@ -219,7 +217,6 @@ class ContactStep:
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.substeps < MOST_DETECTIONS:
                 asked = blocked.any(-1) | (truncated.sum(-1) > TRUNCATED * self.model.num_moving)  # still truncated
-                asked = asked & ~self._inverted(x)  # another body might pass through an inverted one
                 going = asked[:, None, None] if going is None else going & asked[:, None, None]
                 self.substeps += int(going.any())
             if r < self.substeps:
@@ -235,10 +232,6 @@ class ContactStep:
         settings = self.prepared.settings
         return increase_inputs(self.model, self.fields, settings.numbers.time_step, self.prepared.averaged,
                                settings.energies)  # fmt: skip
-
-    def _inverted(self, x: Tensor) -> Tensor:
-        """Scenes with an inverted tet, bool [B]."""
-        return inside_out(self.model.tets, x if self.begun.origin is None else x.detach() + self.origin).any(-1)
 
     def _wanted(self, h2a: Tensor) -> tuple[Tensor, Tensor | None]:
         """Displacement that each vertex starts with, ``h v`` [B, V, 3] [m], and the vertices of partly pinned bodies
