@@ -1,6 +1,6 @@
 // Trust-region radii of bodies until the next detection, shared by CPU and CUDA. Islands depend on the radii and the
-// radii on what an island leaves of a motion, hence rounds: from displacements to radii and islands, then radii
-// relative to these (docs/method.md, section 12). Not differentiated.
+// radii on what an island leaves of a motion: from displacements to radii and islands, then radii relative to these and
+// islands again (docs/method.md, section 12). Not differentiated.
 #pragma once
 
 #include <cstdint>
@@ -11,7 +11,6 @@
 
 namespace diffvbd::contact {
 
-constexpr int kRadiusRounds = 3;     // rounds of radii relative to islands, and islands by these radii
 constexpr double kGrid = 0.125;      // of dhat: cells that the translation of an island is rounded to
 constexpr double kMostCells = 1e15;  // integers hold them
 

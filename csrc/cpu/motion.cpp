@@ -167,11 +167,9 @@ void find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work) {
     radius_alone(in, i / in.motion.bodies, static_cast<int32_t>(i % in.motion.bodies), work);
   }
   find_islands(in.islands, work.island);
-  for (int round = 0; round < kRadiusRounds; ++round) {
-    for_bodies<MovingBody>(
-        in.motion, [&](const MovingBody<T>& b, const Threads& team) { radius_beside_island(in, b, team, work); });
-    find_islands(in.islands, work.island);
-  }
+  for_bodies<MovingBody>(in.motion,
+                         [&](const MovingBody<T>& b, const Threads& team) { radius_beside_island(in, b, team, work); });
+  find_islands(in.islands, work.island);
   for_bodies<MovingBody>(in.motion,
                          [&](const MovingBody<T>& b, const Threads& team) { write_translation(in, b, team, work); });
   for (int64_t scene = 0; scene < scenes; ++scene) finish_radii(in, scene, one, work);

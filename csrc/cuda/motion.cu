@@ -69,7 +69,7 @@ __global__ void __launch_bounds__(kThreads)
   radius_alone(in, place / bodies, static_cast<int32_t>(place % bodies), work);
 }
 
-// All radii of a small scene, by a block with a warp for each of its bodies in turn. It ends once no radius changes.
+// All radii of a small scene, by a block with a warp for each of its bodies in turn.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     radii_of_scene(const __grid_constant__ RadiusInputs<T> in, const __grid_constant__ RadiusWork<T> work,
@@ -85,24 +85,14 @@ __global__ void __launch_bounds__(kThreads)
         [&](int32_t b, const auto& by) { f(body(b), by); });
     __syncthreads();
   };
-  const auto radius = [&](int32_t body) { return radius_at(in, work.trust_radius, scene, body); };
   prepare_scene(in, scene, team, work);
   __syncthreads();
   islands.each(in.motion.bodies, [&](int32_t body) { radius_alone(in, scene, body, work); });
   __syncthreads();
   islands.bound();
-  bool changes = true;
-  for (int round = 0; changes; ++round) {
-    islands.find(work.island);
-    if (round == kRadiusRounds) break;
-    changes = false;
-    for_each_body([&](const MovingBody<T>& b, const auto& by) {
-      const T before = by.leads() ? radius(b.body) : T(0);  // only the leader writes it
-      radius_beside_island(in, b, by, work);
-      if (by.leads()) changes = changes || !(radius(b.body) == before);
-    });
-    changes = __syncthreads_or(changes);
-  }
+  islands.find(work.island);
+  for_each_body([&](const MovingBody<T>& b, const auto& by) { radius_beside_island(in, b, by, work); });
+  islands.find(work.island);
   for_each_body([&](const MovingBody<T>& b, const auto& by) { write_translation(in, b, by, work); });
   finish_radii(in, scene, team, work);
 }
@@ -130,10 +120,8 @@ cudaError_t find_trust_radii(RadiusInputs<T> in, const RadiusWork<T>& work, void
   if (bodies > 0) {
     radii_alone<T><<<blocks_for(bodies, kThreads), kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
-    for (int round = 0; round < kRadiusRounds; ++round) {
-      if (const auto error = for_bodies(in.motion, IslandRadius<T>{in, work}, stream)) return error;
-      if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
-    }
+    if (const auto error = for_bodies(in.motion, IslandRadius<T>{in, work}, stream)) return error;
+    if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
     if (const auto error = for_bodies(in.motion, IslandTranslation<T>{in, work}, stream)) return error;
   }
   each_scene<T, false><<<scenes, kThreads, 0, stream>>>(in, work);

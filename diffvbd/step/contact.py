@@ -39,7 +39,7 @@ from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
 from .contact_coarse import Corrections
-from .contact_rigid import bodies_of, corrected, corrected_after, is_blocked, touching
+from .contact_rigid import MOST_CORRECTIONS, bodies_of, corrected, is_blocked, touching
 from .predict import Begun
 
 CLOSE = 1e-3  # of dhat: pairs with so much more gap do not push, however it is rounded
@@ -198,7 +198,7 @@ class ContactStep:
                 records.swept.append(swept)
                 x, limits, lengths, between = swept
                 taken.extend(between)
-                x, fractions, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.substeps)
+                x, fractions, back = corrected(self, x, now, start, detection.listed, MOST_CORRECTIONS)
                 taken.extend(fractions)
                 # sweeps may have recovered what the start truncated, and corrections what sweeps did
                 blocked = is_blocked(self, x, back)
@@ -268,7 +268,7 @@ class ContactStep:
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
             swept = swept_substep(self, x, start, self.colliders, none, settings, policy, debug_step)
-            x = corrected_after(self, swept.x, self.colliders, start, none, True).x
+            x = corrected(self, swept.x, self.colliders, start, none, MOST_CORRECTIONS).x
             record_substeps(self.model, x, [swept])
         return self._finite(x)
 

@@ -1,5 +1,5 @@
 """The rigid corrections of a substep (docs/method.md, section 18): one before its sweeps, one after them, and more of
-blocked bodies after the last sweeps."""
+blocked bodies."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class Corrections(NamedTuple):
     back: Tensor  # translation that each did not take of its last motion [B, bodies] [m]
 
 
-def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float, least: int = 1,
-            most: int = 1, majorizes: bool = False) -> Corrections:  # fmt: skip
-    """State after rigid corrections of every free body, each by an admissible step fraction, and after those of blocked
+def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float, most: int = 1,
+            majorizes: bool = False) -> Corrections:  # fmt: skip
+    """State after a rigid correction of every free body by an admissible step fraction, and after those of blocked
     bodies, or solved for alone, that follow until there are ``most``. friction_eps: [m], 0 without friction.
     majorizes: As of rigid_correct().
     Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*[t.contiguous() for t in fields])
     kept = torch.is_grad_enabled() and any([t.requires_grad for t in fields])
-    x, back, *made = _correct(*fields, model, time_step, friction_eps, majorizes, least, most, kept)
+    x, back, *made = _correct(*fields, model, time_step, friction_eps, majorizes, most, kept)
     return Corrections(x, [fraction.to(x.dtype) for fraction in (made[::2] if kept else made)], back)
 
 
@@ -57,17 +57,16 @@ def _bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 
 def _run(*args: Any) -> tuple[Tensor, ...]:
-    fields, (model, h, eps, majorizes, least, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
+    fields, (model, h, eps, majorizes, most, kept) = ops.TouchingFields(*args[:_FIELDS]), args[_FIELDS:]
     made, back, moving, captured = [], fields.x, None, is_captured(fields.x)
     for count in range(1, most + 1):
         end = rigid_correct(fields, model._data_count, h, eps, majorizes, moving)
         made.append(end.fraction)
         back = end.remaining if moving is None else torch.where(end.moved, end.remaining, back)
         fields = replaced(fields, x=end.x)
-        if count >= least:
-            moving = end.blocked | end.alone
-            if count == most or not (captured or bool(moving.any())):
-                break
+        moving = end.blocked | end.alone
+        if count == most or not (captured or bool(moving.any())):
+            break
         if kept:
             made.append(end.x)
     return fields.x, back, *made
@@ -85,10 +84,10 @@ def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequ
     return [own.get(name) for name in f._fields]
 
 
-# Fields; model, time_step, friction_eps, majorizes, least, most, kept.
+# Fields; model, time_step, friction_eps, majorizes, most, kept.
 _correct = ops.Differentiable(
-    _run, _reverse, arguments=_FIELDS + 7, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
-    rest=lambda inputs: inputs[_FIELDS:-3],
+    _run, _reverse, arguments=_FIELDS + 6, inputs=_FIELDS, saved=lambda inputs, made: (*inputs[:_FIELDS], *made[2:]),
+    rest=lambda inputs: inputs[_FIELDS:-2],
 )  # fmt: skip
 
 
@@ -99,19 +98,19 @@ def listed_of(f: ops.TouchingFields) -> Pairs:
 
 # --- rigid corrections of a substep -----------------------------------------------------------------------------------
 
-# Rigid corrections after the last sweeps while bodies are blocked, which first approach the blocking bodies and then
-# push them, or are solved for alone. A row of four cubes that meet at 3 m/s lost 14 % of its momentum with one
-# correction and none with three; at 10 m/s that takes five.
-MOST_CORRECTIONS = 5
+# Rigid corrections after sweeps while bodies are blocked, which first approach the blocking bodies and then push them,
+# or are solved for alone. A row of four cubes that meet at 3 m/s loses momentum with one correction and none with three;
+# ten cubes with coarse corrections take six.
+MOST_CORRECTIONS = 6
 BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
 
-def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, least: int = 1, most: int = 1,
+def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, most: int = 1,
               majorizes: bool = False) -> Corrections:  # fmt: skip
-    """State after the rigid corrections of a step; least, most and majorizes as of correct()."""
+    """State after the rigid corrections of a step; most and majorizes as of correct()."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
-    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, least, most, majorizes)
+    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, most, majorizes)
 
 
 def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs) -> ops.TouchingFields:
@@ -122,15 +121,6 @@ def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: 
         of.before, of.kappa, *listed, of.lag, lagged.pairs, lagged.ptr, lagged.entry, of.floor_lag, start.center,
         start.trust_radius,
     )  # fmt: skip
-
-
-def corrected_after(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs, last: bool
-                    ) -> Corrections:  # fmt: skip
-    """State after the corrections that follow the sweeps of a substep. last: Whether these are the last sweeps."""
-    # coarse sweeps leave a stiff body rotated; after one Newton step a free body still gained spin
-    least = 1 if of.prepared.coarse is None else 2
-    most = MOST_CORRECTIONS if last and of.barrier is not None else least
-    return corrected(of, x, collider, start, listed, least, most)
 
 
 def is_blocked(of: Any, x: Tensor, back: Tensor) -> Tensor:

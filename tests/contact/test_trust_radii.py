@@ -189,10 +189,9 @@ def by_torch(g: Given) -> TrustRadii:
 
     trust_radius = radius_of(displacement["bends"])
     island = islands_of(g, trust_radius)
-    for _ in range(3):  # bodies that an island reaches get a radius relative to it as well
-        relative = longest(g, g.move - translations(island)[:, body])
-        trust_radius = torch.maximum(trust_radius, radius_of(relative))
-        island = islands_of(g, trust_radius)
+    relative = longest(g, g.move - translations(island)[:, body])
+    trust_radius = torch.maximum(trust_radius, radius_of(relative))
+    island = islands_of(g, trust_radius)
     own = torch.zeros_like(trust_radius)
     if g.barrier.self_contact:
         own = (RADIUS_FACTOR + 1) * (displacement["apart"] + displacement["stretched"]) + gravity_moves

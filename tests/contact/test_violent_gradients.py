@@ -32,7 +32,7 @@ SCENES = (
     (60.0, 20.0, 3, 2, "plane", True, 1 / 120),
     (60.0, 40.0, 2, 3, "floor", False, 1 / 60),
 )
-SMOOTH = {(5, 8): 5, (6, 8): 5, (7, 2): 1, (7, 8): 9}  # three steps of as many sweeps lie at a kink, of these not
+TRIES = 6  # numbers of sweeps, since with some of them a scene lies at a kink
 
 
 class Scene(NamedTuple):
@@ -79,7 +79,17 @@ def pushed(s: Scene, after: Tensor, steps: int) -> float:
 
 
 def check(number: int, sweeps: int, steps: int) -> None:
-    """Gradient of a scene in a random direction against central differences."""
+    for count in range(sweeps, sweeps + TRIES):
+        found = errors(number, count, steps)
+        if found:
+            assert min(found) <= tolerance("contact_finite_difference")
+            return
+    pytest.fail("the scene lies at a kink: choose another")
+
+
+def errors(number: int, sweeps: int, steps: int) -> list[float]:
+    """Errors of the gradient of a scene in a random direction beside central differences of several sizes, without
+    those whose sides differ."""
     s, rng = scene(number), generator("violent directions", number)
     weights = torch.from_numpy(rng.normal(size=(2, *s.x.shape)))
     along = torch.from_numpy(rng.normal(size=(2, *s.x.shape))) * torch.tensor([0.1, 10.0])[:, None, None]
@@ -97,7 +107,7 @@ def check(number: int, sweeps: int, steps: int) -> None:
     assert pushed(s, after, steps) > 0.1, "nothing collided"
     x_bar, v_bar, mu_bar = torch.autograd.grad(middle, start)
     slope = float((x_bar * along[0]).sum() + (v_bar * along[1]).sum() + mu_bar * stiffer)
-    errors, at = [], float(middle.detach())
+    out, at = [], float(middle.detach())
     for size in DIFFERENCES:
         ends = []
         for by in (size, -size):
@@ -106,9 +116,9 @@ def check(number: int, sweeps: int, steps: int) -> None:
         central = (ends[0] - ends[1]) / (2 * size)
         sides = ((ends[0] - at) / size, (at - ends[1]) / size)
         if abs(sides[0] - sides[1]) < ONE_SIDED * abs(central):
-            errors.append(abs(central - slope) / abs(central))
-    assert errors, "the scene lies at a kink: choose another"
-    assert min(errors) <= tolerance("contact_finite_difference") and slope != 0
+            out.append(abs(central - slope) / abs(central))
+    assert slope != 0
+    return out
 
 
 @pytest.mark.parametrize("sweeps", (2, 8))
@@ -121,4 +131,4 @@ def test_one_step(number: int, sweeps: int) -> None:
 @pytest.mark.parametrize("sweeps", (2, 8))
 @pytest.mark.parametrize("number", range(len(SCENES)))
 def test_three_steps(number: int, sweeps: int) -> None:
-    check(number, SMOOTH.get((number, sweeps), sweeps), steps=3)
+    check(number, sweeps, steps=3)
