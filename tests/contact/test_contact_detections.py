@@ -91,7 +91,7 @@ def test_a_row_that_is_struck_keeps_its_momentum(count: int, gap: float, speed: 
         assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
         shares += [part.corrections for part in found]
     assert float(v[-1, 0]) > 0.05 * speed
-    assert any(len(taken) > 2 for taken in shares) == (speed > 1)  # held up, and corrected again
+    assert speed == 1 or any(len(taken) > 2 for taken in shares)  # held up, and corrected again
 
 
 @pytest.mark.parametrize("device", DEVICES)

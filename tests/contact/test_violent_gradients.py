@@ -26,13 +26,13 @@ SCENES = (
     (15.0, 40.0, 2, 3, "plane", True, 1 / 100),
     (30.0, 10.0, 3, 2, "nothing", True, 1 / 100),
     (30.0, 20.0, 2, 3, "floor", True, 1 / 60),
-    (30.0, 40.0, 3, 2, "plane", False, 1 / 200),
+    (25.0, 40.0, 3, 2, "plane", False, 1 / 200),
     (60.0, 0.0, 3, 2, "floor", True, 1 / 200),
     (60.0, 10.0, 2, 3, "nothing", False, 1 / 500),
-    (60.0, 20.0, 3, 2, "plane", True, 1 / 120),
+    (60.0, 10.0, 3, 2, "plane", True, 1 / 300),
     (60.0, 40.0, 2, 3, "floor", False, 1 / 60),
 )
-TRIES = 6  # numbers of sweeps, since with some of them a scene lies at a kink
+TRIES = 4  # numbers of sweeps, since with some of them a scene lies at a kink
 
 
 class Scene(NamedTuple):
