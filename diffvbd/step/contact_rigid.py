@@ -99,8 +99,8 @@ def listed_of(f: ops.TouchingFields) -> Pairs:
 # --- rigid corrections of a substep -----------------------------------------------------------------------------------
 
 # Rigid corrections after sweeps while bodies are blocked, which first approach the blocking bodies and then push them,
-# or are solved for alone. A row of four cubes that meet at 3 m/s loses momentum with one correction and none with three;
-# ten cubes with coarse corrections take six.
+# or are solved for alone. Four cubes in a row that meet at 3 m/s lose momentum with one correction, and ten with coarse
+# corrections with five.
 MOST_CORRECTIONS = 6
 BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses more is blocked
 
