@@ -39,7 +39,8 @@ class Status:
         pairs: The most pairs of one detection, of all scenes.
         capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN. On
             the CPU, without a ``capacity`` of the PairBarrier, lists are as long as they must be, up to so many.
-        touching: Pairs without a gap that detections found (the step has raised or returned NaN).
+        touching: Pairs without a gap that detections found (an eager step has raised, a captured one returned NaN in
+            their scenes).
         infeasible: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
         truncated: Truncated vertices, [scenes]: those that contact limited in the last sweep (at the start of
             the step if there are no sweeps) or with their body in the last rigid correction. They lost velocity that

@@ -26,7 +26,7 @@ QUICK = {("held_up", 1, 5), *((name, 1, 1) for name in SCENES if name != "held_u
          ("thrown", 1, 5), *((name, *run) for name in ("obstacles", "on_held") for run in RUNS)}  # fmt: skip
 SLOW = [(1, 0), (1, 20), (4, 1)]
 LONG = [(4, 20), (20, 2)]  # in turn; `-m hours` runs both
-SHORT = {"thrown", "held_up"}  # scenes that are like the others after a few steps
+SHORT = {"thrown", "held_up"}  # like the others after a few steps, each of eight substeps
 # the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
 OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}
 HOURS = [(20, 5), (20, 20)]  # one scene runs the first of them in `make test-all`, too
@@ -67,11 +67,10 @@ def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps:
 @pytest.mark.parametrize(
     ("name", "steps", "sweeps"),
     [*(slow(name, *OTHERS.get((name, run), run)) for name in SCENES for run in SLOW),
-     *(pytest.param(name, *OTHERS.get((name, run), run), marks=pytest.mark.slow
-                    if (name in SHORT or i % 2) == (run == LONG[0]) else pytest.mark.hours)
-       for i, name in enumerate(SCENES) for run in (LONG[:1] if name in SHORT else LONG)),
+     *(pytest.param(name, *run, marks=pytest.mark.slow if i % 2 == (run == LONG[0]) else pytest.mark.hours)
+       for i, name in enumerate(SCENES) for run in LONG if name not in SHORT),
      slow("crossed", 20, 5),
-     *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES for run in HOURS
+     *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES if name not in SHORT for run in HOURS
        if (name, run) != ("crossed", HOURS[0]))],
 )  # fmt: skip
 def test_gradients_of_longer_runs(name: str, steps: int, sweeps: int, device: str) -> None:
