@@ -3,6 +3,7 @@ common motion. The independent check compares every edge with every triangle (dv
 
 import itertools
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -218,6 +219,27 @@ def test_a_collider_above_its_bound_raises_and_in_smaller_parts_does_not(device:
             end, _ = dv.step(model, x, torch.zeros_like(x), **options)
             assert float((end - before - up).norm(dim=-1).min()) > 0.2
         assert (dv.contact.status(model).infeasible > 0) == (detections == 1)
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.0, 0.046), (0.06, 0.06)], ids=["too far", "touching"])
+def test_a_captured_step_loses_the_scene_alone_that_is_not_valid(
+    before: float, after: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing may be read, as in a captured step, on the CPU."""
+    model, v = ball(1), torch.zeros(2, 27, 3, dtype=torch.float64)
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64) * torch.tensor([[[1.0]], [[0.5]]])
+    x = model.rest_points.expand(2, -1, -1)
+    given: dict[str, Any] = {"colliders": model.collider_points + after * up, "gravity": WEIGHTLESS, **MATERIAL,
+                             "colliders_before": model.collider_points + before * up}  # fmt: skip
+    one = {name: given[name][1:] if name.startswith("colliders") else value for name, value in given.items()}
+    alone, _ = dv.step(model, x[1:], v[1:], dv.VBD(0.01, 4), **one)
+    step = sys.modules["diffvbd.step.contact"]
+    monkeypatch.setattr(step, "is_captured", lambda x: True)
+    monkeypatch.setattr(step.ContactStep, "_reads", staticmethod(lambda x: False))
+    end, _ = dv.step(model, x, v, dv.VBD(0.01, 4), **given)
+    assert bool(end[0].isnan().all()) and torch.equal(end[1], alone[0])
+    status = dv.contact.status(model)
+    assert (status.infeasible > 0) == (after > before) and (status.touching > 0) == (after == before)
 
 
 @pytest.mark.parametrize("detections", (1, 2, 4))

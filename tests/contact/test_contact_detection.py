@@ -222,7 +222,7 @@ def test_positions_that_are_not_finite(device: str, bad: float) -> None:
     assert int(detect(s, device).counts[1]) == 0
     s.x[1, 7, 1] = bad
     got, alone = detect(s, device), detect(s.alone(0), device)
-    assert int(got.counts[1]) == 1 and int(alone.counts[1]) == 0
+    assert int(got.counts[1]) == 1 and int(alone.counts[1]) == 0 and (got.smallest > 0).tolist() == [True, False]
     assert torch.equal(alone.near_values[0], got.near_values[0])
     s.x[:] = bad
     assert int(detect(s, device).counts[1]) >= s.x.shape[0] * s.x.shape[1]
