@@ -31,7 +31,7 @@ import diffvbd as dv
 from bench import common
 from bench.measure import Card
 from bench.tables import Table
-from diffvbd import losses, results
+from diffvbd import losses, results, robots
 from diffvbd.tasks import lift
 from diffvbd.testing.robot_scenes import ARM_MJCF, ARM_URDF, barrier_energy
 
@@ -48,7 +48,7 @@ def kinematics(card: Card) -> list[Row]:
     mujoco: Any = importlib.import_module("mujoco")
 
     rng, count = np.random.default_rng(SEED), 5 if card.quick else 200
-    arm, other = lift.robot_of(ARM_URDF), lift.robot_of(ARM_MJCF)
+    arm, other = robots.loads(ARM_URDF), robots.loads(ARM_MJCF)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "arm.urdf"
         file.write_text(ARM_URDF, encoding="utf-8")
@@ -100,7 +100,7 @@ class Drawn:
 
     def __init__(self, number: int) -> None:
         rng = np.random.default_rng((SEED, number))
-        self.robot = lift.robot_of(ARM_URDF)
+        self.robot = robots.loads(ARM_URDF)
         points, size = rng.integers(2, 5, 3), rng.uniform(0.03, 0.06, 3)
         box, dhat = dv.mesh.box(tuple(points.tolist()), tuple(size.tolist())), 0.003
         gap = float(rng.uniform(0.6, 0.9)) * dhat

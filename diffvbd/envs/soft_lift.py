@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 import torch
 from torch import Tensor
 
 import diffvbd as dv
 
-from .. import robots
+from ..robots.gripper import gripper
 from .environment import Environment, State
 
 WIDTH, LENGTH = 0.04, 0.12  # of the beam [m]
@@ -20,23 +17,14 @@ SPEEDS = (0.12, 0.03)  # largest of the joints lift and close [m/s]: a finger mu
 HEIGHT, LAG, EFFORT = 20.0, 10.0, 0.01  # reward of 1 m, costs of a lag of 1 m and of a mean squared action of 1
 DROPPED = 0.04  # lag of the beam behind the hand at which the beam has been lost [m]
 # Fingers reach below the table: a lower edge that slides over the beam would dent it, and come too close in fast steps.
-FINGER = """
-<link name="{0}"><collision><geometry><box size="0.02 0.16 0.05"/></geometry></collision></link>
-<joint name="{1}" type="prismatic"><parent link="hand"/><child link="{0}"/><origin xyz="{2} 0.034 0"/>
-  <axis xyz="{3} 0 0"/><limit lower="0" upper="0.0075" effort="20" velocity="0.03"/>{4}</joint>"""
-URDF = f"""<robot name="gripper"><link name="world"/><link name="hand"/>
-<joint name="lift" type="prismatic"><parent link="world"/><child link="hand"/><axis xyz="0 1 0"/>
-  <limit lower="0" upper="0.1" effort="50" velocity="0.12"/></joint>
-{FINGER.format("left", "close", -0.0348, 1, "")}
-{FINGER.format("right", "follow", 0.0348, -1, '<mimic joint="close"/>')}
-</robot>"""
+FINGER = (0.02, 0.16, 0.05)  # [m]
 
 
 class SoftLift(Environment):
     """A gripper of two fingers lifts a soft beam of 63 vertices from a narrow table by friction.
 
-    The gripper is a URDF robot of :mod:`diffvbd.robots` (``soft_lift.URDF``) with the joints lift and close. The beam
-    weighs 1.9 N; how far the fingers must close depends on its modulus and on friction, which are not observed.
+    The gripper is a URDF robot of :mod:`diffvbd.robots` with the joints lift and close. The beam weighs 1.9 N; how far
+    the fingers must close depends on its modulus and on friction, which are not observed.
 
     Observations (13): positions of the joints over their limits, height of the beam over where it lay, how far it lags
     behind the hand, its place along x and z, its velocity, its twist and sag as heights of both ends over its middle,
@@ -52,9 +40,7 @@ class SoftLift(Environment):
     young, friction = (1e4, 3e4), (0.4, 0.8)
 
     def build(self, dtype: torch.dtype, device: str | torch.device) -> dv.Model:
-        with tempfile.TemporaryDirectory() as folder:
-            (file := Path(folder) / "gripper.urdf").write_text(URDF, encoding="utf-8")
-            self.robot = robots.load(file)
+        self.robot = gripper(FINGER, 0.0496, rise=0.1, way=0.0075, height=0.034)
         # a little off the middle: a beam exactly between the fingers is at a kink
         place = (-WIDTH / 2 + 2e-4, GAP, -LENGTH / 2 + 3e-4)
         mesh = dv.mesh.box((3, 3, 7), (WIDTH, WIDTH, LENGTH), split="kuhn").translate(place)

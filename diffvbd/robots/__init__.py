@@ -5,7 +5,7 @@ A Robot is kinematic: joint positions move its links, each of which is an Obstac
 read as joint torques.
 """
 
-from .files import load
+from .files import load, loads
 from .robot import Robot
 
-__all__ = ["Robot", "load"]
+__all__ = ["Robot", "load", "loads"]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import math
+import tempfile
 from os import PathLike, fspath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,6 +49,14 @@ def load(path: str | PathLike[str], base: Tensor | None = None) -> Robot:
         fail("base", "a pose [4, 4]: a rotation, a translation, and 0, 0, 0, 1", pose.tolist())
     of_mjcf = fspath(path).lower().endswith(".xml")
     return Robot((_mjcf if of_mjcf else _urdf)(fspath(path)), pose)
+
+
+def loads(text: str, base: Tensor | None = None) -> Robot:
+    """A robot of the text of a URDF or MJCF file without meshes; otherwise as :func:`load`."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / ("robot.xml" if "<mujoco" in text else "robot.urdf")
+        file.write_text(text, encoding="utf-8")
+        return load(file, base)
 
 
 # --- URDF -------------------------------------------------------------------------------------------------------------

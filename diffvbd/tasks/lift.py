@@ -1,6 +1,6 @@
 """Lift a soft beam with the two fingers of a robot (a task that the paper does not have).
 
-A beam of 14 x 3 x 3 cm lies on the ground between the fingers of a gripper, which is read from a URDF file. Looked for
+A beam of 14 x 3 x 3 cm lies on the ground between the fingers of a gripper, a URDF robot. Looked for
 is how the fingers close and how the hand rises: where both are at the ends of three windows, six numbers, with smooth
 steps between them. The loss is the mean over all steps of the squared distance, as a share of 3 cm, between the height
 of the beam's center of mass and a smooth step to 3 cm in the second window, and twice the mean squared share of its
@@ -15,7 +15,6 @@ The fingers are turned by 20 degrees: where edges of bodies are almost parallel,
 the slope of the loss, though exact, was up to 1e8 per mm.
 """
 
-import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +24,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, results, robots, viz
+from diffvbd.robots.gripper import gripper as two_fingers
 from diffvbd.tasks.problem import Problem, Row, Settings, Stage
 
 PAD = (0.02, 0.04, 0.04)  # size of a finger [m]
@@ -40,35 +40,14 @@ WINDOWS = (0.25, 0.25, 0.15)  # [s]
 SQUEEZE = 0.5  # weight in the loss
 UNITS = (1e-3, 5e-3)  # of the parameters, closing and rise [m]
 VIEW = (15.0, -50.0)
-
-# edges of the fingers that are parallel to edges of a body would be at ties, so the fingers are turned by 20 degrees
-_FINGER = """
-<link name="{name}"><collision><geometry><box size="{size}"/></geometry></collision></link>
-<joint name="{joint}" type="prismatic"><parent link="hand"/><child link="{name}"/>
-<origin xyz="{at} 0 0" rpy="0.35 0 0"/><axis xyz="{way} 0 0"/>
-<limit lower="0" upper="0.05" effort="20" velocity="1"/>{mimic}</joint>"""
-GRIPPER = """<?xml version="1.0"?><robot name="gripper"><link name="world"/><link name="hand"/>
-<joint name="lift" type="prismatic"><parent link="world"/><child link="hand"/><axis xyz="0 1 0"/>
-<limit lower="0" upper="0.5" effort="50" velocity="1"/></joint>""" + "".join(
-    _FINGER.format(name=name, joint=joint, at=-way * (OPEN + PAD[0]) / 2, way=way, mimic=mimic,
-                   size=" ".join(map(str, PAD)))
-    for name, joint, way, mimic in (("left", "close", 1, ""), ("right", "follow", -1, '<mimic joint="close"/>'))
-) + "\n</robot>\n"  # fmt: skip
+TILT = 0.35  # of the fingers [rad]: edges that are parallel to edges of a body would be at ties
 
 
 def gripper(height: float) -> robots.Robot:
-    """The gripper of GRIPPER, with its joints lift and close; the middle of the fingers at a height [m]."""
+    """The gripper, with its joints lift and close; the middle of the fingers at a height [m]."""
     base = torch.eye(4, dtype=torch.float64)
     base[1, 3] = height
-    return robot_of(GRIPPER, base)
-
-
-def robot_of(text: str, base: Tensor | None = None) -> robots.Robot:
-    """A robot of the text of a URDF or MJCF file; base: as :func:`diffvbd.robots.load`."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / ("robot.xml" if text.startswith("<mujoco") else "robot.urdf")
-        file.write_text(text, encoding="utf-8")
-        return robots.load(file, base)
+    return two_fingers(PAD, OPEN, base, rise=0.5, way=0.05, tilt=TILT)
 
 
 class Grip:
