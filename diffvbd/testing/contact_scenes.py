@@ -152,13 +152,13 @@ def batched() -> Scene:
 
 
 def thrown() -> Scene:
-    """Two boxes that meet at 32 m/s, one beside a sphere that moves; a vertex is prescribed. Nobody says
+    """Two boxes that meet at 10 m/s, one beside a sphere that moves; a vertex is prescribed. Nobody says
     how many detections that takes."""
     barrier = PairBarrier(kappa=1e4, dhat=0.02, self_contact=False, damping=1.0)
     sphere = colliders.Sphere((0.26, 0.1, 0.1), 0.05)
     scene = build("thrown", boxes((0, 0, 0), (0.05, 0.23, 0.03), points=2), (barrier, Friction(0.2, 0.1)),
                   colliders=(sphere,), pinned=[0], jitter=2e-3)  # fmt: skip
-    scene.v[8:, 1] -= 32.0
+    scene.v[8:, 1] -= 10.0
     points = scene.model.collider_points
     scene.inputs["colliders_before"] = points + noise("thrown", "before", shape=points.shape, size=2e-4)
     scene.inputs["colliders"] = scene.inputs["colliders_before"] + torch.tensor([-0.001, 0.002, 0.0])
@@ -169,7 +169,7 @@ def thrown() -> Scene:
 
 def held_up() -> Scene:
     """Two scenes of boxes that meet; in one so fast that pairs still hold them up after the parts that were planned."""
-    barrier = PairBarrier(kappa=1e4, dhat=0.02, self_contact=False, damping=1.0)
+    barrier = PairBarrier(kappa=1e4, dhat=0.02, self_contact=False, damping=1.0, detections=2)
     scene = build("held_up", boxes((0, 0, 0), (0.05, 0.23, 0.03), points=2), (barrier, Friction(0.2, 0.1)),
                   batch=(2,), jitter=2e-3)  # fmt: skip
     scene.v[0, 8:, 1] -= 64.0

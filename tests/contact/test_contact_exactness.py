@@ -26,7 +26,7 @@ QUICK = {("held_up", 1, 5), *((name, 1, 1) for name in SCENES if name != "held_u
          ("thrown", 1, 5), *((name, *run) for name in ("obstacles", "on_held") for run in RUNS)}  # fmt: skip
 SLOW = [(1, 0), (1, 20), (4, 1)]
 LONG = [(4, 20), (20, 2)]  # in turn; `-m hours` runs both
-SHORT = {"thrown", "held_up"}  # like the others after a few steps, each of eight substeps
+SHORT = {"thrown", "held_up"}  # like the others after a few steps, each of several substeps
 # the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
 OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}
 HOURS = [(20, 5), (20, 20)]  # one scene runs the first of them in `make test-all`, too

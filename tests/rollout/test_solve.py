@@ -195,9 +195,9 @@ def test_a_step_that_bounds_cut_short_does_not_converge_and_says_so() -> None:
     scene = contact_scenes.fast()
     options: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "max_sweeps": 60}
     with pytest.raises(RuntimeError, match="residual of at most 1e-08, got .* more detections or a larger reach"):
-        dv.solve(scene.model, scene.x, scene.v, dv.VBD(0.01, 1), **options)
+        dv.solve(scene.model, scene.x, 2 * scene.v, dv.VBD(0.01, 1), **options)
     with pytest.warns(RuntimeWarning, match="larger reach"):
-        done = dv.solve(scene.model, scene.x, scene.v, dv.VBD(0.01, 1), on_failure="warn", **options)
+        done = dv.solve(scene.model, scene.x, 2 * scene.v, dv.VBD(0.01, 1), on_failure="warn", **options)
     assert not done.converged and done.sweeps == 60 and done.residual > 0.05
 
 
