@@ -36,7 +36,7 @@ LAWS: dict[str, tuple[str, dict[str, Any]]] = {
     "fibres": (NEO_HOOKEAN + " + k1/(2*k2)*(exp(k2*(I4 - 1)**2) - 1)", {**MODULI, "k1": 1e5, "k2": 1.0}),
 }  # fmt: skip
 TABLES = (
-    Table("Laws of your own", "times", {
+    Table("Laws of your own", "rows", {
         "law": "law", "forward [ms]": "forward_ms", "over the built-in": "forward_ratio",
         "forward and backward [ms]": "both_ms", "over it": "both_ratio", "compile, processor time [s]": "compile_cpu_s",
     }),
@@ -103,5 +103,5 @@ def laws(card: Card) -> list[Row]:
     return rows
 
 
-GROUPS = {"times": laws}
+GROUPS = {"rows": laws}
 THREADS, ANYWHERE = 1, True
