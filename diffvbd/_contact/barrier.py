@@ -63,8 +63,8 @@ class PairBarrier:
             pairs truncate motion one more, with as many sweeps, up to eight in all (docs/contact.md). What is
             prescribed then moves in the first substep.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
-            detections, relative to the motion that bodies near each other share. None: that is one mean edge of its
-            body, or 8 where a single body moves.
+            detections, relative to the motion that bodies near each other share. None: that is two mean edges of its
+            body.
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
         kappa_per_area: Instead of kappa, the stiffness of the barrier over an area [N/m^3]. Each vertex then weighs by
