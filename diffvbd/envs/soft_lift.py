@@ -40,7 +40,7 @@ class SoftLift(Environment):
     young, friction = (1e4, 3e4), (0.4, 0.8)
 
     def build(self, dtype: torch.dtype, device: str | torch.device) -> dv.Model:
-        self.robot = gripper(FINGER, 0.0496, rise=0.1, way=0.0075, height=0.034)
+        self.robot = gripper(FINGER, 0.0496, rise=0.1, travel=0.0075, height=0.034)
         # a little off the middle: a beam exactly between the fingers is at a kink
         place = (-WIDTH / 2 + 2e-4, GAP, -LENGTH / 2 + 3e-4)
         mesh = dv.mesh.box((3, 3, 7), (WIDTH, WIDTH, LENGTH), split="kuhn").translate(place)

@@ -53,6 +53,8 @@ def load(path: str | PathLike[str], base: Tensor | None = None) -> Robot:
 
 def loads(text: str, base: Tensor | None = None) -> Robot:
     """A robot of the text of a URDF or MJCF file without meshes; otherwise as :func:`load`."""
+    if not isinstance(text, str):
+        raise TypeError(f"text: expected a str, got {type(text).__name__}")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / ("robot.xml" if "<mujoco" in text else "robot.urdf")
         file.write_text(text, encoding="utf-8")

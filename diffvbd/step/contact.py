@@ -27,14 +27,7 @@ from ..model.system import System
 from ..ops import SweepSettings, broadcast
 from ..ops import contact as ops_start
 from ..ops.autograd import no_transforms
-from ..ops.contact import (
-    Displacements,
-    SubstepStart,
-    TrustRadii,
-    contact_motion,
-    contact_trust_radii,
-    start_substep,
-)
+from ..ops.contact import Displacements, SubstepStart, TrustRadii, contact_motion, contact_trust_radii, start_substep
 from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
@@ -665,18 +658,9 @@ LEAST_RADIUS = 1.0  # of dhat, added to it: a compressed barrier may push so far
 
 
 @torch.no_grad()
-def trust_radii(
-    surface: ContactSurface,
-    barrier: PairBarrier,
-    x: Tensor,
-    origin: Tensor,
-    mass: Tensor,
-    move: Tensor,
-    gravity_move: Tensor,
-    was: Tensor,
-    now: Tensor,
-    floor: Tensor,
-) -> tuple[Displacements, TrustRadii]:
+def trust_radii(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor,
+                gravity_move: Tensor, was: Tensor, now: Tensor, floor: Tensor
+                ) -> tuple[Displacements, TrustRadii]:  # fmt: skip
     """Wanted displacements by body, and trust-region radii until pairs are found again. Index data.
 
     Args:

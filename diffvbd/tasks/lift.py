@@ -47,7 +47,7 @@ def gripper(height: float) -> robots.Robot:
     """The gripper, with its joints lift and close; the middle of the fingers at a height [m]."""
     base = torch.eye(4, dtype=torch.float64)
     base[1, 3] = height
-    return two_fingers(PAD, OPEN, base, rise=0.5, way=0.05, tilt=TILT)
+    return two_fingers(PAD, OPEN, base, rise=0.5, travel=0.05, tilt=TILT)
 
 
 class Grip:
