@@ -15,6 +15,7 @@ from diffvbd.testing import relative_error, tolerance
 Sample = Callable[[], dict[str, float]]  # how far rounding moves each entry
 
 # Some edges of this scene are almost parallel: their closest points round by eps / sin^2, which no order of sums shows.
+# One unit in the last place of x moves its gradients by up to 2e-10.
 PARALLEL = {"folded": 20.0}
 
 
