@@ -1,4 +1,5 @@
-// Operators of the start of a substep with contact; lagged quantities of the start of the step; and lists of pairs.
+// Operators of the start of a substep with contact, of the pairs that its sweeps can reach, and of what is lagged from
+// the start of the step.
 #include "../contact/start.h"
 
 #include "../contact/pair_list.h"
@@ -65,74 +66,52 @@ DIFFVBD_OPERATOR(Out<8>, contact_start, In x, In move, In u, In rigid, In trust_
   });
 }
 
-// --- lists of pairs --------------------------------------------------------------------------------------------------
+// --- near pairs ---------------------------------------------------------------------------------------------------
 
-// constants with the current gaps of the pairs, see contact/pair_list.h.
-DIFFVBD_OPERATOR(Tensor, contact_refresh_gaps, In x, In origin, In collider, In trust_radius, In pairs, In constants,
-                 In ptr) {
+// What is left of the trust-region radii about x [scenes, vertices], and the pairs that can matter within them
+// (contact/ pair_list.h): their rows in the list, and their list. own_center and own_radius may be empty. exact: of
+// their number, on the CPU; else as long as the whole list, with -1 in empty rows.
+DIFFVBD_OPERATOR(Out<6>, contact_near, In x, In origin, In collider, In center, In own_center, In trust_radius,
+                 In own_radius, In pinned, In pairs, In constants, In ptr, In entry, bool exact) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
-    const int64_t colliders = read.colliders(collider);
-    contact::GapInputs<T> in{};
+    const int64_t colliders = read.colliders(collider), corners = read.b * (read.v + colliders);
+    const contact::PairList all = pair_list(pairs, ptr, entry, x, corners);
+    contact::NearInputs<T> in{};
     in.x = read.positions(), in.origin = read.vectors_or_null("origin", origin);
-    in.collider = read.like("collider", collider, 3 * read.b * colliders),
+    in.collider = read.like("collider", collider, 3 * read.b * colliders);
+    in.center = read.vectors("center", center), in.own_center = read.vectors_or_null("own_center", own_center);
     in.trust_radius = read.of_vertices("trust_radius", trust_radius);
-    in.pairs = read.index("pairs", pairs, pairs.size(0) * contact::kPairRow);
-    read.index("ptr", ptr, read.b * (read.v + colliders) + 1);
+    in.own_radius = own_radius.numel() > 0 ? read.of_vertices("own_radius", own_radius) : nullptr;
+    require(!in.own_center == !in.own_radius, "diffvbd::contact_near: expected own_center and own_radius, or neither");
+    in.pinned = read.flags("pinned", pinned, read.v, true);
+    in.pairs = all.pairs, in.ptr = all.ptr, in.entry = all.entry;
     in.constants = pair_constants<T>(constants, pairs, x);
+    in.count = pairs.size(0), in.corners = corners;
     in.vertices = static_cast<int32_t>(read.v), in.colliders = static_cast<int32_t>(colliders);
-    Tensor out = device.empty({pairs.size(0), contact::kConstants});
-    DIFFVBD_RUN(device, refresh_gaps<T>, in, pairs.size(0), data<T>(out));
-    return out;
-  });
-}
-
-// Compact list of the pairs that `keep` selects, and their indices (contact/pair_list.h); exact: of their number, on
-// the CPU; else as long as the whole list, with -1 in empty rows.
-DIFFVBD_OPERATOR(Out<5>, contact_compact, In keep, In pairs, In constants, In ptr, In entry, bool exact) {
-  const Device device(constants);
-  return dispatch_float(constants, [&]<class T>(T) {
-    const contact::PairList all = pair_list(pairs, ptr, entry, constants, ptr.numel() - 1);
-    const contact::CompactInputs<T> in{array<bool>("keep", keep, constants, ScalarType::Bool, pairs.size(0)),
-                                       all.pairs,
-                                       all.ptr,
-                                       all.entry,
-                                       pair_constants<T>(constants, pairs, constants),
-                                       pairs.size(0),
-                                       ptr.numel() - 1};
-    require(in.corners >= 0, "diffvbd::contact_compact: expected pairs made by contact_detect");
+    const Tensor radius = device.empty({read.b, read.v});
     int64_t capacity = in.count;
 #ifndef USE_CUDA
-    require(std::is_sorted(in.ptr, in.ptr + ptr.numel()) && *in.ptr >= 0 && in.ptr[in.corners] <= entry.numel(),
-            "diffvbd::contact_compact: expected ptr that ascends up to the number of entries");
-    std::vector<int32_t> kept(in.count + 1);
-    for (int64_t i = 0; i < in.count; ++i) kept[i + 1] = kept[i] + contact::stays(in, i);
-    if (exact) capacity = kept.back();
+    require(std::is_sorted(in.ptr, in.ptr + ptr.numel()) && *in.ptr >= 0 && in.ptr[corners] <= entry.numel(),
+            "diffvbd::contact_near: expected ptr that ascends up to the number of entries");
+    const std::vector<T> gaps = find_gaps(in, read.b, data<T>(radius));
+    if (exact) capacity = std::count_if(gaps.begin(), gaps.end(), contact::is_near<T>);
 #endif
     const Tensor rows = device.empty({capacity}, ScalarType::Long),
                  constants_out = device.empty({capacity, contact::kConstants}),
                  pairs_out = device.empty({capacity, contact::kPairRow}, ScalarType::Int),
                  ptr_out = device.empty({ptr.numel()}, ScalarType::Int),
                  entry_out = device.empty({4 * capacity}, ScalarType::Int);
-    const contact::CompactList<T> out{data<int64_t>(rows),      data<int32_t>(pairs_out), data<int32_t>(ptr_out),
-                                      data<int32_t>(entry_out), data<T>(constants_out),   capacity};
+    const contact::NearList<T> out{data<int64_t>(rows),      data<int32_t>(pairs_out), data<int32_t>(ptr_out),
+                                   data<int32_t>(entry_out), data<T>(constants_out),   capacity};
 #ifdef USE_CUDA
-    const Tensor work = device.bytes(cuda::compact_list_bytes(in));
-    DIFFVBD_RUN(device, compact_list<T>, in, out, work.data_ptr());
+    const Tensor work = device.bytes(cuda::near_workspace_bytes(in));
+    DIFFVBD_RUN(device, find_near<T>, in, read.b, data<T>(radius), out, work.data_ptr());
 #else
-    for (int64_t i = 0; i < in.count; ++i) {
-      if (contact::stays(in, i)) contact::copy_pair(in, i, kept[i], out);
-    }
-    for (int64_t i = kept.back(); i < out.capacity; ++i) contact::leave_empty(i, out);
-    int32_t at = 0;
-    for (int64_t i = 0; i < in.corners; ++i) {
-      out.ptr[i] = at;
-      contact::each_entry(in, kept.data(), i, [&](int32_t own) { out.entry[at++] = own; });
-    }
-    out.ptr[in.corners] = at;
+    copy_near(in, gaps, out);
 #endif
-    return Out<5>(rows, pairs_out, constants_out, ptr_out, entry_out);
+    return Out<6>(radius, rows, pairs_out, constants_out, ptr_out, entry_out);
   });
 }
 

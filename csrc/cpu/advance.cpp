@@ -142,12 +142,40 @@ void start_substep(const StartStep<T>& s) {
 }
 
 template <class T>
-void refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants) {
-  for_each(pairs, [&](int64_t i) { refresh_gap(in, i, constants + kConstants * i); }, kPairGrain);
+std::vector<T> find_gaps(const NearInputs<T>& in, int64_t scenes, T* radius) {
+  std::vector<T> gaps(in.count);
+  const auto left = [&](int64_t i) {
+    radius[i] = in.radius_left(i / in.vertices, static_cast<int32_t>(i % in.vertices));
+  };
+  for_each(scenes * in.vertices, left, kPairGrain);
+  const auto known = [&](int64_t scene, int32_t v) { return v < in.vertices ? radius[scene * in.vertices + v] : T(0); };
+  for_each(in.count, [&](int64_t i) { gaps[i] = near_gap(in, i, known); }, kPairGrain);
+  return gaps;
 }
 
-template void refresh_gaps<float>(const GapInputs<float>&, int64_t, float*);
-template void refresh_gaps<double>(const GapInputs<double>&, int64_t, double*);
+template <class T>
+void copy_near(const NearInputs<T>& in, const std::vector<T>& gaps, const NearList<T>& out) {
+  std::vector<int32_t> place(in.count);
+  int32_t kept = 0, at = 0;
+  for (int64_t i = 0; i < in.count; ++i) {
+    place[i] = kept;
+    if (is_near(gaps[i])) copy_pair(in, i, gaps[i], kept++, out);
+  }
+  for (int64_t i = kept; i < out.capacity; ++i) leave_empty(i, out);
+  for (int64_t i = 0; i < in.corners; ++i) {
+    out.ptr[i] = at;
+    for (int32_t e = in.ptr[i]; e < in.ptr[i + 1]; ++e) {
+      const int32_t entry = in.entry[e], pair = entry >> 2;
+      if (is_near(gaps[pair])) out.entry[at++] = 4 * place[pair] + (entry & 3);
+    }
+  }
+  out.ptr[in.corners] = at;
+}
+
+template std::vector<float> find_gaps<float>(const NearInputs<float>&, int64_t, float*);
+template std::vector<double> find_gaps<double>(const NearInputs<double>&, int64_t, double*);
+template void copy_near<float>(const NearInputs<float>&, const std::vector<float>&, const NearList<float>&);
+template void copy_near<double>(const NearInputs<double>&, const std::vector<double>&, const NearList<double>&);
 template void start_substep<float>(const StartStep<float>&);
 template void start_substep<double>(const StartStep<double>&);
 

@@ -212,13 +212,6 @@ __global__ void __launch_bounds__(kThreads) start_kernel(Phase phase, const __gr
   if (row < s.items()) phase(s, row);
 }
 
-template <class T>
-__global__ void __launch_bounds__(kThreads)
-    refresh_kernel(const __grid_constant__ GapInputs<T> in, int64_t pairs, T* constants) {
-  const int64_t i = own_item(kThreads);
-  if (i < pairs) refresh_gap(in, i, constants + kConstants * i);
-}
-
 // Parts of the workspace; without memory, its size.
 template <class T>
 struct AdvanceWork {
@@ -285,15 +278,6 @@ cudaError_t start_substep(const StartStep<T>& s, int64_t capacity, void* workspa
   return cudaGetLastError();
 }
 
-template <class T>
-cudaError_t refresh_gaps(const GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
-  if (pairs == 0) return cudaSuccess;
-  const auto blocks = blocks_for(pairs, kThreads);
-  refresh_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);
-  return cudaGetLastError();
-}
-
-DIFFVBD_INSTANTIATE(refresh_gaps)
 DIFFVBD_INSTANTIATE(advance_workspace_bytes)
 DIFFVBD_INSTANTIATE(start_substep)
 

@@ -69,18 +69,15 @@ template <class T>
 cudaError_t start_substep(const contact::StartStep<T>& s, int64_t capacity, void* workspace, int multiprocessors,
                           cudaStream_t stream);
 
-// constants [pairs, 8] (contact/pair_list.h).
+// Near pairs and what is left of the radii of vertices (contact/pair_list.h).
 template <class T>
-cudaError_t refresh_gaps(const contact::GapInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
+int64_t near_workspace_bytes(const contact::NearInputs<T>& in);
+template <class T>
+cudaError_t find_near(const contact::NearInputs<T>& in, int64_t scenes, T* radius, const contact::NearList<T>& out,
+                      void* workspace, cudaStream_t stream);
 
 template <class T>
-int64_t compact_list_bytes(const contact::CompactInputs<T>& in);
-template <class T>
-cudaError_t compact_list(const contact::CompactInputs<T>& in, const contact::CompactList<T>& out, void* workspace,
-                         cudaStream_t stream);
-
-template <class T>
-cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream);
+cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* displacements, T* sums, cudaStream_t stream);
 // islands: memory of islands_workspace_bytes().
 template <class T>
 cudaError_t find_trust_radii(contact::RadiusInputs<T> in, const contact::RadiusWork<T>& work, void* islands,

@@ -25,9 +25,9 @@ cudaError_t for_bodies(const MotionInputs<T>& in, const Act& act, cudaStream_t s
 
 template <class T>
 struct Find {
-  T *rigid, *ways, *sums;
+  T *rigid, *displacements, *sums;
   __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
-    contact::find_motion(b, team, rigid, ways, sums);
+    contact::find_motion(b, team, rigid, displacements, sums);
   }
 };
 template <class T>
@@ -100,8 +100,8 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class T>
-cudaError_t find_motion(const MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream) {
-  return for_bodies(in, Find<T>{rigid, ways, sums}, stream);
+cudaError_t find_motion(const MotionInputs<T>& in, T* rigid, T* displacements, T* sums, cudaStream_t stream) {
+  return for_bodies(in, Find<T>{rigid, displacements, sums}, stream);
 }
 
 template <class T>

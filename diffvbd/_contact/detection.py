@@ -32,9 +32,8 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (trust_radius, deformation_radius)
     )
     return ops_contact.contact_detect(
-        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.pinned, trust_radius,
-        deformation_radius, s.face_counts, s.point_weights, s.bodies, barrier.self_contact, barrier.between_bodies,
-        barrier.dhat, capacity, not torch.compiler.is_compiling(),
+        x, origin, was, now, trust_radius, deformation_radius, *s.searched, s.bodies, barrier.self_contact,
+        barrier.between_bodies, barrier.dhat, capacity, not torch.compiler.is_compiling(),
     )  # fmt: skip
 
 

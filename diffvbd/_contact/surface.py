@@ -51,6 +51,17 @@ class ContactSurface:
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
+    def searched(self) -> tuple[Tensor, ...]:
+        """As ops.contact.contact_detect takes it."""
+        return (self.rest, self.radius, self.triangles, self.edges, self.points, self.planes, self.body, self.pinned,
+                self.face_counts, self.point_weights)  # fmt: skip
+
+    @property
+    def of_bodies(self) -> tuple[Tensor, ...]:
+        """As ops.contact.contact_find takes it."""
+        return (self.pinned_bodies, self.body_order, self.body_ptr, self.max_trust_radius, self.max_deformation_radius)
+
+    @property
     def collider_points(self) -> Tensor:
         return self.rest[self.body_order.shape[0] :]
 

@@ -46,14 +46,6 @@ def no_pairs(like: Tensor, corners: int) -> Pairs:
     return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
 
 
-def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
-    """Those of listed pairs that ``keep`` names, bool [pairs], and which they are. Where values must not decide sizes,
-    on CUDA and compiled, in lists of the same length, with -1 where there is none."""
-    exact = not keep.is_cuda and not torch.compiler.is_compiling()
-    rows, *kept = ops_contact.compact(keep, listed, exact)
-    return Pairs(*kept), rows
-
-
 _of_scene = ops.Linear(lambda value, listed: value[listed.pairs[:, 5].clamp(min=0).to(torch.int64)],
                        lambda bar, shape, listed: sum_of_scenes(bar, listed, shape[0]), 2)  # fmt: skip
 

@@ -1,5 +1,5 @@
-"""The compiled operators of contact: searches, motions and trust regions of bodies, the start of a substep, values
-lagged from the start of a step, the rigid correction; and the search for neighboring points.
+"""The compiled operators of contact: searches, the start of a substep, near pairs, values lagged from the start of a
+step, the rigid correction; and the search for neighboring points.
 
 Sizes: B scenes that never mix, V vertices, Vc collider points, N = V + Vc corner points (vertices first), F triangles,
 E edges, P points, L planes, NB bodies of the mesh. Index tensors are int32; float tensors have the dtype of x; all are
@@ -37,11 +37,11 @@ class Detection(NamedTuple):
     smallest: Tensor  # [B]  smallest gap, at most 0 where pairs touch, or how far was looked [m]
 
 
-def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
-                   triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor,
-                   trust_radius: Tensor, deformation_radius: Tensor, face_counts: Tensor, point_weights: Tensor,
-                   mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float, capacity: int,
-                   trim: bool = False) -> Detection:  # fmt: skip
+def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, trust_radius: Tensor,
+                   deformation_radius: Tensor, rest: Tensor, radius: Tensor, triangles: Tensor, edges: Tensor,
+                   points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor, face_counts: Tensor,
+                   point_weights: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float,
+                   capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
 
     ``trust_radius`` bounds the displacement of a vertex relative to its island. ``deformation_radius`` bounds it
@@ -58,12 +58,12 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         x: [B, V, 3] positions [m], relative to ``origin`` [B, V, 3], one point for each body; or empty.
         collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are taken at the
             latter, or now where a plane would pass the point. What is near a plane now is listed, too.
+        trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
         rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique. Edges and vertices of surfaces
             may be faces, too, with points of other bodies: (a, b, b) and (a, a, a).
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, pinned: [N]; labels from ``mesh_bodies`` on are colliders; pinned: bool, no sweep moves the point.
-        trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
         face_counts: [F + E] how often the barrier of each of ``triangles`` counts; whether each edge is sharp (1 or 0).
             The barrier of two edges of different bodies that are not both sharp reaches ``dhat / 4``.
         point_weights: [P] what the barrier of each of ``points`` is multiplied by.
@@ -75,11 +75,62 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, pinned,
-            trust_radius, deformation_radius, face_counts, point_weights, mesh_bodies, self_contact, between_bodies,
-            dhat, capacity, trim,
+            x, origin, collider, collider_next, trust_radius, deformation_radius, rest, radius, triangles, edges,
+            points, planes, body, pinned, face_counts, point_weights, mesh_bodies, self_contact, between_bodies, dhat,
+            capacity, trim,
         )
     )  # fmt: skip
+
+
+class Found(NamedTuple):
+    """Result of :func:`contact_find`; all is index data."""
+
+    pairs: Tensor  # these eight as in Detection
+    constants: Tensor
+    ptr: Tensor
+    entry: Tensor
+    near_corners: Tensor
+    near_values: Tensor
+    counts: Tensor
+    smallest: Tensor
+    rigid: Tensor  # [B, V, 3] [m]  the rigid motion with the body's momentum; zero where a vertex of it is pinned
+    longest: Tensor  # [5, B, NB] [m]  the longest displacements of a vertex, of the kinds of DISPLACEMENTS
+    sums: Tensor  # [B, NB, 4]  momentum times the time [kg m] and mass [kg] of the free vertices
+    island: Tensor  # [B, NB] int32  of each body, as its smallest body; -1: a pinned vertex or a collider stops it
+    u: Tensor  # [B, NB, 3] [m]  translation of each body's island, rounded to a grid
+    trust_radius: Tensor  # [B, NB + 1] [m]  relative to the island's translation, and the largest of the scene
+    deformation_radius: Tensor  # [B, NB + 1] [m]  relative to the body's rigid motion
+
+
+def contact_find(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, mass: Tensor, move: Tensor,
+                 gravity_move: Tensor, floor: Tensor, surface: Sequence[Tensor], bodies: Sequence[Tensor],
+                 self_contact: bool, between_bodies: bool, dhat: float, factor: float, least: float, capacity: int,
+                 trim: bool = False) -> Found:  # fmt: skip
+    """Pairs that can matter in a substep: of :func:`contact_detect`, within the trust-region radii that follow from the
+    wanted displacements.
+
+    A body's rigid motion has its linear and angular momentum. The longest displacements of a body: of a free vertex
+    relative to their mean (bends), relative to the rigid motion (apart) and by ``gravity_move`` (gravity); of a pinned
+    vertex (driven); and from the end of a straight path to the turned body (stretched). NaN where one is NaN.
+
+    A body that does not move relative to its neighbours gets a small radius and lists few pairs. An island translates
+    by the mean of ``move`` over the mass of its free vertices: bodies whose boxes, swept by that translation and grown
+    by radius and dhat / 2, overlap are of one island. Not differentiable; results repeat to the bit.
+
+    Args:
+        x, origin, collider, collider_next: As for :func:`contact_detect`.  mass: [1 | B, V] [kg].
+        move, gravity_move: Wanted displacements [B, V, 3] [m], and what corrections and sweeps add to them, or empty.
+        floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
+        surface: rest to point_weights of :func:`contact_detect`.
+        bodies: Whether a vertex of a body is pinned [NB], vertices by body [V] and the first of each body [NB + 1],
+            bounds of its trust-region radius and of its deformation radius [NB] [m].
+        self_contact, between_bodies, dhat, capacity, trim: As for :func:`contact_detect`; a body has a deformation
+            radius only with self-contact.
+        factor, least: Radius over a body's displacement relative to its island, and what is added [m].
+    """
+    return Found(*raw.contact_find(x, origin, collider, collider_next, mass, move, gravity_move, floor, *surface,
+                                   *bodies, self_contact, between_bodies, dhat, factor, least, capacity,
+                                   trim))  # fmt: skip
 
 
 class Intersections(NamedTuple):
@@ -116,70 +167,6 @@ def contact_intersections(x: Tensor, origin: Tensor, collider: Tensor, rest: Ten
     )  # fmt: skip
 
 
-# --- motions and trust regions of bodies ------------------------------------------------------------------------------
-
-
-class Displacements(NamedTuple):
-    """Wanted displacements, by body."""
-
-    rigid: Tensor  # [B, V, 3] [m]  the rigid motion with the body's momentum; zero where a vertex of it is pinned
-    longest: Tensor  # [5, B, NB] [m]  the longest displacements of a vertex, of the kinds of DISPLACEMENTS
-    sums: Tensor  # [B, NB, 4]  momentum times the time [kg m] and mass [kg] of the free vertices
-
-
-def contact_motion(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, gravity_move: Tensor, pinned: Tensor,
-                   pinned_bodies: Tensor, order: Tensor, ptr: Tensor) -> Displacements:  # fmt: skip
-    """Rigid motion with each body's linear and angular momentum, and the longest displacements.
-
-    The longest displacements of a body: of a free vertex relative to their mean (bends), relative to the rigid motion
-    (apart) and by ``gravity_move`` (gravity); of a pinned vertex (driven); and from the end of a straight path to the
-    turned body (stretched). NaN where one is NaN. They are not differentiated; results repeat to the bit.
-
-    Args:
-        x, origin: As for :func:`contact_detect`.  mass: [1 | B, V] [kg].
-        move, gravity_move: [B, V, 3] [m]; gravity_move may be empty.
-        pinned, pinned_bodies: [V] or more, [NB] bool: pinned or prescribed vertices, and bodies with one.
-        order, ptr: Vertices by body [V], and the first of each body [NB + 1].
-    """
-    return Displacements(*raw.contact_motion(x, origin, mass, move, gravity_move, pinned, pinned_bodies, order, ptr))
-
-
-class TrustRadii(NamedTuple):
-    """Trust-region radii of bodies until the next detection. Index data."""
-
-    island: Tensor  # of each body, as its smallest body [B, NB] int32; -1: a pinned vertex or a collider stops it
-    u: Tensor  # translation of each body's island, rounded to a grid [B, NB, 3] [m]
-    trust_radius: Tensor  # relative to the island's translation, and the largest of the scene [B, NB + 1] [m]
-    deformation_radius: Tensor  # relative to the body's rigid motion [B, NB + 1] [m]
-
-
-def contact_trust_radii(x: Tensor, origin: Tensor, mass: Tensor, move: Tensor, pinned: Tensor, order: Tensor,
-                        ptr: Tensor, displacements: Displacements, floor: Tensor, collider: Tensor,
-                        collider_next: Tensor, planes: Tensor, body: Tensor, radius: Tensor, most: Tensor,
-                        most_own: Tensor, dhat: float, fraction: float,
-                        least: float, self_contact: bool) -> TrustRadii:  # fmt: skip
-    """Trust-region radii from the wanted displacements. A body that does not move relative to its neighbours gets a
-    small radius and lists few pairs. An island translates by the mean of ``move`` over the mass of its free vertices:
-    bodies whose boxes, swept by that translation and grown by radius and dhat / 2, overlap are of one island. Not
-    differentiable; results repeat to the bit.
-
-    Args:
-        x, origin, mass, move, pinned, order, ptr: As for :func:`contact_motion`, pinned [N].
-        displacements: Result of :func:`contact_motion`.
-        floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
-        collider, collider_next, planes, body, radius: As for :func:`contact_detect`.
-        most, most_own: Bounds of both radii of each body [NB] [m], see ContactSurface.
-        dhat: [m].  fraction, least: Radius over a body's displacement relative to its island, and what is added [m].
-        self_contact: Whether a body has pairs of its own, and so a deformation radius.
-    """
-    return TrustRadii(
-        *raw.contact_trust_radii(
-            x, origin, mass, move, pinned, order, ptr, displacements.longest, displacements.sums, floor, collider,
-            collider_next, planes, body, radius, most, most_own, dhat, fraction, least, self_contact,
-        )
-    )  # fmt: skip
-
-
 # --- the start of a substep -------------------------------------------------------------------------------------------
 
 
@@ -206,35 +193,49 @@ def start_substep(x: Tensor, move: Tensor, u: Tensor, rigid: Tensor, trust_radiu
     Args:
         x, move: [B, V, 3], state and wanted displacement [m].  u: Translation of each body's island [B, NB, 3] [m].
         rigid: Rigid motion of each body, a displacement [B, V, 3] [m]; empty where bodies have no pairs of their own.
-        trust_radius, deformation_radius: As of :func:`contact_trust_radii`.
+        trust_radius, deformation_radius: As of :func:`contact_find`.
         floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
         collider, collider_next: [B, Vc, 3] [m], before and during the sweeps.
         unit: [V] int32, the vertex whose fraction each vertex has.
-        listed: pairs, constants, ptr, entry of :func:`contact_detect`, gaps taken at x.
+        listed: pairs, constants, ptr, entry of :func:`contact_find`, gaps taken at x.
     """
     return SubstepStart(*_start(x.contiguous(), move.contiguous(), u, rigid, trust_radius, deformation_radius, floor,
                                 origin, collider, collider_next, pinned, body, unit, *listed))  # fmt: skip
 
 
-def refresh_gaps(x: Tensor, origin: Tensor, collider: Tensor, trust_radius: Tensor, pairs: Tensor, constants: Tensor,
-                 ptr: Tensor) -> Tensor:  # fmt: skip
-    """``constants`` of listed pairs with their gaps at x in the last column. A gap is infinite where the sides stay out
-    of reach within the trust-region radii of the vertices [B, V] [m]. Not differentiable."""
-    return raw.contact_refresh_gaps(x, origin, collider, trust_radius, pairs, constants, ptr)
+class Near(NamedTuple):
+    """Result of :func:`contact_near`; all is index data."""
+
+    radius: Tensor  # [B, V] [m]  what is left of the radii about x; 0 where pinned
+    rows: Tensor  # int64  which pair of the list each is, or -1
+    pairs: Tensor  # these four as in Detection, with gaps at x in the last column of the constants
+    constants: Tensor
+    ptr: Tensor
+    entry: Tensor
 
 
-def gaps(x: Tensor, origin: Tensor, collider: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor) -> Tensor:
-    """Gaps of listed pairs [pairs] [m], vertices at x and colliders at ``collider``. Detection takes gaps of planes at
-    the end of the step. Not differentiable."""
-    trust_radius = torch.full_like(x[..., 0], torch.inf)  # all may come within reach
-    return refresh_gaps(x.detach(), origin, collider.detach(), trust_radius, pairs, constants, ptr)[:, -1]
+def contact_near(x: Tensor, origin: Tensor, collider: Tensor, center: Tensor, own_center: Tensor, trust_radius: Tensor,
+                 own_radius: Tensor, pinned: Tensor, listed: Sequence[Tensor]) -> Near:  # fmt: skip
+    """The listed pairs whose sides can come within reach of their barriers while vertices stay within their trust
+    regions, with gaps at x. Where values must not decide sizes, on CUDA and compiled, the list is as long as the whole
+    one, with -1 in empty rows. Not differentiable.
+
+    Args:
+        x, origin, collider: [B, V, 3], [B, V, 3] or empty, [B, Vc, 3] [m].
+        center, trust_radius, own_center, own_radius: Trust regions as of :class:`SubstepStart`.
+        pinned: [V] or more, bool.  listed: pairs, constants, ptr, entry of :func:`contact_detect`.
+    """
+    exact = not x.is_cuda and not torch.compiler.is_compiling()
+    return Near(*raw.contact_near(x, origin, collider, center, own_center, trust_radius, own_radius, pinned, *listed,
+                                  exact))  # fmt: skip
 
 
-def compact(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, ...]:
-    """Compact list of the pairs that ``rows`` selects, bool [pairs]: their indices, int64, and their list (pairs,
-    constants, ptr, entry of :func:`contact_detect`). exact: of their number, on the CPU only; else as long as the whole
-    list, and -1 in empty rows."""
-    return raw.contact_compact(rows, *listed, exact)
+def within(radius: float, x: Tensor, origin: Tensor, collider: Tensor, pinned: Tensor,
+           listed: Sequence[Tensor]) -> Near:  # fmt: skip
+    """The same within one radius [m] of all vertices about x [B, V, 3]."""
+    x, none = x.detach(), x.new_empty((0,))
+    radii = torch.full_like(x[..., 0], radius)
+    return contact_near(x, origin, collider.detach(), x, none, radii, none, pinned, listed)
 
 
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------

@@ -142,11 +142,6 @@ def _coarse_stiffness_backward(a: Any) -> Any:
 # --- contact ----------------------------------------------------------------------------------------------------------
 
 
-def _bodies(a: Any) -> int:
-    """How many the lists by body have."""
-    return (a.ptr if hasattr(a, "order") else a.body_ptr).shape[0] - 1
-
-
 def _points(x: Tensor, collider: Tensor) -> Tensor:
     """One vector for each corner point."""
     return new(x, x.shape[0], x.shape[1] + (collider.shape[1] if collider.dim() == 3 else 0), 3)
@@ -160,9 +155,15 @@ def _contact_detect(a: Any) -> Any:
             new(x, COUNTS, dtype=LONG), new(x, b))  # fmt: skip
 
 
-def _contact_compact(a: Any) -> Any:
+def _contact_find(a: Any) -> Any:
+    x, b, n = a.x, a.x.shape[0], a.body_ptr.shape[0] - 1
+    return (*_contact_detect(a), torch.empty_like(x), new(x, len(DISPLACEMENTS), b, n), new(x, b, n, 4),
+            new(x, b, n, dtype=INT), new(x, b, n, 3), new(x, b, n + 1), new(x, b, n + 1))  # fmt: skip
+
+
+def _contact_near(a: Any) -> Any:
     count, like = torch.library.get_ctx().new_dynamic_size() if a.exact else a.pairs.shape[0], a.constants
-    return (new(like, count, dtype=LONG), new(like, count, a.pairs.shape[1], dtype=INT),
+    return (torch.empty_like(a.x[..., 0]), new(like, count, dtype=LONG), new(like, count, a.pairs.shape[1], dtype=INT),
             new(like, count, like.shape[1]), new(like, *a.ptr.shape, dtype=INT),
             new(like, 4 * count, dtype=INT))  # fmt: skip
 
@@ -173,11 +174,6 @@ def _contact_start(a: Any) -> Any:
     return (torch.empty_like(a.x), torch.empty_like(a.x), new(a.x, own, vertices, 3), new(a.x, scenes, vertices),
             new(a.x, own, vertices), new(a.x, scenes, vertices), new(a.x, scenes, vertices, dtype=torch.bool),
             new(a.x, scenes, dtype=LONG))  # fmt: skip
-
-
-def _contact_trust_radii(a: Any) -> Any:
-    b, n = a.x.shape[0], _bodies(a)
-    return new(a.x, b, n, dtype=INT), new(a.x, b, n, 3), new(a.x, b, n + 1), new(a.x, b, n + 1)
 
 
 def _contact_rigid_correct(a: Any) -> Any:
@@ -240,12 +236,9 @@ TABLE: dict[str, Row] = {
     "contact_detect": _contact_detect,
     "contact_intersections": lambda a: (new(a.x, a.capacity, CROSSING_ROW, dtype=INT),
                                         new(a.x, a.x.shape[0], 2, dtype=LONG), new(a.x, a.x.shape[0], 2, 2, dtype=INT)),
-    "contact_motion": lambda a: (torch.empty_like(a.x), new(a.x, len(DISPLACEMENTS), a.x.shape[0], _bodies(a)),
-                                 new(a.x, a.x.shape[0], _bodies(a), 4)),
-    "contact_trust_radii": _contact_trust_radii,
+    "contact_find": _contact_find,
     "contact_start": _contact_start,
-    "contact_refresh_gaps": lambda a: torch.empty_like(a.constants),
-    "contact_compact": _contact_compact,
+    "contact_near": _contact_near,
     "contact_lag": lambda a: (new(a.x, a.pairs.shape[0], LAG_SCALARS), new(a.x, a.pairs.shape[0]),
                               new(a.x, a.pairs.shape[0], dtype=LONG)),
     "contact_lag_backward": lambda a: (_points(a.x, a.collider), new(a.x, a.x.shape[0])),

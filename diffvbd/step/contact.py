@@ -15,19 +15,17 @@ from torch import Tensor
 
 from .._common.constants import CONTACT
 from .._common.context import MorePairs, checking, in_segment, is_captured, not_compiled, recorders, replaced
-from .._contact import detection as search
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
-from ..adjoint.contact import Pairs, floor_coefficients, friction_lag, no_pairs, some_of
+from ..adjoint.contact import Pairs, floor_coefficients, friction_lag, no_pairs
 from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
 from ..model.inputs import parameter_of
 from ..model.model import Model
 from ..model.system import System
 from ..ops import SweepSettings, broadcast
-from ..ops import contact as ops_start
 from ..ops.autograd import no_transforms
-from ..ops.contact import Displacements, SubstepStart, TrustRadii, contact_motion, contact_trust_radii, start_substep
+from ..ops.contact import Found, SubstepStart, contact_find, contact_near, start_substep, within
 from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
@@ -35,7 +33,6 @@ from .contact_coarse import Corrections
 from .contact_rigid import MOST_CORRECTIONS, bodies_of, corrected, is_blocked, touching
 from .predict import Begun
 
-CLOSE = 1e-3  # of dhat: pairs with so much more gap do not push, however it is rounded
 MOST_CAPACITY = 2**26
 FAR = 1e15  # [m] trust-region radius without pairs
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
@@ -89,16 +86,17 @@ class ContactStep:
         normal = broadcast(normal, (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
-    def _lag_friction(self, listed: Pairs, collider: Tensor) -> None:
-        """Lags friction and damping of the pairs at the start of the step, where there are any."""
-        if not self._has_lag:
+    def _lag_friction(self, listed: Pairs) -> None:
+        """Lags friction and damping of the pairs that push at the start of the step, where sweeps read them."""
+        if self.model.friction is None and not self._damps:
             return
         assert self.surface is not None
+        near = within(0.0, self.x_prev, self.origin, self.before, self.surface.pinned, listed)
+        self.lagged = Pairs(*near[2:])
         friction = None if self.model.friction is None else self._parameter("friction")
         damping = self._parameter("pair_damping") if self._damps else None
-        self.lagged = listed
-        self.lag = friction_lag(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin,
-                                self.surface.body, listed)  # fmt: skip
+        self.lag = friction_lag(self.begun.x_prev, self.before, self.kappa, friction, damping, self.origin,
+                                self.surface.body, self.lagged)  # fmt: skip
 
     @property
     def _damps(self) -> bool:
@@ -106,40 +104,20 @@ class ContactStep:
         barrier = self.barrier
         return barrier is not None and (barrier.damping > 0 or "pair_damping" in self.prepared.parameters)
 
-    @property
-    def _has_lag(self) -> bool:
-        """Whether sweeps need lagged values of pairs."""
-        return self.model.friction is not None or self._damps
-
     @staticmethod
     def _reads(x: Tensor) -> bool:
         """Whether values may decide sizes; on CUDA the host would wait."""
         return not x.is_cuda
 
     def gaps_before(self, listed: Pairs) -> Tensor:
-        """Gaps of pairs at the start of the step [n] [m]."""
+        """Gaps of pairs at the start of the step [n] [m]. Those of planes in a detection are of its end."""
         if self.colliders is self.before:
             return listed.constants[:, -1]
-        return ops_start.gaps(self.x_prev, self.origin, self.before, *listed[:3])
-
-    def _pushing(self, listed: Pairs) -> Pairs:
-        """Pairs that may push at the start, the same of a scene in any batch. On CUDA they are selected only if sweeps
-        read them."""
-        if not (self._has_lag or self._reads(self.x_prev)):
-            return listed
-        gap = self.gaps_before(listed)
-        return some_of(listed, (gap < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
-
-    def _refreshed(
-        self, listed: Pairs, x: Tensor, collider: Tensor, trust_radius: Tensor
-    ) -> tuple[Pairs, Tensor | None]:
-        """Pairs that can matter within the trust-region radii [B, V] about x, with their gaps there; and their rows in
-        the list, where these may be read."""
-        with torch.no_grad():
-            constants = ops_start.refresh_gaps(x.detach().contiguous(), self.origin, collider.detach().contiguous(),
-                                               trust_radius, listed.pairs, listed.constants, listed.ptr)  # fmt: skip
-        near, rows = some_of(replaced(listed, constants=constants), (constants[:, -1] < torch.inf).contiguous())
-        return near, rows if self._reads(x) else None
+        assert self.surface is not None
+        near = within(torch.inf, self.x_prev, self.origin, self.before, self.surface.pinned, listed)
+        gaps = near.constants.new_full((len(listed.pairs) + 1,), torch.inf)
+        gaps[near.rows] = near.constants[:, -1]  # a row of -1 is the last
+        return gaps[:-1]
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all substeps [B, V, 3]; raises where a detection is not valid."""
@@ -170,7 +148,7 @@ class ContactStep:
             if self._reads(x):  # before any work
                 self._check(r, detection.counts.tolist(), 0, records)
             if r == 0:
-                self._lag_friction(self._pushing(detection.listed), was)
+                self._lag_friction(detection.listed)
             start = start_substep(x, self._as_wholes(move), detection.u, detection.rigid, detection.trust_radius,
                                   detection.deformation_radius, self.planes, self.origin, was.detach(), now.detach(),
                                   surface.pinned, surface.body, surface.unit, detection.listed)  # fmt: skip
@@ -181,13 +159,15 @@ class ContactStep:
             x, taken, _ = corrected(self, start.x, now, start, detection.listed)
             if barrier.self_contact:
                 start = replaced(start, own_center=start.own_center + (x - start.x).detach())
-            trust_radius = radii_of_sweeps(start, x.detach(), self.model._pinned)
-            near, kept = self._refreshed(detection.listed, x, now, trust_radius)
-            swept_from = replaced(start, center=x.detach(), trust_radius=trust_radius)
+            at = x.detach()
+            left, kept, *near = contact_near(at, self.origin, now.detach(), start.center, start.own_center,
+                                             start.trust_radius, start.own_radius, surface.pinned,
+                                             detection.listed)  # fmt: skip
+            swept_from = replaced(start, center=at, trust_radius=left)
             limits, lengths, blocked, truncated = None, None, start.truncated, start.truncated
             if sweeps:
                 own = replaced(settings, sweeps=sweeps)
-                swept = swept_substep(self, x, swept_from, now, near, own, policy, debug_step)
+                swept = swept_substep(self, x, swept_from, now, Pairs(*near), own, policy, debug_step)
                 records.swept.append(swept)
                 x, limits, lengths, between = swept
                 taken.extend(between)
@@ -204,8 +184,8 @@ class ContactStep:
             records.truncated = truncated
             records.found[r] = replaced(detection, fractions=start.fractions, truncated=start.truncated,
                                         corrections=tuple(taken), limits=limits,
-                                        kept=kept, lengths=lengths, sweeps=sweeps, going=going,
-                                        resting=resting)  # fmt: skip
+                                        kept=kept if self._reads(x) else None, lengths=lengths, sweeps=sweeps,
+                                        going=going, resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.substeps < MOST_DETECTIONS:
@@ -288,19 +268,14 @@ class ContactStep:
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
                      checked=self.begun.law is None)[:2]  # fmt: skip
 
-    @torch.no_grad()
     def detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, gravity_move: Tensor) -> Detection:
-        """Pairs that can matter for displacements from x [B, V, 3] [m], as of trust_radii()."""
+        """Pairs that can matter for displacements from x [B, V, 3] [m]."""
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
-        wanted, within = trust_radii(surface, barrier, x, self.origin, self.fields.mass, move, gravity_move, was, now,
-                                     self.planes)  # fmt: skip
-        radii = within.trust_radius, within.deformation_radius
-        *index, corners, values, counts, smallest = search.detect(
-            x.detach(), self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, *radii
-        )
-        rigid = wanted.rigid if barrier.self_contact else self.none
-        return Detection(Pairs(*index), corners, values, counts, smallest, rigid, within.u, *radii)
+        found = find(surface, barrier, x, self.origin, self.fields.mass, move, gravity_move, was, now, self.planes,
+                     self.capacity)  # fmt: skip
+        rigid = found.rigid if barrier.self_contact else self.none
+        return Detection(Pairs(*found[:4]), *found[4:8], rigid, found.u, found.trust_radius, found.deformation_radius)
 
     def _record(self, records: Records) -> Outcome:
         """Records the outcome of the step."""
@@ -657,31 +632,17 @@ RADIUS_FACTOR = 1.5  # trust-region radius over the longest wanted displacement 
 LEAST_RADIUS = 1.0  # of dhat, added to it: a compressed barrier may push so far
 
 
-@torch.no_grad()
-def trust_radii(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor,
-                gravity_move: Tensor, was: Tensor, now: Tensor, floor: Tensor
-                ) -> tuple[Displacements, TrustRadii]:  # fmt: skip
-    """Wanted displacements by body, and trust-region radii until pairs are found again. Index data.
+def find(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor,
+         gravity_move: Tensor, was: Tensor, now: Tensor, floor: Tensor, capacity: int) -> Found:  # fmt: skip
+    """Pairs that can matter in a substep, and trust-region radii until they are found again. Index data.
 
     Args:
         x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
         move, gravity_move: Wanted displacements [B, V, 3] [m], and h^2 a, which corrections and sweeps add.
         was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or empty.
+        capacity: Pairs of all scenes that fit.
     """
-    s, dhat = surface, barrier.dhat
-    x, mass, move, gravity_move = [t.detach().contiguous() for t in (x, mass, move, gravity_move)]
-    bodies = s.body_order, s.body_ptr
-    wanted = contact_motion(x, origin, mass, move, gravity_move, s.pinned, s.pinned_bodies, *bodies)
-    return wanted, contact_trust_radii(
-        x, origin, mass, move, s.pinned, *bodies, wanted, floor, was.detach(), now.detach(), s.planes, s.body, s.radius,
-        s.max_trust_radius, s.max_deformation_radius, dhat, RADIUS_FACTOR, LEAST_RADIUS * dhat, barrier.self_contact,
-    )  # fmt: skip
-
-
-def radii_of_sweeps(start: SubstepStart, x: Tensor, pinned: Tensor) -> Tensor:
-    """Trust-region radii of the sweeps about x [B, V, 3], [B, V] [m]: what is left of those of the substep. 0 where
-    pinned, bool [V]. Index data."""
-    left = start.trust_radius - (x - start.center).norm(dim=-1)
-    if start.own_radius.numel() > 0:
-        left = torch.minimum(left, start.own_radius - (x - start.own_center).norm(dim=-1))
-    return torch.where(pinned, 0.0, left).clamp(min=0.0)
+    given = [t.detach().contiguous() for t in (x, origin, was, now, mass, move, gravity_move, floor)]
+    return contact_find(*given, surface.searched, surface.of_bodies, barrier.self_contact, barrier.between_bodies,
+                        barrier.dhat, RADIUS_FACTOR, LEAST_RADIUS * barrier.dhat, capacity,
+                        not torch.compiler.is_compiling())  # fmt: skip

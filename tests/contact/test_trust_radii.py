@@ -10,14 +10,23 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd._contact.surface import ContactSurface
-from diffvbd.ops.contact import Displacements, TrustRadii
+from diffvbd._contact.surface import LEAST_CAPACITY, ContactSurface
+from diffvbd.ops.contact import Found
 from diffvbd.ops.fields import DISPLACEMENTS
-from diffvbd.step.contact import LEAST_RADIUS, RADIUS_FACTOR, trust_radii
+from diffvbd.step.contact import LEAST_RADIUS, RADIUS_FACTOR, find
 from diffvbd.testing import generator, tolerance
 
 DHAT = 0.02
 GRID = 0.125  # of dhat, see csrc/contact/trust_region.h
+
+
+class TrustRadii(NamedTuple):
+    """These of Found."""
+
+    island: Tensor
+    u: Tensor
+    trust_radius: Tensor
+    deformation_radius: Tensor
 
 
 class Given(NamedTuple):
@@ -32,8 +41,8 @@ class Given(NamedTuple):
     now: Tensor
     floor: Tensor
 
-    def found(self) -> tuple[Displacements, TrustRadii]:
-        return trust_radii(*self)
+    def found(self) -> Found:
+        return find(*self, LEAST_CAPACITY)
 
 
 def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact: bool, apart: float = 1.3,
@@ -168,7 +177,7 @@ def islands_of(g: Given, trust_radius: Tensor) -> Tensor:
 
 def by_torch(g: Given) -> TrustRadii:
     """As written down."""
-    s, wanted = g.surface, g.found()[0]
+    s, wanted = g.surface, g.found()
     body = s.body[: g.x.shape[1]].long()
     displacement = dict(zip(DISPLACEMENTS, wanted.longest, strict=True))
     gravity_moves = 2 * displacement["gravity"] + LEAST_RADIUS * DHAT
@@ -201,8 +210,9 @@ def by_torch(g: Given) -> TrustRadii:
 
 
 def check(g: Given) -> None:
-    (_, got), (_, again) = g.found(), g.found()
-    for name, one, expected, same in zip(got._fields, got, by_torch(g), again, strict=True):
+    got, again = g.found(), g.found()
+    for name, expected in by_torch(g)._asdict().items():
+        one, same = getattr(got, name), getattr(again, name)
         torch.testing.assert_close(one, expected, rtol=tolerance("sums_of_bodies"), atol=0.0,
                                    msg=lambda text, name=name: f"{name}: {text}")  # fmt: skip
         assert torch.equal(one, same)
@@ -228,7 +238,7 @@ def test_a_body_that_is_not_finite_has_no_radius(device: str) -> None:
     g = given(device, speed=0.03, pinned=False, plane=True, self_contact=True)
     move = g.move.clone()
     move[1, -1, 0] = torch.nan
-    found = g._replace(move=move).found()[1]
+    found = g._replace(move=move).found()
     assert found.trust_radius[0].isfinite().all() and found.island[1, 3] == -1
     assert found.trust_radius[1, 3:].isnan().all()
 
@@ -247,7 +257,7 @@ def placed(places: list[tuple[float, float, float]], colliders: Any = (), fall: 
 
 
 def test_bodies_that_fall_side_by_side_are_one_island() -> None:
-    found = placed([(0, 0, 0), (1.001, 0, 0), (5, 0, 0), (6.001, 0.5, 0), (0, 3, 0)]).found()[1]
+    found = placed([(0, 0, 0), (1.001, 0, 0), (5, 0, 0), (6.001, 0.5, 0), (0, 3, 0)]).found()
     assert found.island.tolist() == [[0, 0, 2, 2, 4]]
     down = found.u.new_tensor([0.0, -1.0, 0.0])
     assert (found.u - down).abs().max() < GRID * DHAT and (found.u[..., 1] >= -1.0).all()  # toward zero
@@ -265,5 +275,5 @@ def test_what_reaches_a_collider_stays(collider: str, gap: float, expected: int)
         "capsule": dv.colliders.Capsule((-2.0, top - 0.1, 0.3), (2.0, top - 0.1, 0.4), 0.1),
         "obstacle": dv.colliders.Obstacle(slab.points, slab.surface),
     }
-    found = placed([(0, 0, 0)], [things[collider]]).found()[1]
+    found = placed([(0, 0, 0)], [things[collider]]).found()
     assert found.island.tolist() == [[expected]] and bool((found.u == 0).all()) == (expected < 0)

@@ -10,12 +10,19 @@ import torch
 from helpers.grouped import grouped
 from torch import Tensor
 
-from diffvbd.ops import contact as ops_motion
-from diffvbd.ops.contact import Displacements
+from diffvbd.ops.contact import contact_find
 from diffvbd.ops.fields import DISPLACEMENTS
 from diffvbd.testing import generator, tolerance
 
 SIZES = [[0, 3, 0, 1], [1] * 40, [300, 20, 0], [8] * 7, [6000, 5], [0], []]
+
+
+class Displacements(NamedTuple):
+    """These of Found."""
+
+    rigid: Tensor
+    longest: Tensor
+    sums: Tensor
 
 
 class Case(NamedTuple):
@@ -33,7 +40,15 @@ class Case(NamedTuple):
         return Case(**(self._asdict() | values))
 
     def found(self) -> Displacements:
-        return ops_motion.contact_motion(*self)
+        """Of bodies without a surface."""
+        n, none, empty = self.x.shape[1], self.x.new_empty((0,)), self.order[:0]
+        colliders, far = self.x.new_empty((len(self.x), 0, 3)), self.mass.new_ones((len(self.ptr) - 1,))
+        surface = (self.x.new_zeros((n, 3)), self.x.new_zeros((n,)), empty.reshape(0, 3), empty.reshape(0, 2), empty,
+                   empty.reshape(0, 3), self.body().to(torch.int32), self.pinned[:n], empty, none)  # fmt: skip
+        found = contact_find(self.x, self.origin, colliders, colliders, self.mass, self.move, self.gravity_move, none,
+                             surface, (self.pinned_bodies, self.order, self.ptr, far, far), True, True, 0.1, 1.5, 0.1,
+                             0)  # fmt: skip
+        return Displacements(found.rigid, found.longest, found.sums)
 
     def body(self) -> Tensor:
         body = torch.empty_like(self.order, dtype=torch.int64)
