@@ -642,7 +642,8 @@ def find(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tenso
         was, now: Collider points [B, Vc, 3] [m].  floor: Data of the FloorBarrier, or empty.
         capacity: Pairs of all scenes that fit.
     """
-    given = [t.detach().contiguous() for t in (x, origin, was, now, mass, move, gravity_move, floor)]
-    return contact_find(*given, surface.searched, surface.of_bodies, barrier.self_contact, barrier.between_bodies,
-                        barrier.dhat, RADIUS_FACTOR, LEAST_RADIUS * barrier.dhat, capacity,
+    x, move, gravity_move = x.detach().contiguous(), move.detach().contiguous(), gravity_move.detach().contiguous()
+    return contact_find(x, origin, was.detach(), now.detach(), mass.detach(), move, gravity_move, floor,
+                        surface.searched, surface.of_bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat,
+                        RADIUS_FACTOR, LEAST_RADIUS * barrier.dhat, capacity,
                         not torch.compiler.is_compiling())  # fmt: skip

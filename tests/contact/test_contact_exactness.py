@@ -26,10 +26,10 @@ QUICK = {("held_up", 1, 5), *((name, 1, 1) for name in SCENES if name != "held_u
          ("thrown", 1, 5), *((name, *run) for name in ("obstacles", "on_held") for run in RUNS)}  # fmt: skip
 SLOW = [(1, 0), (1, 20), (4, 1)]
 LONG = [(4, 20), (20, 2)]  # in turn; `-m hours` runs both
-SHORT = {"thrown", "held_up"}  # like the others after a few steps, each of several substeps
+SHORT = {"fast", "thrown", "held_up"}  # like the others after a few steps, each of several substeps
 # the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
 OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}
-HOURS = [(20, 5), (20, 20)]  # one scene runs the first of them in `make test-all`, too
+HOURS = [(20, 5), (20, 20)]
 # Bounds hold every vertex back in the first step, which therefore starts without a pair closer than dhat.
 NONE_YET = {"grad_pair_damping", "grad_friction"}
 ZERO = {("fast", 1): NONE_YET, ("held_up", 1): NONE_YET}
@@ -69,9 +69,7 @@ def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps:
     [*(slow(name, *OTHERS.get((name, run), run)) for name in SCENES for run in SLOW),
      *(pytest.param(name, *run, marks=pytest.mark.slow if i % 2 == (run == LONG[0]) else pytest.mark.hours)
        for i, name in enumerate(SCENES) for run in LONG if name not in SHORT),
-     slow("crossed", 20, 5),
-     *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES if name not in SHORT for run in HOURS
-       if (name, run) != ("crossed", HOURS[0]))],
+     *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES if name not in SHORT for run in HOURS)],
 )  # fmt: skip
 def test_gradients_of_longer_runs(name: str, steps: int, sweeps: int, device: str) -> None:
     check(name, steps, sweeps, device)

@@ -23,7 +23,7 @@ DTYPES = (torch.float64, torch.float32)
 def arguments(s: Scene, device: str, dtype: torch.dtype, capacity: int) -> tuple:
     given = s.arguments(device, dtype, capacity)
     triangles = torch.as_tensor(triangles_of(s), device=device)
-    return (*given[:3], *given[4:6], triangles, *given[7:12], *given[16:19], capacity)
+    return (*given[:3], *given[6:8], triangles, *given[9:14], *given[16:19], capacity)
 
 
 def triangles_of(s: Scene) -> np.ndarray:
