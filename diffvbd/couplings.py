@@ -236,18 +236,16 @@ class Springs(Coupling):
         return d - values["points"] if "points" in values else d
 
     def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
-        d, rest = self._vectors(x, values), values["rest_length"]
-        length, inverse = _length(d)
-        longer = (length - rest).clamp(min=0) if self.tension_only else length - rest
-        at_zero = (d * d).sum(-1) * (rest == 0 if self.tension_only else 1)  # an attachment, with its second derivative
-        return values["stiffness"] / 2 * torch.where(inverse > 0, longer.square(), at_zero + longer.square())
+        longer = _length(self._vectors(x, values))[0] - values["rest_length"]
+        return values["stiffness"] / 2 * (longer.clamp(min=0) if self.tension_only else longer).square()
 
     def pull(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Gradient of each spring with respect to p - q, [B, S, 3]: the force on q, and against that on p."""
-        d = self._vectors(x, values)
-        # at d = 0 the derivative is that of an attachment
-        rate = values["stiffness"] * (1 - values["rest_length"] * _length(d)[1])
-        return (rate.clamp(min=0) if self.tension_only else rate)[..., None] * d
+        d, rest = self._vectors(x, values), values["rest_length"]
+        length, inverse = _length(d)
+        # at d = 0 the derivative is that of an attachment, of a slack cable 0
+        rate = values["stiffness"] * (1 - rest * inverse)
+        return (torch.where(length < rest, 0.0, rate) if self.tension_only else rate)[..., None] * d
 
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         # k / 2 |d|^2 - k L |d|, of which the second part is concave: k bounds all of it

@@ -23,10 +23,10 @@ from torch.autograd import Function
 from .. import ops
 from .._common.context import is_captured
 from .._common.messages import warn
+from ..model.patches import Averaged
 from ..model.system import System
 from ..ops import is_batched, no_second_derivative, of_inputs
-from ..ops.sweep import sweep
-from .potential import PAIRS, IncrementalPotential
+from .potential import DEPENDS, PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
@@ -35,29 +35,24 @@ CHECK_EVERY = 8  # iterations on CUDA between two looks at whether all scenes ha
 
 Operator = Callable[[Tensor], Tensor]
 
-_DIFFERENTIABLE = ops.SweepFields._fields.index("origin")  # x_start ... energy_data
-_FIELDS = _DIFFERENTIABLE + 1  # and the origin
+_OF_FIELDS = ops.SweepFields._fields.index("origin")  # x_start ... energy_data
 
 
 def global_sweep(
-    model: System, fields: ops.SweepFields, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
-    then: Callable[[Tensor], Tensor] = lambda x: x,
+    model: System, fields: ops.SweepFields, averaged: Averaged | None, couplings: Tensor, time_step: float,
+    adjoint: GlobalAdjoint, run: Callable[[], Tensor],
 ) -> Tensor:  # fmt: skip
-    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``fields``: without contact."""
-    others = tuple(t if t is None else t.detach() for t in fields[_FIELDS:])  # coarse corrections
-    return _GlobalSweep.apply(*fields[:_FIELDS], others, model, settings, adjoint, debug_step, then)
+    """Positions where ``run`` ends the step [B, V, 3]; arguments before the time step: as of IncrementalPotential."""
+    given = *fields[:_OF_FIELDS], *(averaged or (None, None)), couplings
+    return _GlobalSweep.apply(*given, fields.origin, model, time_step, adjoint, run)
 
 
 class _GlobalSweep(Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:
-        others, model, settings, adjoint, debug_step = args[_FIELDS:-1]
-        fields = ops.SweepFields(*args[:_FIELDS], *others)
-        x, _, _ = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE,
-                        debug_step=debug_step)  # fmt: skip
-        x = args[-1](x)
-        ctx.save_for_backward(*fields[:_FIELDS], x)
-        ctx.model, ctx.h, ctx.adjoint = model, settings.numbers.time_step, adjoint
+        *tensors, ctx.model, ctx.h, ctx.adjoint, run = args
+        x = run()
+        ctx.save_for_backward(*tensors, x)
         return x
 
     @staticmethod
@@ -65,27 +60,30 @@ class _GlobalSweep(Function):
         if is_batched(grads[0]):  # the solve looks at values
             raise NotImplementedError("adjoint: expected ReverseSweep for batched gradients (is_grads_batched), got "
                                       "GlobalAdjoint, which takes one at a time")  # fmt: skip
-        needs = ctx.needs_input_grad[:_DIFFERENTIABLE]
+        needs = ctx.needs_input_grad[:DEPENDS]
         out = _GlobalBackward.apply(grads[0], *ctx.saved_tensors, ctx.model, ctx.h, ctx.adjoint, needs)
-        return of_inputs(out, needs, 7)
+        return of_inputs(out, needs, 5)
 
 
 class _GlobalBackward(Function):
     @staticmethod
     def forward(ctx: Any, x_bar: Tensor, *args: Any) -> tuple[Tensor, ...]:
-        fields, (x, model, h, adjoint, needs) = ops.SweepFields(*args[:_FIELDS]), args[_FIELDS:]
+        given, (origin, x, model, h, adjoint, needs) = args[:DEPENDS], args[DEPENDS:]
         if is_captured(x):
             raise RuntimeError("adjoint: expected ReverseSweep while a CUDA graph is captured, got GlobalAdjoint, "
                                "whose solve waits for the device")  # fmt: skip
+        *averaged, couplings = given[_OF_FIELDS:]
+        averaged = None if averaged[0] is None else Averaged(*averaged)
         with torch.autocast(x.device.type, enabled=False):  # which would take the products in half precision
-            potential = IncrementalPotential(model, x, fields, h)
+            fields = ops.SweepFields(*given[:_OF_FIELDS], origin=origin)
+            potential = IncrementalPotential(model, x, fields, h, averaged, couplings)
             x_bar_free = torch.where(potential.free > 0, x_bar, 0)
             w = solve_adjoint(potential, x_bar_free, adjoint, system(potential, adjoint.assembled), "GlobalAdjoint")
             bars = potential.dependence(w, needs)
             if needs[0]:
                 bars[0] = torch.where(potential.free > 0, 0, x_bar - potential.product(w))
         out = []
-        for bar, tensor, need in zip(bars, fields, needs, strict=False):
+        for bar, tensor, need in zip(bars, given, needs, strict=True):
             if need and tensor is not None:
                 out.append(torch.zeros_like(tensor) if bar is None else ops.sum_to(bar, tensor.shape))
         return tuple(out)
@@ -132,12 +130,21 @@ def solve_adjoint(potential: IncrementalPotential, x_bar: Tensor, adjoint: Globa
     return found.x * size
 
 
-def system(potential: IncrementalPotential, matrix: bool) -> tuple[Operator, Operator]:
-    """Product with the Hessian between free vertices, by a matrix or without, and with the inverse of its diagonal
-    blocks, which preconditions it; functions of [B, V, 3]."""
-    blocks, free = potential.diagonal(), potential.free
-    product = Assembled(potential, blocks) if matrix else lambda w: free * potential.product(w)
-    return product, inverse_blocks(blocks, free)
+def system(potential: IncrementalPotential, matrix: bool, shift: Tensor | None = None) -> tuple[Operator, Operator]:
+    """Product with the Hessian between free vertices, of single tets by a matrix or without, and with the inverse of
+    its diagonal blocks, which preconditions it; functions of [B, V, 3].
+
+    shift: What is added to the diagonal [B, V, 1].
+    """
+    free, blocks = potential.free, potential.tet_diagonal()
+    shift = blocks.new_zeros((1, 1, 1)) if shift is None else shift
+    blocks = blocks + shift[..., None] * torch.eye(3, dtype=blocks.dtype, device=blocks.device)
+    of_tets = Assembled(potential, blocks) if matrix else None
+
+    def product(w: Tensor) -> Tensor:
+        return free * (potential.product(w) + shift * w if of_tets is None else potential.with_others(w, of_tets(w)))
+
+    return product, inverse_blocks(potential.with_other_blocks(blocks), free)
 
 
 def inverse_blocks(blocks: Tensor, free: Tensor) -> Operator:

@@ -21,6 +21,7 @@ from torch import Tensor
 from .. import ops
 from .._common.constants import ELASTIC
 from .._common.context import replaced
+from ..couplings import load_of
 from ..laws.tets import LawTets
 from ..model.moving import MovingBodies, moving_bodies
 from ..model.patches import Averaged
@@ -28,6 +29,7 @@ from ..model.system import System
 from ..ops.fields import ROUNDINGS
 from ..ops.sums import Rows
 
+DEPENDS = 11  # what G depends on, as dependence() lists it
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
 _PAIRS = [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 2, 0), (2, 3, 0, 1)]
@@ -50,13 +52,14 @@ class IncrementalPotential:
     """
 
     def __init__(self, model: System, x: Tensor, fields: ops.SweepFields, time_step: float,
-                 averaged: Averaged | None = None) -> None:  # fmt: skip
+                 averaged: Averaged | None = None, couplings: Tensor | None = None) -> None:  # fmt: skip
         """fields: of the step, without bounds of patches; where its sweeps start does not enter.  averaged: the law
-        whose volumes patches average; None: that of the fields."""
+        whose volumes patches average; None: that of the fields.  couplings: the parameters of each coupling, one after
+        another [1 | B, n]; None: there are none, or the fields have their bound about x."""
         self.model, self.x, self.h = model, x, time_step
         self.x_prev, self.y, self.data = fields.x_prev, fields.y, fields.energy_data
         self.mu, self.lam, self.mass = fields.mu, fields.lam, fields.mass[..., None]
-        self.origin = fields.origin
+        self.origin, self.couplings = fields.origin, couplings
         rest = fields.rest
         self.rest = model.rest_scalars if rest is None else rest  # [1 | B, T, 7]
         self.free = (~model._pinned)[:, None].to(x.dtype)
@@ -87,6 +90,15 @@ class IncrementalPotential:
         if model.law is not None:
             self.own = LawTets(model.law.density, ops.tet_gather(x, *model._topology), self.rest, time_step)
 
+    @cached_property
+    def coupled(self) -> _CouplingTerms | None:
+        return None if self.couplings is None or not self.model.couplings else _CouplingTerms(self, self.couplings)
+
+    @property
+    def _others(self) -> list[Any]:
+        """What a matrix of tets has no room for."""
+        return [terms for terms in (self.patches, self.coupled) if terms is not None]
+
     def _edges_of(self, x: Tensor) -> Tensor:
         corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1).contiguous()
         return corners[1:] - corners[:1]
@@ -112,7 +124,7 @@ class IncrementalPotential:
         total = self.elastic()
         for energy, data in self._vertex_energies(self.data):
             total = total + energy.gradient(self.x, self.x_prev, data, self.h, self.origin)
-        return total
+        return total if self.coupled is None else total + self.coupled.gradient
 
     def inertia(self) -> Tensor:
         """M (x - y) [kg m], [B, V, 3]."""
@@ -120,19 +132,28 @@ class IncrementalPotential:
 
     def product(self, w: Tensor) -> Tensor:
         """Hessian times w, [B, V, 3], rows of pinned vertices included."""
-        out = self.elastic_product(w) + self.mass * w
+        out = self.tet_product(w) + self.mass * w
         blocks = self.vertex_blocks()
-        return out if blocks is None else out + (blocks * w[..., None, :]).sum(-1)
+        return self.with_others(w, out if blocks is None else out + (blocks * w[..., None, :]).sum(-1))
+
+    def with_others(self, w: Tensor, out: Tensor) -> Tensor:
+        """``out`` and the part of product() that is that of patches and couplings."""
+        for terms in self._others:
+            out = out + terms.product(w)
+        return out
 
     def elastic_product(self, w: Tensor) -> Tensor:
-        """The part of product() that is that of the tets."""
+        """The part of product() that is that of the tets and patches."""
+        return self.tet_product(w) if self.patches is None else self.tet_product(w) + self.patches.product(w)
+
+    def tet_product(self, w: Tensor) -> Tensor:
+        """The part of product() that is that of single tets."""
         if self.own is not None:
             return ops.star_sum(self.own.product(ops.tet_gather(w, *self.model._topology)), *self.model._topology)
         f = self._edges_of(w)
         turned = _cross(_rolled(f, 1), self._last) + _cross(self._next, _rolled(f, 2))
         stretched = self._bulk * (self.normals * f).sum(0).sum(0)
-        out = self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
-        return out if self.patches is None else out + self.patches.product(w)
+        return self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
 
     def vertex_blocks(self) -> Tensor | None:
         """3x3 blocks of the energies of single vertices, [B, V, 3, 3], or None where there are none."""
@@ -152,8 +173,18 @@ class IncrementalPotential:
         return self._blocks
 
     def diagonal(self) -> Tensor:
-        """The 3x3 blocks on the diagonal, [B, V, 3, 3]: positive definite wherever mu >= 0 and mu + lam >= 0
-        with StableNeoHookean."""
+        """The 3x3 blocks on the diagonal, [B, V, 3, 3], of couplings what is above theirs: positive definite wherever
+        mu >= 0 and mu + lam >= 0 with StableNeoHookean."""
+        return self.with_other_blocks(self.tet_diagonal())
+
+    def with_other_blocks(self, out: Tensor) -> Tensor:
+        """``out`` and the part of diagonal() that is that of patches and couplings."""
+        for terms in self._others:
+            out = out + terms.diagonal
+        return out
+
+    def tet_diagonal(self) -> Tensor:
+        """The part of diagonal() that is that of single tets and vertices."""
         eye = torch.eye(3, dtype=self.x.dtype, device=self.x.device)
         if self.own is not None:
             blocks = self.own.hessian.diagonal(dim1=2, dim2=3).movedim(-1, 2)
@@ -165,8 +196,7 @@ class IncrementalPotential:
         total = ops.star_sum(blocks.flatten(-2), *self.model._topology).unflatten(-1, (3, 3))
         total = total + self.mass[..., None] * eye
         own = self.vertex_blocks()
-        total = total if own is None else total + own
-        return total if self.patches is None else total + self.patches.diagonal
+        return total if own is None else total + own
 
     def stiffness(self) -> Tensor:
         """Traces of the blocks on the diagonal [kg], [B, V, 1]."""
@@ -197,13 +227,14 @@ class IncrementalPotential:
         return torch.cat([-self.normals.sum(0, keepdim=True), self.normals])
 
     def dependence(self, w: Tensor, wants: Sequence[bool]) -> list[Tensor | None]:
-        """Gradient of -w . dG/dx, with w fixed and zero where pinned, with respect to the arguments of the sweep.
+        """Gradient of -w . dG/dx, with w fixed and zero where pinned, with respect to what G depends on.
 
-        wants: for x_start, x_prev, y, mu, lam, mass, rest, energy_data. The first is zero and left to the caller.
+        wants: for x_start, x_prev, y, mu, lam, mass, rest, energy_data, lam and c6 that patches average, couplings. The
+        first is zero and left to the caller.
         """
         h2 = self.h * self.h
-        out: list[Tensor | None] = [None] * 8
-        f, lam = self._edges_of(w), self.lam if self.patches is None else torch.zeros_like(self.lam)
+        out: list[Tensor | None] = [None] * DEPENDS
+        f = self._edges_of(w)
         bent = (self.normals * f).sum(0).sum(0) / 6  # d(V J) along w, over c6 V = 1/6
         if wants[2]:
             out[2] = self.mass * w
@@ -222,15 +253,15 @@ class IncrementalPotential:
                 out[3] = h2 * (sheared - (self.ratio - 2) * bent)
             if wants[6]:
                 shape = torch.broadcast_shapes(bent.shape, self.c6.shape)
-                of_c6 = -h2 * (self.mu + lam) * (self.ratio / self.c6) * bent
+                of_c6 = -h2 * (self.mu + self.lam) * (self.ratio / self.c6) * bent
                 columns = [h2 * self.mu * s for s in stretch] + [of_c6]
                 out[6] = torch.stack([c.expand(shape) for c in columns], -1)
         if wants[4] and self.own is None:
             out[4] = -h2 * (self.ratio - 1) * bent
-        if self.patches is not None and (wants[4] or wants[6]):
-            out[4], of_c6 = self.patches.dependence(bent)
-            if out[6] is not None:
-                out[6] = torch.cat([out[6][..., :6], out[6][..., 6:] + of_c6[..., None]], -1)
+        if self.patches is not None and (wants[8] or wants[9]):
+            out[8], out[9] = self.patches.dependence(bent)
+        if self.coupled is not None and wants[10]:
+            out[10] = self.coupled.dependence(w)
         if self.model.vertex_energies and (wants[1] or wants[7]):
             with torch.enable_grad():
                 x_prev, data = (t.detach().requires_grad_() for t in (self.x_prev, self.data))
@@ -251,7 +282,8 @@ class IncrementalPotential:
 
 
 class _PatchTerms:
-    """h^2 sum over patches of L / 2 (J_P - 1)^2, L = sum V lam, at one state (model/patches.py)."""
+    """h^2 sum over patches of L / 2 (J_P - 1)^2, L = sum V lam, at one state, in place of what lam does in their tets
+    (model/patches.py)."""
 
     def __init__(self, at: IncrementalPotential, averaged: Averaged) -> None:
         assert at.model.patches is not None
@@ -294,8 +326,42 @@ class _PatchTerms:
             total = self.of.sum(volume)
             strain = self.of.sum(self.det.detach() / 6) / total - 1
             along = self.of.sum(volume * lam) * strain * self.of.sum(bent.detach()) / total
-            of_lam, of_c6 = torch.autograd.grad(-(self.at.h**2) * along.sum(), (lam, c6))
+            of_tets = lam * (c6 * self.det.detach() - 1) * bent.detach()
+            of_lam, of_c6 = torch.autograd.grad(-(self.at.h**2) * (along.sum() - of_tets.sum()), (lam, c6))
         return of_lam, of_c6
+
+
+class _CouplingTerms:
+    """h^2 times the energies of couplings at one state, whose gradient autograd differentiates."""
+
+    def __init__(self, at: IncrementalPotential, given: Tensor) -> None:
+        with torch.enable_grad():
+            self.x, self.given = (t.detach().requires_grad_() for t in (at.x, given))
+            where = self.x if at.origin is None else self.x + at.origin
+            load = at.h * at.h * load_of(at.model.couplings, values_of(at.model, self.given, len(where)), where)
+            self._slope, bound = load.split((3, 1), -1)
+        self.gradient = self._slope.detach()  # [kg m], [B, V, 3], rows of pinned vertices included
+        self.diagonal = torch.diag_embed(bound.detach().expand_as(self.gradient))  # bound of the blocks, [B, V, 3, 3]
+
+    def product(self, w: Tensor) -> Tensor:
+        # the Hessian is symmetric: a product with its transpose is one with it
+        return torch.autograd.grad(self._slope, self.x, w, retain_graph=True)[0]
+
+    def dependence(self, w: Tensor) -> Tensor:
+        """Gradient of -w . dE/dx with respect to the parameters, [1 | B, n]."""
+        return torch.autograd.grad(self._slope, self.given, -w, retain_graph=True)[0]
+
+
+def values_of(model: System, couplings: Tensor, scenes: int) -> list[dict[str, Tensor]]:
+    """The parameters of each coupling by key [B, ...], from those of all in one row [1 | B, n]."""
+    out, first = [], 0
+    couplings = ops.broadcast(couplings, (scenes, couplings.shape[1]))
+    for energy in model.couplings:
+        out.append({})
+        for key, own in model.constants(energy).items():
+            out[-1][key] = couplings[:, first : first + own.numel()].unflatten(1, own.shape)
+            first += own.numel()
+    return out
 
 
 def of_vertices(data: Tensor, x: Tensor) -> Tensor:

@@ -81,9 +81,9 @@ class GlobalAdjoint:
     potential at the executed end state, solved by preconditioned conjugate gradients (3x3 blocks of vertices).
 
     Right where the sweeps have converged, as after :func:`diffvbd.solve`; before, wrong in size and even in sign. Keeps
-    no tape: memory does not grow with the sweeps. Not recommended for steps of few
-    sweeps. Its backward waits for the device, so that it cannot be captured in a CUDA graph, and is not available to
-    ``torch.func``.
+    no tape: memory does not grow with the sweeps. Not recommended for steps of few sweeps. Springs, tendons, pressure
+    and patches enter with their energies, not with the bounds that sweeps see. Its backward waits for the device, so
+    that it cannot be captured in a CUDA graph, and is not available to ``torch.func``.
 
     Args:
         assembled: Store the Hessian as a sparse matrix of 3V x 3V; else multiply with it matrix-free, tet by tet.
@@ -96,8 +96,8 @@ class GlobalAdjoint:
     Raises:
         RuntimeError: In the backward, for a solve that fails, for adjoints that are not finite, and while a CUDA graph
             is captured.
-        NotImplementedError: Inside ``torch.func`` transforms; in the backward, for second derivatives and for batched
-            gradients (``is_grads_batched``).
+        NotImplementedError: With contact or rigid bodies; inside ``torch.func`` transforms; in the backward, for second
+            derivatives and for batched gradients (``is_grads_batched``).
 
     Source: paper, eq. 5 (right) and section 6.3; docs/adjoints.md.
     """

@@ -17,10 +17,9 @@ from torch import Tensor
 from .. import ops
 from .._contact.pair_forces import NearPairs, corner_points, near_pairs, pair_energy, safe_fraction
 from .._contact.surface import ContactSurface
-from ..couplings import load_of
 from ..model.system import System
-from .implicit import Assembled, Operator, inverse_blocks
-from .potential import IncreaseInputs, IncrementalPotential, increase_of_bodies
+from .implicit import Operator, system
+from .potential import DEPENDS, IncreaseInputs, IncrementalPotential, increase_of_bodies, values_of
 
 CLOSED = 0.8  # of a gap, at most, in one iteration
 REACH = 0.5  # of the trust-region radius of steps, which a vertex goes at most in one iteration
@@ -56,41 +55,15 @@ class StaticPotential(IncrementalPotential):
     """U at the state x [B, V, 3]."""
 
     def __init__(self, model: System, x: Tensor, given: Statics) -> None:
-        super().__init__(model, x, given.fields(x), 1.0)
+        super().__init__(model, x, given.fields(x), 1.0, couplings=given.couplings)
         self.given = given
-
-    def _values(self, couplings: Tensor) -> list[dict[str, Tensor]]:
-        """Parameters of each coupling by key, [B, ...]."""
-        out, first = [], 0
-        couplings = ops.broadcast(couplings, (len(self.x), couplings.shape[1]))
-        for energy in self.model.couplings:
-            out.append({})
-            for key, own in self.model.constants(energy).items():
-                out[-1][key] = couplings[:, first : first + own.numel()].unflatten(1, own.shape)
-                first += own.numel()
-        return out
 
     @cached_property
     def coupling_terms(self) -> Tensor:
         """Terms [J] of the energies of couplings, [B, n]; their sum is the energy but for a constant."""
-        return self._terms(self.x, self.given.couplings)
-
-    def _terms(self, x: Tensor, couplings: Tensor) -> Tensor:
-        values, none = self._values(couplings), [x.new_zeros((len(x), 0))]
-        parts = [energy.terms(x, own) for energy, own in zip(self.model.couplings, values, strict=True)]
+        values, none = values_of(self.model, self.given.couplings, len(self.x)), [self.x.new_zeros((len(self.x), 0))]
+        parts = [energy.terms(self.x, own) for energy, own in zip(self.model.couplings, values, strict=True)]
         return torch.cat(parts or none, -1)
-
-    @cached_property
-    def _coupled(self) -> tuple[Tensor, Tensor, Tensor]:
-        """x, the parameters of couplings, and the gradient of their energies [N], which autograd differentiates."""
-        with torch.enable_grad():
-            x, couplings = (t.detach().requires_grad_() for t in (self.x, self.given.couplings))
-            (slope,) = torch.autograd.grad(self._terms(x, couplings).sum(), x, create_graph=True)
-            return x, couplings, slope
-
-    def coupled(self) -> Tensor:
-        """The gradient of the energies of couplings [N], [B, V, 3], rows of pinned vertices included."""
-        return self._coupled[2].detach() if self.model.couplings else torch.zeros_like(self.x)
 
     @cached_property
     def points(self) -> Tensor:
@@ -131,7 +104,7 @@ class StaticPotential(IncrementalPotential):
                                                                 self.given.kappa))  # fmt: skip
 
     def internal(self) -> Tensor:
-        """dE/dx of all but couplings [N], [B, V, 3], rows of pinned vertices included."""
+        """dE/dx [N], [B, V, 3], rows of pinned vertices included."""
         total = self.forces()
         if self.pairs is None:
             return total
@@ -151,36 +124,26 @@ class StaticPotential(IncrementalPotential):
             (blocks,) = torch.autograd.grad(slope, at, rows, is_grads_batched=True)
         return blocks.flatten(2).movedim(0, 1)
 
-    def product(self, w: Tensor) -> Tensor:
-        return self.with_others(w, super().product(w))
-
     def with_others(self, w: Tensor, out: Tensor) -> Tensor:
-        """``out`` and the part of product() that is that of pairs and couplings."""
+        """``out`` and the part of product() that is that of patches, couplings and pairs."""
+        out = super().with_others(w, out)
         if self.pairs is not None:
             at = self.pairs.positions(self._with_colliders(w)).reshape(-1, 12, 1)
             out = out + self._on_vertices(self.pairs, (self.pair_blocks @ at).reshape(-1, 4, 3))
-        if self.model.couplings:
-            x, _, slope = self._coupled  # the Hessian is symmetric: a product with its transpose is one with it
-            out = out + torch.autograd.grad(slope, x, w, retain_graph=True)[0]
         return out
 
     @cached_property
-    def other_diagonal(self) -> Tensor:
-        """The blocks on the diagonal of pairs, [B, V, 3, 3], without what is negative in them, and the bound of
-        couplings, which is above theirs."""
-        total = self.x.new_zeros(*self.x.shape, 3)
-        if self.model.couplings:
-            bound = load_of(self.model.couplings, self._values(self.given.couplings), self.x)[..., 3:]
-            total.diagonal(dim1=-2, dim2=-1).add_(bound)
-        if self.pairs is None:
-            return total
+    def pair_diagonal(self) -> Tensor:
+        """The blocks of pairs on the diagonal, [B, V, 3, 3], without what is negative in them."""
+        assert self.pairs is not None
         blocks = self.pair_blocks.reshape(-1, 4, 3, 4, 3).diagonal(dim1=1, dim2=3).movedim(-1, 1)
         value, vector = torch.linalg.eigh(blocks)
         blocks = (vector * value.clamp(min=0)[..., None, :]) @ vector.mT
-        return total + self._on_vertices(self.pairs, blocks.flatten(-2)).unflatten(-1, (3, 3))
+        return self._on_vertices(self.pairs, blocks.flatten(-2)).unflatten(-1, (3, 3))
 
-    def diagonal(self) -> Tensor:
-        return super().diagonal() + self.other_diagonal
+    def with_other_blocks(self, out: Tensor) -> Tensor:
+        out = super().with_other_blocks(out)
+        return out if self.pairs is None else out + self.pair_diagonal
 
     def increase(self, inputs: IncreaseInputs, to: StaticPotential) -> tuple[Tensor, Tensor]:
         """Increase of U from here to another state with the same pinned positions, and the sum of the sizes of its
@@ -215,7 +178,10 @@ class StaticPotential(IncrementalPotential):
 
     def depends(self, w: Tensor) -> Statics:
         """Gradient of -w . dU/dx, with w fixed and zero where pinned, with respect to what U depends on."""
-        _, _, _, mu, lam, _, rest, data = self.dependence(w, [True] * 8)
+        _, _, _, mu, lam, _, rest, data, of_lam, of_c6, couplings = self.dependence(w, [True] * DEPENDS)
+        assert mu is not None and lam is not None and rest is not None
+        if of_lam is not None and of_c6 is not None:  # patches average the law itself
+            lam, rest = lam + of_lam, torch.cat([rest[..., :6], rest[..., 6:] + of_c6[..., None]], -1)
         colliders, kappa = torch.zeros_like(self.given.colliders), torch.zeros_like(self.given.kappa)
         if self.pairs is not None:
             with torch.enable_grad():
@@ -224,38 +190,21 @@ class StaticPotential(IncrementalPotential):
                 slope = self._pair_gradient(self.pairs, at, kappa)
                 along = -(slope * self.pairs.positions(self._with_colliders(w))).sum()
                 colliders, kappa = torch.autograd.grad(along, (colliders, kappa), materialize_grads=True)
-        couplings = self.given.couplings
-        if self.model.couplings:
-            _, couplings, slope = self._coupled
-            (couplings,) = torch.autograd.grad(slope, couplings, -w, retain_graph=True)
         data = torch.zeros_like(self.data) if data is None else data
-        assert mu is not None and lam is not None and rest is not None
+        couplings = torch.zeros_like(self.given.couplings) if couplings is None else couplings
         return Statics(w, mu, lam, rest, data, colliders, kappa, couplings)
 
 
 def newton_operators(at: StaticPotential, shift: Tensor | None = None) -> tuple[Operator, Operator]:
     """Product with the Hessian of U between free vertices, ``shift`` [B, V, 1] added to its diagonal, and what
     preconditions it: the inverse of its diagonal blocks and, with a coarse subspace, of its projection on that."""
-    eye = torch.eye(3, dtype=at.x.dtype, device=at.x.device)
-    shift = at.x.new_zeros((1, 1, 1)) if shift is None else shift
-    blocks = at.diagonal() + shift[..., None] * eye
-    smooth = inverse_blocks(blocks, at.free)
     stored = at.x.is_cuda or torch.backends.mkl.is_available()  # sparse products on a CPU need MKL
-    of_tets = blocks - at.other_diagonal
-    of_tets = of_tets if at.patches is None else of_tets - at.patches.diagonal
-    elastic = Assembled(at, of_tets) if stored else (
-        lambda w: IncrementalPotential.product(at, w) + shift * w)  # fmt: skip
-
-    def product(w: Tensor) -> Tensor:
-        out = elastic(w)
-        if stored and at.patches is not None:  # a matrix of tets has no room for what couples several
-            out = out + at.patches.product(w)
-        return at.free * at.with_others(w, out)
-
+    product, smooth = system(at, stored, shift)
     weights = _coarse_functions(at.model)
     if weights is None:
         return product, smooth
     (count, functions), scenes = weights.shape, len(at.x)
+    eye = torch.eye(3, dtype=at.x.dtype, device=at.x.device)
     columns = (weights[:, None, :, None] * eye[:, None]).reshape(count, 3, 3 * functions)
     image = torch.stack([product(c.expand(scenes, -1, -1)).flatten(1) for c in columns.unbind(-1)], -1)
     matrix = columns.flatten(0, 1).T @ image

@@ -39,7 +39,7 @@ from ..step.arguments import (
     prepare,
     refuse_non_finite,
 )
-from ..step.couplings import parameters_at
+from ..step.couplings import row_of
 from ..step.predict import energy_data
 from ..step.warnings import system_for
 from .newton import Limits, Rest, find_rest
@@ -175,15 +175,8 @@ def _statics(model: System, x: Tensor, lead: tuple[int, ...], inputs: dict[str, 
     given = Statics(load, prepared.mu, prepared.lam, model.rest_scalars if prepared.rest is None else prepared.rest,
                     energy_data(model, prepared, None), x.new_zeros((flat[0], 0, 3)) if colliders is None else
                     colliders[1], x.new_zeros((1,)) if kappa is None else kappa,
-                    _couplings(model, prepared.parameters, flat[0]))  # fmt: skip
+                    row_of(model, prepared.parameters, flat[0]))  # fmt: skip
     return held.double(), Statics(*(t.double() for t in given))
-
-
-def _couplings(model: System, given: dict[str, Tensor], scenes: int) -> Tensor:
-    """The parameters of all couplings [B, n]."""
-    values = parameters_at(model, given, scenes)
-    flat = [value.flatten(1) for own in values for value in own.values()]
-    return torch.cat(flat, 1) if flat else model._mass.new_zeros((1, 0))
 
 
 class _Rest(Function):

@@ -215,13 +215,14 @@ def _state(at: StaticPotential, x: Tensor) -> StaticPotential:
 def residual_of(at: StaticPotential, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
     """Force left over at free vertices [N], [B, V, 3]; its size over those of internal forces, loads and SMALL_STRAIN
     [-], [B]; whether that meets the tolerance, or is no more than rounding leaves, bool [B]."""
-    internal, coupled = at.internal(), at.coupled()  # where pinned, too: without loads the reactions are what balances
-    left = at.free * (internal + coupled - at.given.load)
+    internal = at.internal()  # where pinned, too: without loads the reactions are what balances
+    coupled = torch.zeros_like(internal) if at.coupled is None else at.coupled.gradient
+    left = at.free * (internal - at.given.load)
     size = of_scenes(left)
     # a state without stress and loads has no forces to compare with: those of a small strain stand for them
     extent = (at.x.amax(1) - at.x.amin(1)).amax(-1, keepdim=True) if at.x.numel() else size
     least = SMALL_STRAIN * extent / max(at.x.shape[1], 1) * of_scenes(at.free * at.stiffness())
-    ratio = share(size, of_scenes(internal) + of_scenes(coupled) + of_scenes(at.given.load) + least)
+    ratio = share(size, of_scenes(internal - coupled) + of_scenes(coupled) + of_scenes(at.given.load) + least)
     return left, ratio[:, 0], ((ratio <= tolerance) | (size <= rounding(at, of_scenes)))[:, 0]
 
 

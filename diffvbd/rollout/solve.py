@@ -12,13 +12,12 @@ from torch import Tensor
 from .._common.checks import check_bool, check_count, check_positive, fail, is_word
 from .._common.context import refuse_refinement, refuse_transforms, replaced
 from .._common.messages import log_progress, warn
-from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, check_adjoint
 from ..model.model import Model
 from ..model.solver import BDF2, VBD
 from ..model.system import System
 from ..ops import SweepSettings
-from ..step.advance import advance, swept
+from ..step.advance import advance, of_equation, swept
 from ..step.arguments import (
     Prepared,
     acceleration_of,
@@ -90,8 +89,8 @@ def solve(
             on CUDA waits for the device; later looks are further apart, at most a quarter of the sweeps so far.
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
         adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
-            the same sweeps again and differentiate them. With contact ReverseSweep(), and no other; with patches,
-            springs, tendons or pressure not GlobalAdjoint(), and ReverseSweep() by default.
+            the same sweeps again and differentiate them. With contact ReverseSweep(), and no other; with rigid bodies
+            not GlobalAdjoint(), and ReverseSweep() by default.
         progress: Print each look at the residual, by the logger "diffvbd".
 
     Returns:
@@ -101,7 +100,7 @@ def solve(
         ValueError, TypeError: As :func:`diffvbd.step`.
         RuntimeError: Where the sweeps do not converge.
         NotImplementedError: For another adjoint than ReverseSweep with contact or friction; for GlobalAdjoint with
-            patches, springs, tendons or pressure.
+            rigid bodies.
 
     Source: paper, eq. 1; docs/adjoints.md.
     """
@@ -110,7 +109,7 @@ def solve(
     lead, system, scheme = check_state(model, x, v), system_for(model, solver), solver.integrator
     if isinstance(scheme, BDF2):
         fail("solver", "ImplicitEuler() or SDIRK2() in a step: BDF2() needs the step before", "BDF2()")
-    if adjoint is None and not (model.touches or model._renews or model.rigid_bodies):
+    if adjoint is None and not (model.touches or model.rigid_bodies):
         adjoint = GlobalAdjoint()
     adjoint = check_adjoint(adjoint, solver.tape)
     if check_positive("tolerance", tolerance) >= 1:
@@ -156,9 +155,7 @@ class _Converging:
                 refuse_non_finite(model, {"x": x, "v": v, **loads, "mu": prepared.mu, "lam": prepared.lam})
         _judge(done, self.tolerance, self.on_failure)
         if isinstance(self.adjoint, GlobalAdjoint):
-            # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
-            begun = replaced(begun, x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
-            end = global_sweep(model, begun.fields(model, prepared), prepared.settings, self.adjoint)
+            end = of_equation(model, begun, prepared, self.adjoint, lambda: done.end.clone())
             x_end, v_end = begun.finish(end, model, prepared, corrects=False)
         else:
             again = replaced(prepared, settings=replaced(prepared.settings, sweeps=done.count))

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -32,8 +33,8 @@ from .arguments import (
 )
 from .coarse import lengths_of, with_corrections
 from .contact import run_contact
-from .couplings import sweep_renewed
-from .predict import Begun, begin
+from .couplings import row_of, sweep_renewed
+from .predict import Begun, begin, energy_data
 
 TAPED = TapedSweep()
 
@@ -97,23 +98,37 @@ def swept(
         if checking() and begun.y.is_cuda and not begun.renews:
             check_on_cpu(model, fields, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):
+            run = partial(_run, model, begun, prepared, fields, policy, debug_step)
             if isinstance(adjoint, GlobalAdjoint):
-                return global_sweep(model, fields, settings, adjoint, debug_step,
-                                    lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            if begun.renews:
-                end, found = sweep_renewed(model, begun.renewed, fields, settings, policy, debug_step,
-                                           lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-                corrections = torch.cat([end.new_empty((len(end), 0, 0)), *found][bool(found) :], 1)
-            else:
-                end, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
-                                            debug_step=debug_step)  # fmt: skip
-            if corrections.numel():
-                for found in recorders("subspace"):
-                    found.append(lengths_of(model, corrections))
-            return end
+                return of_equation(model, begun, prepared, adjoint, lambda: begun.corrected(run(), model, prepared))
+            return run()
     except ValueError as error:
         # the frames of operators say nothing to who gave the argument
         raise named(model, error, {**given, **prepared.parameters}) from None
+
+
+def _run(model: System, begun: Begun, prepared: Prepared, fields: ops.SweepFields, policy: int, debug_step: int
+         ) -> Tensor:  # fmt: skip
+    if begun.renews:
+        end, found = sweep_renewed(model, begun.renewed, fields, prepared.settings, policy, debug_step,
+                                   lambda x: begun.corrected(x, model, prepared))  # fmt: skip
+        corrections = torch.cat([end.new_empty((len(end), 0, 0)), *found][bool(found) :], 1)
+    else:
+        end, _, corrections = sweep(fields, model._packed_rest, model._plan, prepared.settings, tape_policy=policy,
+                                    debug_step=debug_step)  # fmt: skip
+    if corrections.numel():
+        for found in recorders("subspace"):
+            found.append(lengths_of(model, corrections))
+    return end
+
+
+def of_equation(model: System, begun: Begun, prepared: Prepared, adjoint: GlobalAdjoint, run: Callable[[], Tensor]
+                ) -> Tensor:  # fmt: skip
+    """Positions where ``run`` ends the step [B, V, 3], with the derivative of the step's equation there."""
+    data = energy_data(model, prepared, begun.origin)  # without the bound of couplings
+    fields = replaced(begun.fields(model, prepared), energy_data=data)
+    return global_sweep(model, fields, prepared.averaged, row_of(model, prepared.parameters, len(begun.y)),
+                        prepared.settings.numbers.time_step, adjoint, run)  # fmt: skip
 
 
 def _fuses(model: System, force: Tensor | None, gravity: Tensor) -> bool:

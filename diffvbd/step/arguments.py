@@ -263,9 +263,6 @@ def prepare(
         materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
-    if model._renews and isinstance(adjoint, GlobalAdjoint):  # the Hessian of a bound is not that of the energy
-        raise NotImplementedError(f"adjoint: expected ReverseSweep or Unrolled with {what_renews(model)}, got "
-                                  "GlobalAdjoint")  # fmt: skip
     if model.rigid_bodies is not None and isinstance(adjoint, GlobalAdjoint):
         raise NotImplementedError("adjoint: expected ReverseSweep or Unrolled with rigid bodies, got GlobalAdjoint")
     averaged = None
@@ -299,11 +296,6 @@ def prepare(
         damping=damping,
         averaged=averaged,
     )
-
-
-def what_renews(model: Model) -> str:
-    """The energy of a Model whose bound sweeps begin with anew."""
-    return repr(model.couplings[0]) if model.couplings else "patches of tets"
 
 
 def _stress_free(given: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,13 @@ def parameters_at(model: System, given: dict[str, Tensor], scenes: int) -> list[
     ]  # fmt: skip
 
 
+def row_of(model: System, given: dict[str, Tensor], scenes: int) -> Tensor:
+    """The parameters of all couplings in one row [B, n]; arguments as of parameters_at()."""
+    values = parameters_at(model, given, scenes)
+    flat = [value.flatten(1) for own in values for value in own.values()]
+    return torch.cat(flat, 1) if flat else model._mass.new_zeros((1, 0))
+
+
 def record_of(model: System, given: dict[str, Tensor], data: Tensor, origin: Tensor | None, scenes: int) -> Record:
     """The record of a Model's couplings for a step.
 

@@ -1,4 +1,4 @@
-"""Gradients of some steps with respect to every input, held against autograd and against differences."""
+"""Gradients of some steps with respect to every input, held against autograd, differences and dense equations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -52,3 +52,38 @@ def assert_like_differences(run: Callable[..., tuple[Tensor, Tensor]], values: d
         derivative = float((found[f"grad_{name}"] * along).sum())
         size = float((found[f"grad_{name}"].abs() * along.abs()).sum())
         assert abs(difference - derivative) <= tolerance("finite_difference") * size, name
+
+
+def assert_converged(models: tuple[dv.Model, dv.Model], solver: dv.VBD,
+                     inputs_of: Callable[[dv.Model], dict[str, Tensor]]) -> None:  # fmt: skip
+    """Both forms of GlobalAdjoint, on the second Model, have the gradients of the executed sweeps of the first."""
+    first, second = models
+    h = solver.time_step
+    expected = evaluate(run_of(first, solver), inputs_of(first), h)
+    for assembled in (True, False):
+        adjoint = dv.GlobalAdjoint(assembled, tolerance=tolerance("linear_residual"))
+        result = evaluate(run_of(second, solver, adjoint=adjoint), inputs_of(second), h)
+        assert second.device != first.device or torch.equal(result["x"], expected["x"])
+        for name in (key for key in expected if key.startswith("grad_")):
+            assert expected[name].any(), name
+            assert relative_error(result[name], expected[name]) <= tolerance("global_converged"), name
+
+
+def assert_of_equation(model: dv.Model, run: Callable[..., tuple[Tensor, Tensor]],
+                       potential: Callable[..., Tensor], values: dict[str, Tensor]) -> None:  # fmt: skip
+    """The gradient of a step's end, converged or not, is that of the equation there by a dense solve.
+
+    potential: of the step, a function of its end and of the inputs.
+    """
+    values = {name: value.clone().requires_grad_() for name, value in values.items()}
+    end, free = run(**values)[0], ~model.pinned
+    weights = torch.as_tensor(generator("loss").standard_normal(end.shape))
+    result = torch.autograd.grad((weights * end).sum(), [*values.values()])
+    unknown = end.detach()[free].requires_grad_()
+    at = values["x"].index_put((free,), unknown)
+    (slope,) = torch.autograd.grad(potential(at, **values), unknown, create_graph=True)
+    rows = [torch.autograd.grad(s, unknown, retain_graph=True)[0].flatten() for s in slope.flatten()]
+    w = torch.linalg.solve(torch.stack(rows), weights[free].flatten()).reshape(slope.shape)
+    expected = torch.autograd.grad((weights * at).sum() - (w * slope).sum(), [*values.values()])
+    for name, ours, theirs in zip(values, result, expected, strict=True):
+        assert theirs.any() and relative_error(ours, theirs) <= tolerance("global_converged"), name

@@ -1,16 +1,18 @@
 """Claim: steps with springs, tendons and pressure, and their gradients, equal autograd through an independent execution
-of the same bounds and sweeps; and the gradients are those of differences."""
+of the same bounds and sweeps; and the gradients are those of differences. GlobalAdjoint has those of the energies."""
 
 from typing import Any
 
 import pytest
 import torch
 from helpers.coupled import coupled, inputs_of
-from helpers.executed import assert_executed, assert_like_differences, run_of
+from helpers.executed import assert_converged, assert_executed, assert_like_differences, assert_of_equation, run_of
 from helpers.marks import slow
 from helpers.spreads import assert_near_contact
+from torch import Tensor
 
 import diffvbd as dv
+from diffvbd import reference
 from diffvbd.testing import contact_scenes, evaluate, relative_error, tolerance
 
 FLOOR = dv.FloorBarrier(height=-0.01, kappa=1e4, dhat=0.03)
@@ -64,6 +66,50 @@ def test_gradients_are_those_of_differences(case: str, sweeps: int) -> None:
     scene, energies, options = CASES[case]
     model, solver = coupled(*energies, **scene), dv.VBD(STEP, sweeps, **options)
     assert_like_differences(run_of(model, solver), inputs_of(model), STEP)
+
+
+@pytest.mark.parametrize("case", ["gas", "places", *map(slow, (c for c in CASES if c not in ("gas", "places")))])
+def test_global_adjoint_is_the_derivative_of_a_converged_step(device: str, case: str) -> None:
+    scene, energies, options = CASES[case]
+    models = coupled(*energies, **scene), coupled(*energies, **scene, device=device)
+    assert_converged(models, dv.VBD(STEP, 150, **options), inputs_of)
+
+
+def test_the_gradient_of_a_converged_step_is_that_of_differences() -> None:
+    """GlobalAdjoint is what solve takes if not told otherwise."""
+    model = coupled(places=True)
+
+    def run(x: Tensor, v: Tensor, **inputs: Tensor) -> tuple[Tensor, Tensor]:
+        done = dv.solve(model, x, v, dv.VBD(STEP, 0), tolerance=1e-13, **inputs)
+        return done.x, done.v
+
+    assert_like_differences(run, inputs_of(model), STEP)
+
+
+@pytest.mark.parametrize("kind", ["gas", "places"])
+def test_global_adjoint_of_one_sweep_is_of_the_energies_and_not_of_their_bound(kind: str) -> None:
+    model = coupled(**{kind: True})
+
+    def potential(end: Tensor, x: Tensor, v: Tensor, mu: Tensor, lam: Tensor, force: Tensor, **parameters: Tensor
+                  ) -> Tensor:  # fmt: skip
+        y = x + STEP * v + STEP**2 * (x.new_tensor([0, -9.81, 0]) + force / model.mass[:, None])
+        return reference.incremental_potential(model, end, y, mu, lam, STEP, x, parameters=parameters)
+
+    run = run_of(model, dv.VBD(STEP, 1), adjoint=dv.GlobalAdjoint(tolerance=tolerance("linear_residual")))
+    values = {k: v for k, v in inputs_of(model).items() if k not in ("rest_points", "density")}
+    assert_of_equation(model, run, potential, values)
+
+
+def test_a_cable_of_no_length_resists_only_without_slack() -> None:
+    mesh, rest = dv.mesh.cube(2, 0.1), torch.tensor([0.0, 0.02], dtype=torch.float64)
+    at = dv.Embedding.of_vertices([6, 7])
+    cables = dv.Springs(at, torch.from_numpy(mesh.points[6:8].copy()), 50.0, rest, tension_only=True)
+    model = dv.Model(mesh, pinned=[0], energies=(dv.StableNeoHookean(), cables))
+    x = model.rest_points.requires_grad_()
+    found = dv.coupling_forces(model, x).springs
+    assert found is not None and not found.any()
+    slopes = torch.autograd.grad(found[:, 0].sum(), x)[0]
+    assert slopes[6:].tolist() == [[-50.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
 
 
 def test_attached_bodies_touch(device: str) -> None:
