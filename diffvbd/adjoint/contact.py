@@ -157,7 +157,8 @@ class StepContact:
     """
 
     def __init__(self, model: System, data: Tensor, parameters: dict[str, Tensor], colliders: Tensor, before: Tensor,
-                 x_prev: Tensor | None, origin: Tensor | None, time_step: float, friction_eps: float) -> None:  # fmt: skip
+                 x_prev: Tensor | None, origin: Tensor | None, time_step: float, friction_eps: float
+                 ) -> None:  # fmt: skip
         self.model, self.parameters, self.origin, self.h = model, parameters, origin, time_step
         self.colliders, self.x_prev = colliders, x_prev
         floor = model.floor
