@@ -144,16 +144,19 @@ class StepContact:
         colliders, before: Collider points at the end and at the start [B, Vc, 3].
         x_prev: Start of the step [B, V, 3], relative to ``origin`` where there is one; None: at rest in any state, so
             that there is neither damping nor friction.
+        friction_eps: Motion from there below which friction is smoothed [m], as of the solve: where that is part of a
+            step, this need not be its time step times the velocity of the friction.
     """
 
     def __init__(self, model: System, data: Tensor, parameters: dict[str, Tensor], colliders: Tensor, before: Tensor,
-                 x_prev: Tensor | None, origin: Tensor | None, time_step: float) -> None:  # fmt: skip
+                 x_prev: Tensor | None, origin: Tensor | None, time_step: float, friction_eps: float
+                 ) -> None:  # fmt: skip
         self.model, self.parameters, self.origin, self.h = model, parameters, origin, time_step
         self.colliders, self.x_prev = colliders, x_prev
         floor = model.floor
         self.planes = None if floor is None else data[:, : floor.count()].double()
         self.start = None if x_prev is None else corner_points(x_prev, origin, before)
-        self.reach = 1.0 if model.friction is None else time_step * model.friction.velocity
+        self.reach = friction_eps
         self.lag = None
         surface, barrier = model.surface_of_contact, model.contact
         if x_prev is not None and self.start is not None and surface is not None and barrier is not None:

@@ -230,9 +230,9 @@ def _contact_at(given: Wide, x: Tensor, previous: tuple[Tensor, Tensor] | None) 
                                   "supported: use torch.autograd")  # fmt: skip
     flat = (x.shape[:-2].numel(), *x.shape[-2:])
     start = None if previous is None else previous[0].double().reshape(flat)
-    h = given.prepared.settings.numbers.time_step
+    numbers = given.prepared.settings.numbers
     contact = StepContact(given.model, given.data(), given.prepared.parameters, given.colliders, given.before, start,
-                          None, h)  # fmt: skip
+                          None, numbers.time_step, numbers.friction_eps)  # fmt: skip
     return contact.at(x.double().reshape(flat))
 
 

@@ -535,7 +535,7 @@ def on_halved(given: dict[str, Any], model: Model, fine: Halved) -> dict[str, An
 
 MOST_SWEEPS = 1300
 LOOKS = 64  # at steps of a run, evenly spread
-STALLED = 0.5  # of what was left over: more than this part of it after twice the sweeps
+STALLED = 0.9  # of what was left over: more than this part of it after twice the sweeps
 
 
 def unbalanced(seen: list[Any]) -> float:

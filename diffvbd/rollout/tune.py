@@ -518,11 +518,8 @@ STUCK = 6  # levels of the refinement that do not come closer: there is no limit
 
 def start_of(trials: TrialRuns) -> VBD:
     """Solver of the refinement: well converged and never far from the fastest."""
-    model = trials.model
-    if not takes_corrections(model, PLAIN):
+    if not takes_corrections(trials.model, PLAIN):
         return VBD(1.0, 40, integrator=SDIRK2())
-    if model.touches:
-        return VBD(1.0, 20, integrator=SDIRK2())
     relaxation = 1.5 if _may_over_relax(trials) else 1.0
     return VBD(1.0, 8, integrator=SDIRK2(), relaxation=relaxation, subspace="coarse")
 
@@ -530,9 +527,8 @@ def start_of(trials: TrialRuns) -> VBD:
 def candidates_of(trials: TrialRuns) -> list[VBD]:
     """Solvers that might be faster than the refinement's, the likeliest first."""
     model, sdirk, bdf, euler = trials.model, SDIRK2(), BDF2(), ImplicitEuler()
-    touches, corrects = model.touches, takes_corrections(model, PLAIN)
-    free = not touches and corrects and _may_over_relax(trials)
-    over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
+    corrects = takes_corrections(model, PLAIN)
+    over, over_coarse = (1.6, 1.5) if corrects and _may_over_relax(trials) else (1.0, 1.0)
 
     def plain(scheme: Integrator, *sweeps: int) -> list[VBD]:
         return [VBD(1.0, k, integrator=scheme, relaxation=over) for k in sweeps]
@@ -541,7 +537,7 @@ def candidates_of(trials: TrialRuns) -> list[VBD]:
         return [VBD(1.0, k, integrator=scheme, relaxation=over_coarse, subspace="coarse") for k in sweeps]
 
     out = []
-    if corrects and not touches:
+    if corrects:
         out += [*coarse(sdirk, 2), *coarse(euler, 2), *coarse(bdf, 2), *coarse(sdirk, 5)]
     out += [*plain(sdirk, 10), *plain(euler, 5), *plain(bdf, 5), *plain(sdirk, 5, 20), *plain(bdf, 10, 20),
             *plain(euler, 10, 20)]  # fmt: skip
@@ -549,7 +545,10 @@ def candidates_of(trials: TrialRuns) -> list[VBD]:
 
 
 def _may_over_relax(trials: TrialRuns) -> bool:
-    """Whether no tet comes near incompressible, at any of some times where moduli change."""
+    """Whether no pairs or friction act, and no tet comes near incompressible, at any of some times where moduli
+    change."""
+    if trials.model.touches:
+        return False
     if trials.model.mesh.num_tets == 0:
         return True
     changing = any(of_time(trials.given.get(name)) for name in MODULI)

@@ -41,9 +41,9 @@ def contact_of_step(
     """Contact of a step that has begun; where: collider points at its start and at its end, None without contact."""
     if where is None:
         return None
-    before, colliders = where
+    (before, colliders), numbers = where, prepared.settings.numbers
     return StepContact(model, begun.data, prepared.parameters, colliders, before, begun.x_prev, begun.origin,
-                       prepared.settings.numbers.time_step)  # fmt: skip
+                       numbers.time_step, numbers.friction_eps)  # fmt: skip
 
 
 def potential_of_step(

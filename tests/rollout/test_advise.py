@@ -11,6 +11,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import mesh
+from diffvbd.rollout.refine import is_balanced
 from diffvbd.rollout.tune import SWINGS, TrialRuns, unseen
 from diffvbd.testing.tolerances import tolerance
 
@@ -126,6 +127,18 @@ def test_bad_input(given, error, text) -> None:
     x = model.rest_points
     with pytest.raises(error, match=text):
         dv.advise(model, x, torch.zeros_like(x), **{"duration": 0.1, **material} | given)
+
+
+@pytest.mark.parametrize("integrator", [dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2()], ids=str)
+def test_converged_steps_with_friction_are_known_to_balance(integrator: Any) -> None:
+    """The part of a step that SDIRK2 and BDF2 solve smooths friction over what the whole step does."""
+    body = mesh.box(2, 0.1, split="kuhn").translate((0, 1e-3, 0))
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e4, dhat=2e-3), dv.Friction(0.4))
+    model = dv.Model(body, energies=energies)
+    x = model.rest_points
+    runs = TrialRuns(model, x, torch.zeros_like(x), 0.01, {"mu": 1e5, "lam": 2e5})
+    assert not runs.run(dv.VBD(1.0, 100, integrator=integrator), 100).failure
+    assert is_balanced(runs.left())
 
 
 @pytest.mark.slow
