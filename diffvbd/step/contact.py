@@ -643,7 +643,7 @@ def find(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tenso
         capacity: Pairs of all scenes that fit.
     """
     x, move, gravity_move = x.detach().contiguous(), move.detach().contiguous(), gravity_move.detach().contiguous()
-    return contact_find(x, origin, was.detach(), now.detach(), mass.detach(), move, gravity_move, floor,
+    return contact_find(x, origin, was.detach(), now.detach(), mass.detach().contiguous(), move, gravity_move, floor,
                         surface.searched, surface.of_bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat,
                         RADIUS_FACTOR, LEAST_RADIUS * barrier.dhat, capacity,
                         not torch.compiler.is_compiling())  # fmt: skip
