@@ -312,7 +312,7 @@ def risen(number: int, device: str) -> dict[str, float]:
 
         return mock.patch.object(owner, name, wrapped)
 
-    detect, start = step._detect, contact.start_substep
+    detect, start, corrected = step.detect, contact.start_substep, contact.corrected
 
     def detected(of: Any, *given: Any) -> Any:
         now["step"] = of
@@ -323,13 +323,17 @@ def risen(number: int, device: str) -> dict[str, float]:
         note("start", x, end.x)
         return end
 
+    def moved(of: Any, x: Tensor, *given: Any) -> Any:
+        end = corrected(of, x, *given)
+        note(PARTS[4] if len(given) > 3 else PARTS[1], x, end.x)  # so many may follow sweeps
+        return end
+
     with ExitStack() as patches, torch.no_grad():
-        for patch in (mock.patch.object(step, "_detect", detected),
+        for patch in (mock.patch.object(step, "detect", detected),
                       mock.patch.object(contact, "start_substep", started),
-                      watched(contact, "corrected", PARTS[1], lambda end: end.x),
+                      mock.patch.object(contact, "corrected", moved),
                       watched(step, "_sweep", PARTS[2], lambda end: end[0]),
-                      watched(contact.Corrections, "correct", PARTS[3], lambda end: end[0]),
-                      watched(contact, "corrected_after", PARTS[4], lambda end: end.x)):  # fmt: skip
+                      watched(contact.Corrections, "correct", PARTS[3], lambda end: end[0])):  # fmt: skip
             patches.enter_context(patch)
         for _ in range(4):
             now |= {"size": 0.0, "y": x + h * v + h * h * torch.tensor([0.0, -GRAVITY, 0.0]).to(x)}

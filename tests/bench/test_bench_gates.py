@@ -62,11 +62,12 @@ def raising(device: str) -> None:
     raise RuntimeError("not today")
 
 
-def test_a_gate_is_not_met_by_an_error() -> None:
+def test_a_gate_is_not_met_by_an_error_and_parts_of_a_step_are_seen() -> None:
     rows, _ = contact_gates.measured((0, raising, {}), "cpu")
     assert isinstance(rows, list)
     (row,) = rows
     assert not row["met"] and "not today" in row["note"]
+    assert set(contact_gates.contact_scenes.risen(3, "cpu")) == set(contact_gates.contact_scenes.PARTS)
     found = contact_gates.over([3], raising, "cpu")
     assert found["ends"] == {} and "scene 3" in found["raised"][0]
     for rows in (contact_gates.contact_scenes.flight_rows({}, found["raised"]),
