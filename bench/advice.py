@@ -24,6 +24,7 @@ from bench import common
 from bench.measure import Card
 from bench.tables import Table, count, most
 from diffvbd import mesh
+from diffvbd.rollout.tune import STILL
 
 SEED = 20_261_125  # of no scene that the search was tuned on
 DHAT = 2e-3  # [m]
@@ -106,14 +107,15 @@ class Runs:
         return x.detach(), torch.autograd.grad(way, leaves) if leaves else ()
 
     def motion(self, x: Tensor) -> float:
-        """Root mean square way from the start, over vertices and frames [m]."""
-        return float((x[1:] - x[:1]).square().sum(-1).mean().sqrt())
+        """Root mean square way from the start, over vertices and frames [m], at least what `advise` calls still."""
+        size = float((x[0].amax(0) - x[0].amin(0)).norm())
+        return max(float((x[1:] - x[:1]).square().sum(-1).mean().sqrt()), STILL * size)
 
     def apart(self, a: Run, b: Run) -> tuple[float, float]:
         """Root mean square distance over the motion of the second, and the relative one of the worst gradient."""
         if a.x is None or b.x is None:
             return math.inf, math.inf
-        off = float((a.x[1:].to(b.x) - b.x[1:]).square().sum(-1).mean().sqrt()) / max(self.motion(b.x), 1e-300)
+        off = float((a.x[1:].to(b.x) - b.x[1:]).square().sum(-1).mean().sqrt()) / self.motion(b.x)
         gradients = [float((u.to(w) - w).norm() / w.norm().clamp(min=1e-300))
                      for u, w in zip(a.gradient, b.gradient, strict=False)]  # fmt: skip
         return off, max(gradients, default=0.0)

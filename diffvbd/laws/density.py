@@ -175,6 +175,12 @@ class Density:
     def curvatures(self) -> Callable[[Sequence[Tensor], Sequence[Tensor]], list[Tensor]]:
         return self.function("curvatures")
 
+    def fibre_modulus(self, parameters: Sequence[Tensor]) -> Tensor:
+        """Stiffness along the fibre at F = I that I4 adds [Pa], 4 d2psi/dI4^2, where it is positive."""
+        one = torch.ones_like(parameters[0])
+        bend = self.curvatures([3 * one, 3 * one, one, one], parameters)[PAIRS.index((3, 3))]
+        return 4 * bend.clamp(min=0)
+
     @cached_property
     def at_rest(self) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
         """mu, lam and stress [Pa] of the law at F = I as a function of its parameters, without fibres: the second

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .energies import StableNeoHookean
+from .energies import Law, StableNeoHookean
 from .rigid import admits, axial, cross_matrix, turning_stiffness
 from .scene import Scene, dot, shape_functions
 
@@ -80,7 +80,12 @@ class Coarse:
             of_mu, of_lam = ((scene.volume * modulus)[..., members] for modulus in (scene.mu, lam))
             k = torch.einsum("...t,...fjt,...kit->...fikj", of_mu, slopes, slopes)
             k = k + torch.einsum("...t,...fct,...kct,ij->...fikj", of_mu, slopes, slopes, one)
-            out.append(k + torch.einsum("...t,...fit,...kjt->...fikj", of_lam, slopes, slopes))
+            k = k + torch.einsum("...t,...fit,...kjt->...fikj", of_lam, slopes, slopes)
+            for law in (e for e in self.energies if isinstance(e, Law) and e.density.fibre):
+                along, size = law.fibres[..., members], (scene.volume * law.fibre_modulus())[..., members]
+                rate = (slopes * along[..., None, :, :]).sum(-2)
+                k = k + torch.einsum("...t,...ft,...it,...kt,...jt->...fikj", size, rate, along, rate, along)
+            out.append(k)
         return torch.stack(out, -5)
 
     def rotations(self, x_prev: Tensor) -> Tensor:

@@ -171,6 +171,17 @@ class Law(StableNeoHookean):
         self.sizes = invariants, values, scale  # of the latest call
         return scale * self.density.value(invariants, values)[0]
 
+    def fibre_modulus(self) -> Tensor:
+        """4 d2psi/dI4^2 at F = I [Pa], where it is positive."""
+        differentiated = torch.is_grad_enabled()
+        with torch.enable_grad():
+            one = torch.ones_like(self.values[0])
+            fourth = one.clone().requires_grad_()
+            total = self.density.value([3 * one, 3 * one, one, fourth], self.values)[0].sum()
+            for _ in range(2):
+                (total,) = torch.autograd.grad(total.sum(), fourth, create_graph=True)
+        return 4 * (total if differentiated else total.detach()).clamp(min=0)
+
     def _of_pairs(self, k: int, x: Tensor, own: Tensor) -> Tensor:
         """The same of the pairs of color k, whose vertices are at own [..., 3, P]."""
         color = self.scene.layout.colors[k]

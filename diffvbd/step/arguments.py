@@ -39,7 +39,7 @@ from ..model.model import Model
 from ..model.patches import Averaged, uniform
 from ..model.solver import SDIRK2, Integrator
 from ..model.system import System
-from .coarse import CoarseParts, coarse_parts
+from .coarse import CoarseParts, coarse_parts, fibre_stiffness
 from .law import law_inputs, law_rest
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
@@ -280,7 +280,10 @@ def prepare(
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
-        coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
+        fibres = None
+        if model.law is not None and law is not None and law.a0 is not None:
+            fibres = fibre_stiffness(model, model.law.density.fibre_modulus(law.values), law.a0, corners)
+        coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners, fibres)
     damping = None
     if viscosity is not None or bulk is not None or drag is not None:
         damping = _damping(model, like, lead, material, corners, (materials[0], materials[1]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from ..model.coarse import CoarsePlan
 from ..model.material import shape_gradients
 from ..model.system import System
 from ..ops import distinct
+from ..ops.sums import one_thread
 
 # --- parts of the matrices of coarse corrections ----------------------------------------------------------------------
 
@@ -75,12 +77,13 @@ class CoarseParts(NamedTuple):
     stiffness: Tensor  # [1 | B, groups, 3, 3, width, width], at rest [N/m]
     mass: Tensor  # [1 | B, cells] [kg]
     rest: Tensor  # [1 | B, blocks, 7, lanes], see CoarsePlan
+    fibres: Tensor | None  # their share of the stiffness
 
 
 def coarse_parts(model: System, mu: Tensor, lam: Tensor, mass: Tensor | None, rest: Tensor | None,
-                 corners: Tensor | None) -> CoarseParts:  # fmt: skip
+                 corners: Tensor | None, fibres: Tensor | None = None) -> CoarseParts:  # fmt: skip
     """mu, lam [1 | B, 1 | T]; mass [B, V], rest [B, T, 7] and the tets' corners at rest [B, T, 4, 3] where a step is
-    given them, else None."""
+    given them, else None; fibres: of fibre_stiffness(), of a law that has some."""
     with torch.autocast(mu.device.type, enabled=False):  # which would take the products in half precision
         plan = model._coarse_plan
         least = torch.maximum(lam, mu * (-2 / 3))
@@ -92,8 +95,55 @@ def coarse_parts(model: System, mu: Tensor, lam: Tensor, mass: Tensor | None, re
             own = corners is None
             shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)
             stiffness = coarse_stiffness(plan, mu, least, *shapes)
+        stiffness = stiffness if fibres is None else stiffness + fibres
         lanes = plan.rest if rest is None else in_lanes(model, rest)
-        return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes)
+        return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes, fibres)
+
+
+class _FibreIndex(NamedTuple):
+    """Constants of a Model with a law that has fibres; n tets with a vertex to move."""
+
+    tet: Tensor  # int64 [n]
+    weights: Tensor  # [n, 4, width] of the functions of the tet's group at its corners
+    members: Tensor  # int64 [groups, most], which of the n tets are of each group; n: none
+
+
+def _fibre_index(model: System) -> _FibreIndex:
+    g, tets = model.coarse_geometry, model._topology[0].cpu().numpy()
+    tet = np.flatnonzero(g.tet_group >= 0)
+    group = g.tet_group[tet]
+    key = g.vertex * g.functions + g.function
+    order, function = np.argsort(key), g.group_functions[group][:, None]
+    wanted = tets[tet][:, :, None] * g.functions + function
+    at = order[np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)]
+    weights = np.where((key[at] == wanted) & (function >= 0), g.weight[at], 0.0)
+    by_group, counts = np.argsort(group, kind="stable"), np.bincount(group, minlength=len(g.group_body))
+    members = np.full((len(counts), counts.max(initial=0)), len(tet))
+    members[np.arange(members.shape[1]) < counts[:, None]] = by_group
+    placed = [torch.from_numpy(a).to(model.device) for a in (tet, weights, members)]
+    return _FibreIndex(placed[0], placed[1].to(model._mass), placed[2])
+
+
+def fibre_stiffness(model: System, modulus: Tensor, a0: Tensor, corners: Tensor | None) -> Tensor:
+    """The share of fibres in the stiffness of CoarseParts: of V k (a0 . grad N)^2 a0 a0' in each tet at rest.
+
+    modulus: k [Pa], [1 | B, 1 | T].  a0: unit directions [1 | B, 1 | T, 3].  corners: as of coarse_parts().
+    """
+    index: _FibreIndex = model.derived("coarse_fibres", lambda: _fibre_index(model))
+    own = corners is None
+    gradients, volume = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)
+    scenes, tets = max(map(len, (modulus, a0, gradients))), model.num_tets
+    a0 = ops.broadcast(a0, (scenes, tets, 3))[:, index.tet]
+    size = ops.broadcast(modulus * volume, (scenes, tets))[:, index.tet]
+    along = (ops.broadcast(gradients, (scenes, tets, 4, 3))[:, index.tet] * a0[:, :, None]).sum(-1)
+    slopes = (along[..., None] * index.weights).sum(2)  # of each function along the fibre
+    right = (a0[..., None] * slopes[:, :, None]).flatten(2)
+    # a row of zeros stands for no tet
+    left, right = (torch.cat([t, t.new_zeros(scenes, 1, t.shape[-1])], 1)[:, index.members]
+                   for t in (size[..., None] * right, right))  # fmt: skip
+    with one_thread(left):
+        out = left.mT @ right
+    return out.unflatten(-1, (3, -1)).unflatten(-3, (3, -1)).transpose(-3, -2)
 
 
 def in_lanes(model: System, rest: Tensor) -> Tensor:

@@ -141,6 +141,7 @@ def _viscous(model: System, prepared: Prepared, damping: Damping, products: Tens
         out |= {"mu": r * both, "lam": r * (lam + volume)}
     coarse = prepared.coarse
     if coarse is not None:  # whose matrices are those of the shape at rest
-        parts = coarse_parts(model, mu + all_shear, lam + all_volume, None, metric, damping.corners)
+        parts = coarse_parts(model, mu + all_shear, lam + all_volume, None, metric, damping.corners,
+                             coarse.fibres)  # fmt: skip
         coarse = replaced(parts, mass=coarse.mass)
     return replaced(prepared, rest=metric, coarse=coarse, **out)

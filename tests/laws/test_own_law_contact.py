@@ -1,6 +1,7 @@
 """Claim: a law of one's own has contact as the built-in one has: pairs, friction, floors, rigid and coarse corrections,
 with the exact gradient of the executed step."""
 
+import math
 from typing import Any
 
 import pytest
@@ -73,3 +74,25 @@ def test_central_differences(subspace: Any) -> None:
             ends = [loss(**{**leaves, name: value + sign * 1e-6 * way}) for sign in (1, -1)]
         slope, found = (ends[0] - ends[1]) / 2e-6, (gradients[name] * way).sum()
         assert found.abs() > 0 and relative_error(found, slope) < 1e-5, name
+
+
+def test_a_block_pressed_between_planes_has_its_closed_form_load() -> None:
+    """Without friction it thickens freely: its side stress is zero, and the barriers bear what the stretch makes."""
+    size, mu, lam, kappa, dhat = 0.2, 2e4, 4e4, 1e7, 5e-4
+    planes = [dv.colliders.Plane((0, 0, 0)), dv.colliders.Plane((0, 0.9 * size, 0), (0, -1, 0))]
+    mesh, weak = dv.mesh.box(4, size), dv.Anchor(0.05)  # against sliding
+    energies = (dv.law(LOG, mu=mu, lam=lam), dv.PairBarrier(kappa, dhat=dhat, self_contact=False), weak)
+    model = dv.Model(mesh, energies=energies, colliders=planes)
+    rest = model.rest_points
+    squeezed = rest * rest.new_tensor([1.0, 0.89, 1.0]) + rest.new_tensor([0.0, 0.005 * size, 0.0])
+    y = dv.equilibrium(model, squeezed, dv.VBD(1.0, 1), gravity=(0, 0, 0)).x[:, 1]
+    top, bottom = rest[:, 1] > size - 1e-9, rest[:, 1] < 1e-9
+    stretch = float(y[top].mean() - y[bottom].mean()) / size
+    wide, gap = 1.0, 0.9 * size - y[top]
+    for _ in range(100):  # mu (w^2 - 1) + lam log(stretch w^2) = 0
+        volume = stretch * wide**2
+        wide -= (mu * (wide**2 - 1) + lam * math.log(volume)) / (2 * mu * wide + 2 * lam / wide)
+    pressure = -(mu * (stretch - 1 / stretch) + lam * math.log(stretch * wide**2) / stretch)
+    borne = kappa * (2 * (gap - dhat) * torch.log(gap / dhat) + (gap - dhat) ** 2 / gap)
+    assert 0.88 < stretch < 0.91 and float(gap.min()) > 0
+    assert float(borne[gap < dhat].sum()) == pytest.approx(size**2 * pressure, rel=0.01)
