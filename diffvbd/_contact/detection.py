@@ -32,7 +32,7 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (trust_radius, deformation_radius)
     )
     return ops_contact.contact_detect(
-        x, origin, was, now, trust_radius, deformation_radius, *s.searched, s.bodies, barrier.self_contact,
+        x, origin, was, now, trust_radius, deformation_radius, s.searched, s.bodies, barrier.self_contact,
         barrier.between_bodies, barrier.dhat, capacity, not torch.compiler.is_compiling(),
     )  # fmt: skip
 

@@ -38,10 +38,8 @@ class Detection(NamedTuple):
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, trust_radius: Tensor,
-                   deformation_radius: Tensor, rest: Tensor, radius: Tensor, triangles: Tensor, edges: Tensor,
-                   points: Tensor, planes: Tensor, body: Tensor, pinned: Tensor, face_counts: Tensor,
-                   point_weights: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float,
-                   capacity: int, trim: bool = False) -> Detection:  # fmt: skip
+                   deformation_radius: Tensor, surface: Sequence[Tensor], mesh_bodies: int, self_contact: bool,
+                   between_bodies: bool, dhat: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Nearest pair of every corner point, and the pairs that may come within the barrier's reach before the next call.
 
     ``trust_radius`` bounds the displacement of a vertex relative to its island. ``deformation_radius`` bounds it
@@ -59,6 +57,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are taken at the
             latter, or now where a plane would pass the point. What is near a plane now is listed, too.
         trust_radius, deformation_radius: [B, mesh_bodies + 1] [m] of each body, and the largest.
+        surface: The ten tensors that follow, from rest to point_weights.
         rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique. Edges and vertices of surfaces
             may be faces, too, with points of other bodies: (a, b, b) and (a, a, a).
@@ -75,9 +74,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, trust_radius, deformation_radius, rest, radius, triangles, edges,
-            points, planes, body, pinned, face_counts, point_weights, mesh_bodies, self_contact, between_bodies, dhat,
-            capacity, trim,
+            x, origin, collider, collider_next, trust_radius, deformation_radius, *surface, mesh_bodies, self_contact,
+            between_bodies, dhat, capacity, trim,
         )
     )  # fmt: skip
 
@@ -121,7 +119,7 @@ def contact_find(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Ten
         x, origin, collider, collider_next: As for :func:`contact_detect`.  mass: [1 | B, V] [kg].
         move, gravity_move: Wanted displacements [B, V, 3] [m], and what corrections and sweeps add to them, or empty.
         floor: Data of the FloorBarrier [1 | B, 7 planes], or empty.
-        surface: rest to point_weights of :func:`contact_detect`.
+        surface: As for :func:`contact_detect`.
         bodies: Whether a vertex of a body is pinned [NB], vertices by body [V] and the first of each body [NB + 1],
             bounds of its trust-region radius and of its deformation radius [NB] [m].
         self_contact, between_bodies, dhat, capacity, trim: As for :func:`contact_detect`; a body has a deformation

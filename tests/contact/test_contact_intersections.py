@@ -22,8 +22,9 @@ DTYPES = (torch.float64, torch.float32)
 
 def arguments(s: Scene, device: str, dtype: torch.dtype, capacity: int) -> tuple:
     given = s.arguments(device, dtype, capacity)
+    surface = given[6]
     triangles = torch.as_tensor(triangles_of(s), device=device)
-    return (*given[:3], *given[6:8], triangles, *given[9:14], *given[16:19], capacity)
+    return (*given[:3], *surface[:2], triangles, *surface[3:8], *given[7:10], capacity)
 
 
 def triangles_of(s: Scene) -> np.ndarray:

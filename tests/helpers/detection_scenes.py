@@ -148,10 +148,10 @@ class Scene:
         trust_radius = np.tile([*self.trust_radii, self.trust_radius], (len(x), 1))
         return (
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(trust_radius),
-            real(self.own_fraction * trust_radius), real(self.rest), real(self.radius), index(self.triangles),
-            index(self.edges), index(self.points), index(self.planes), index(self.body), index(self.pinned),
-            index(self.face_counts), real(self.weights), self.mesh_bodies, self.self_contact, self.between_bodies,
-            self.dhat, capacity,
+            real(self.own_fraction * trust_radius),
+            (real(self.rest), real(self.radius), index(self.triangles), index(self.edges), index(self.points),
+             index(self.planes), index(self.body), index(self.pinned), index(self.face_counts), real(self.weights)),
+            self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
         )  # fmt: skip
 
 
