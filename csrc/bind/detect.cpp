@@ -114,7 +114,7 @@ DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collid
 DIFFVBD_OPERATOR(Out<15>, contact_find, In x, In origin, In collider, In collider_next, In mass, In move,
                  In gravity_move, In floor, In rest, In radius, In triangles, In edges, In points, In planes, In body,
                  In pinned, In face_counts, In point_weights, In pinned_bodies, In body_order, In body_ptr, In most,
-                 In most_own, bool self_contact, bool between_bodies, double dhat, double fraction, double least,
+                 In most_own, bool self_contact, bool between_bodies, double dhat, double factor, double least,
                  int64_t capacity, bool trim) {
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
@@ -145,7 +145,7 @@ DIFFVBD_OPERATOR(Out<15>, contact_find, In x, In origin, In collider, In collide
     of.half = static_cast<T>(dhat / 2), of.floor = floor_of(read, floor), of.floor_planes = planes_of(floor);
     in.displacements = data<T>(longest), in.sums = data<T>(sums);
     in.most = read.like("most", most, bodies), in.most_own = read.like("most_own", most_own, bodies);
-    in.fraction = static_cast<T>(fraction), in.least = static_cast<T>(least);
+    in.factor = static_cast<T>(factor), in.least = static_cast<T>(least);
     in.dhat = static_cast<T>(dhat), in.self_contact = self_contact;
     const Tensor island = device.empty({b, bodies}, ScalarType::Int), u = device.empty({b, bodies, 3}),
                  trust_radius = device.empty({b, bodies + 1}), deformation_radius = device.empty({b, bodies + 1}),

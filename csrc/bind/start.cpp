@@ -66,7 +66,7 @@ DIFFVBD_OPERATOR(Out<8>, contact_start, In x, In move, In u, In rigid, In trust_
   });
 }
 
-// --- near pairs ---------------------------------------------------------------------------------------------------
+// --- near pairs ------------------------------------------------------------------------------------------------------
 
 // What is left of the trust-region radii about x [scenes, vertices], and the pairs that can matter within them
 // (contact/ pair_list.h): their rows in the list, and their list. own_center and own_radius may be empty. exact: of

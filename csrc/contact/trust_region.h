@@ -20,7 +20,7 @@ struct RadiusInputs {
   IslandInputs<T> islands;        // without the radius
   const T *displacements, *sums;  // of find_motion
   const T *most, *most_own;       // [bodies] [m] bounds of both radii: see ContactSurface
-  T fraction, least, dhat;        // of a displacement, and added to it [m]
+  T factor, least, dhat;          // of a displacement, and added to it [m]
   bool self_contact;
 
   DIFFVBD_FN T displacement(DisplacementKind which, int64_t place) const {
@@ -55,7 +55,7 @@ DIFFVBD_FN T trust_radius_of(const RadiusInputs<T>& in, const RadiusWork<T>& wor
                              T relative) {
   const int64_t place = scene * in.motion.bodies + body;
   const T gravity = T(2) * in.displacement(kGravity, place);  // sweeps may take it back
-  const T wished = in.fraction * relative + gravity + in.least;
+  const T wished = in.factor * relative + gravity + in.least;
   return larger(smaller(wished, in.most[body]), in.displacement(kDriven, place)) + work.pushed[scene];
 }
 template <class T>
@@ -110,7 +110,7 @@ DIFFVBD_FN void radius_beside_island(const RadiusInputs<T>& in, const MovingBody
   trust_radius = larger(trust_radius, trust_radius_of(in, work, b.scene, b.body, relative));
   T deformation_radius = T(0);
   if (in.self_contact) {
-    deformation_radius = (in.fraction + T(1)) * (in.displacement(kApart, place) + stretched) +
+    deformation_radius = (in.factor + T(1)) * (in.displacement(kApart, place) + stretched) +
                          T(2) * in.displacement(kGravity, place) + in.least;
     deformation_radius = larger(smaller(deformation_radius, in.most_own[b.body]), in.displacement(kDriven, place));
   }

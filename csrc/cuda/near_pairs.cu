@@ -26,8 +26,8 @@ __global__ void __launch_bounds__(kThreads) flag_pairs(int64_t count, const T* g
   const int64_t i = own_item(kThreads);
   if (i <= count) kept[i] = i < count && is_near(gaps[i]) ? 1 : 0;
 }
-// Calls f(number(entry), index in the compact list) for the entries of a corner point whose pairs stay, a warp for each
-// corner. Returns how many there are.
+// Calls f(number(entry), index in the list of near pairs) for the entries of a corner point whose pairs stay, a warp
+// for each corner. Returns how many there are.
 template <class T, class Number, class F>
 __device__ int32_t each_kept(const NearInputs<T>& in, const T* gaps, int64_t corner, const Number& number, const F& f) {
   constexpr int kAhead = 8;  // entries of a thread that are read at once: a corner of a collider may have thousands
@@ -130,8 +130,8 @@ __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
 // The first blocks copy pairs; the others count the entries that corner points keep.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    compact_few_pairs(const __grid_constant__ NearInputs<T> in, const T* gaps, unsigned blocks, int32_t* kept,
-                      int32_t* counts, const __grid_constant__ NearList<T> out) {
+    copy_few_pairs(const __grid_constant__ NearInputs<T> in, const T* gaps, unsigned blocks, int32_t* kept,
+                   int32_t* counts, const __grid_constant__ NearList<T> out) {
   if (blockIdx.x >= blocks) {
     count_entries_of(in, gaps, (static_cast<int64_t>(blockIdx.x - blocks) * kThreads + threadIdx.x) / kWarp, counts);
     return;
@@ -153,8 +153,8 @@ __global__ void __launch_bounds__(kThreads)
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    compact_few_entries(const __grid_constant__ NearInputs<T> in, const T* gaps, const int32_t* kept,
-                        const int32_t* counts, const __grid_constant__ NearList<T> out) {
+    copy_few_entries(const __grid_constant__ NearInputs<T> in, const T* gaps, const int32_t* kept,
+                     const int32_t* counts, const __grid_constant__ NearList<T> out) {
   const int64_t i = own_item(kThreads) / kWarp, first = static_cast<int64_t>(blockIdx.x) * (kThreads / kWarp);
   int before = sums_before(first, first, [&](int64_t corner) { return counts[corner]; }).all;
   if (i > in.corners) return;
@@ -212,8 +212,8 @@ cudaError_t find_near(const NearInputs<T>& in, int64_t scenes, T* radius, const 
   }
   if (are_few(in)) {
     const unsigned of_pairs = blocks_for(in.count, kThreads);
-    compact_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, gaps, of_pairs, kept, work.counts, out);
-    compact_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, gaps, kept, work.counts, out);
+    copy_few_pairs<T><<<of_pairs + of_corners, kThreads, 0, stream>>>(in, gaps, of_pairs, kept, work.counts, out);
+    copy_few_entries<T><<<of_corners, kThreads, 0, stream>>>(in, gaps, kept, work.counts, out);
     return cudaGetLastError();
   }
   size_t bytes = work.scanned;

@@ -196,7 +196,7 @@ DIFFVBD_FN NoFrame<R> plane_step(const NoFrame<R>& axes, const Vec3<R>&) {
 }
 
 // Adjoint of phi = p . (g + H d_raw) for one record of an energy's data, by one Dual evaluation for each input. The
-// records of an energy only add up. CompactList out of line: it is shared by all variants and seldom wanted.
+// records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted.
 template <class E, class R, class Planes = NoFrame<R>>
 struct DualAdjoint {
   const VertexState<R>& s;

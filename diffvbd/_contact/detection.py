@@ -1,4 +1,4 @@
-"""Detection for a step: near pairs, intersections and support vertices."""
+"""Near pairs at a state, and intersections."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from ..ops import contact as ops_contact
 
 
 def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
-           capacity: int, trust_radius: Tensor | None = None, deformation_radius: Tensor | None = None
-           ) -> tuple[Tensor, ...]:  # fmt: skip
+           capacity: int, trust_radius: Tensor, deformation_radius: Tensor) -> tuple[Tensor, ...]:  # fmt: skip
     """Pairs that may come closer than dhat before the next detection, and the nearest pair of each corner point.
 
     Args:
         x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  was, now: Collider points [B, Vc, 3] [m].
         capacity: Pairs of all scenes that fit.
         trust_radius, deformation_radius: Of each body, relative to its island and to its rigid motion, and the largest
-            [B, bodies + 1] [m]; None: zero.
+            [B, bodies + 1] [m].
 
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
         pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, measure,
@@ -28,9 +27,6 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         (pairs needed, pairs without a gap, key of one); smallest gap [B], at most 0 where pairs have none.
     """
     s = surface
-    trust_radius, deformation_radius = (
-        x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (trust_radius, deformation_radius)
-    )
     return ops_contact.contact_detect(
         x, origin, was, now, trust_radius, deformation_radius, s.searched, s.bodies, barrier.self_contact,
         barrier.between_bodies, barrier.dhat, capacity, not torch.compiler.is_compiling(),

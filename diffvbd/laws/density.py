@@ -175,11 +175,18 @@ class Density:
     def curvatures(self) -> Callable[[Sequence[Tensor], Sequence[Tensor]], list[Tensor]]:
         return self.function("curvatures")
 
-    def fibre_modulus(self, parameters: Sequence[Tensor]) -> Tensor:
-        """Stiffness along the fibre at F = I that I4 adds [Pa], 4 d2psi/dI4^2, where it is positive."""
-        one = torch.ones_like(parameters[0])
-        bend = self.curvatures([3 * one, 3 * one, one, one], parameters)[PAIRS.index((3, 3))]
-        return 4 * bend.clamp(min=0)
+    @cached_property
+    def _fibre_bend(self) -> Callable[[Any, Sequence[Tensor]], list[Any]]:
+        return self._function([self.derived["curvatures"][PAIRS.index((3, 3))]])
+
+    def fibre_modulus(self, parameters: Sequence[Tensor], one: Tensor) -> Tensor:
+        """Stiffness along the fibre at F = I that I4 adds [Pa], 4 d2psi/dI4^2, where it is positive.
+
+        one: Ones of any shape with which that of the result is broadcast.
+        """
+        at_rest = SimpleNamespace(i1=3 * one, i2=3 * one, j=one, i4=one, below=0 * one)
+        (bend,) = self._fibre_bend(at_rest, parameters)
+        return 4 * (one * bend).clamp(min=0)  # a number where nothing varies: no copy to the device
 
     @cached_property
     def at_rest(self) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:

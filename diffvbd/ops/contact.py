@@ -230,7 +230,7 @@ def contact_near(x: Tensor, origin: Tensor, collider: Tensor, center: Tensor, ow
 
 def within(radius: float, x: Tensor, origin: Tensor, collider: Tensor, pinned: Tensor,
            listed: Sequence[Tensor]) -> Near:  # fmt: skip
-    """The same within one radius [m] of all vertices about x [B, V, 3]."""
+    """:func:`contact_near` within one radius [m] of all vertices about x [B, V, 3]."""
     x, none = x.detach(), x.new_empty((0,))
     radii = torch.full_like(x[..., 0], radius)
     return contact_near(x, origin, collider.detach(), x, none, radii, none, pinned, listed)

@@ -175,11 +175,12 @@ class Law(StableNeoHookean):
         """4 d2psi/dI4^2 at F = I [Pa], where it is positive."""
         differentiated = torch.is_grad_enabled()
         with torch.enable_grad():
-            one = torch.ones_like(self.values[0])
+            one = torch.ones_like(self.scene.volume)
             fourth = one.clone().requires_grad_()
-            total = self.density.value([3 * one, 3 * one, one, fourth], self.values)[0].sum()
-            for _ in range(2):
-                (total,) = torch.autograd.grad(total.sum(), fourth, create_graph=True)
+            total = self.density.value([3 * one, 3 * one, one, fourth], self.values)[0]
+            for _ in range(2):  # psi may be linear in I4
+                total = total.sum() + 0 * fourth.square().sum()
+                (total,) = torch.autograd.grad(total, fourth, create_graph=True)
         return 4 * (total if differentiated else total.detach()).clamp(min=0)
 
     def _of_pairs(self, k: int, x: Tensor, own: Tensor) -> Tensor:

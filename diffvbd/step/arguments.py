@@ -280,9 +280,7 @@ def prepare(
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
-        fibres = None
-        if model.law is not None and law is not None and law.a0 is not None:
-            fibres = fibre_stiffness(model, model.law.density.fibre_modulus(law.values), law.a0, corners)
+        fibres = None if law is None else fibre_stiffness(model, law, corners)
         coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners, fibres)
     damping = None
     if viscosity is not None or bulk is not None or drag is not None:

@@ -21,6 +21,7 @@ from ..model.material import shape_gradients
 from ..model.system import System
 from ..ops import distinct
 from ..ops.sums import one_thread
+from .law import LawInputs
 
 # --- parts of the matrices of coarse corrections ----------------------------------------------------------------------
 
@@ -124,11 +125,17 @@ def _fibre_index(model: System) -> _FibreIndex:
     return _FibreIndex(placed[0], placed[1].to(model._mass), placed[2])
 
 
-def fibre_stiffness(model: System, modulus: Tensor, a0: Tensor, corners: Tensor | None) -> Tensor:
-    """The share of fibres in the stiffness of CoarseParts: of V k (a0 . grad N)^2 a0 a0' in each tet at rest.
+def fibre_stiffness(model: System, law: LawInputs, corners: Tensor | None) -> Tensor | None:
+    """The share of a law's fibres in the stiffness of CoarseParts: of V k (a0 . grad N)^2 a0 a0' in each tet at rest,
+    k of Density.fibre_modulus(). None without fibres. corners: as of coarse_parts()."""
+    if model.law is None or law.a0 is None:
+        return None
+    with torch.autocast(law.a0.device.type, enabled=False):
+        modulus = model.law.density.fibre_modulus(law.values, law.a0.new_ones(1, 1))
+        return _fibre_stiffness(model, modulus, law.a0, corners)
 
-    modulus: k [Pa], [1 | B, 1 | T].  a0: unit directions [1 | B, 1 | T, 3].  corners: as of coarse_parts().
-    """
+
+def _fibre_stiffness(model: System, modulus: Tensor, a0: Tensor, corners: Tensor | None) -> Tensor:
     index: _FibreIndex = model.derived("coarse_fibres", lambda: _fibre_index(model))
     own = corners is None
     gradients, volume = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)
@@ -141,9 +148,22 @@ def fibre_stiffness(model: System, modulus: Tensor, a0: Tensor, corners: Tensor 
     # a row of zeros stands for no tet
     left, right = (torch.cat([t, t.new_zeros(scenes, 1, t.shape[-1])], 1)[:, index.members]
                    for t in (size[..., None] * right, right))  # fmt: skip
-    with one_thread(left):
-        out = left.mT @ right
-    return out.unflatten(-1, (3, -1)).unflatten(-3, (3, -1)).transpose(-3, -2)
+    return _products(left, right).unflatten(-1, (3, -1)).unflatten(-3, (3, -1)).transpose(-3, -2)
+
+
+def _run_products(a: Tensor, b: Tensor) -> Tensor:
+    with one_thread(a):
+        return a.mT @ b
+
+
+def _products_reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]
+                      ) -> Sequence[Tensor]:  # fmt: skip
+    a, b = saved
+    with one_thread(a):
+        return b @ bars[0].mT, a @ bars[0]
+
+
+_products = ops.Differentiable(_run_products, _products_reverse, arguments=2, inputs=2, vmap=NO_VMAP, batched=True)
 
 
 def in_lanes(model: System, rest: Tensor) -> Tensor:

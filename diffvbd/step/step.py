@@ -61,8 +61,8 @@ def step(
             for surfaces that touch at the start, for prescribed motion that leaves bodies no way, and with BDF2, whose
             history lives in rollouts.
         RuntimeError: Where more pairs are near than the PairBarrier has capacity for.
-        NotImplementedError: For forward mode; with GlobalAdjoint inside torch.func transforms; in the backward for
-            second derivatives (which Unrolled has).
+        NotImplementedError: For forward mode; with GlobalAdjoint for contact, for rigid bodies and inside torch.func
+            transforms; in the backward for second derivatives (which Unrolled has).
 
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """

@@ -25,7 +25,7 @@ RUNS = [(1, 1), (1, 5), (4, 5)]
 QUICK = {("held_up", 1, 5), *((name, 1, 1) for name in SCENES if name != "held_up"), ("batched", 1, 5),
          ("thrown", 1, 5), *((name, *run) for name in ("obstacles", "on_held") for run in RUNS)}  # fmt: skip
 SLOW = [(1, 0), (1, 20), (4, 1)]
-LONG = [(4, 20), (20, 2)]  # in turn; `-m hours` runs both
+LONG = [(3, 20), (20, 2)]  # in turn; `-m hours` runs both
 SHORT = {"fast", "thrown", "held_up"}  # like the others after a few steps, each of several substeps
 # the fourth step of one folds so that rounding grows beyond its bar; in one sweep no pair of the other is damped
 OTHERS = {("folded", (4, 1)): (3, 1), ("held_up", (4, 1)): (4, 2)}

@@ -152,6 +152,21 @@ def test_moduli_at_rest() -> None:
     assert (mu.item(), lam.item()) == pytest.approx((shear, VALUES["K"] - 2 / 3 * shear), rel=1e-12)
 
 
+def test_stiffness_of_fibres() -> None:
+    """4 d2psi/dI4^2 at rest, in the shape of what varies: also where nothing does, and where psi is linear in I4."""
+
+    def real(*shape: int, value: float = 1.0) -> Tensor:
+        return torch.full(shape, value, dtype=torch.float64)
+
+    cases = {"k1/(2*k2)*(exp(k2*(I4 - 1)**2) - 1)": ([real(2, 5, value=3e4), real(1, 5, value=2.0)],
+                                                     real(2, 5, value=12e4)),
+             "5e3*(I4 - 1)**2": ([], real(1, 1, value=4e4)),
+             "k*(I4 - 1)": ([real()], real(1, 1, value=0.0))}  # fmt: skip
+    for text, (given, expected) in cases.items():
+        own = Density("3e4*(I1 - 3) - 6e4*log(J) + " + text).fibre_modulus(given, real(1, 1))
+        assert own.shape == expected.shape and torch.allclose(own, expected), text
+
+
 def test_kinds() -> None:
     """Which laws are quadratic in one vertex, read all edges, or have to be continued."""
     kinds = {text: (d.quadratic, d.edges, d.guarded) for text in (LOG, COROTATED, MOONEY_RIVLIN, STABLE, "c*(I2 - 3)")
