@@ -9,11 +9,12 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import functools
 import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -96,12 +97,19 @@ def refuse_forward_mode() -> None:
 
 
 def not_compiled(function: F) -> F:
-    """torch.compiler.disable, which loads the compiler: a second of every import, so it waits for the first call."""
+    """torch.compiler.disable for calls in compiled code. Others pass it by: it loads the compiler, which takes a
+    second."""
     try:
         from torch._compile import _disable_dynamo as disable
     except ImportError:
         disable = torch.compiler.disable
-    return disable(function)  # pyright: ignore[reportReturnType]
+    disabled = disable(function)
+
+    @functools.wraps(function)
+    def either(*args: Any, **options: Any) -> Any:
+        return disabled(*args, **options) if torch.compiler.is_compiling() else function(*args, **options)
+
+    return cast(F, either)
 
 
 def recorders(kind: str = "contact") -> tuple[list[Any], ...]:

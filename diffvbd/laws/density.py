@@ -9,8 +9,7 @@ import hashlib
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +22,16 @@ FUNCTIONS = ("log", "exp", "sqrt")
 ROOT = "root_of"
 LEAST_VOLUME = 0.1  # J below which psi is its Taylor polynomial of second order in J; twin of kLeastVolume in csrc
 PAIRS = [(i, k) for i in range(4) for k in range(i, 4)]
+
+
+class _Invariants(NamedTuple):
+    """What functions of the density read; ``below``: how far J is below its least."""
+
+    i1: Tensor
+    i2: Tensor
+    j: Tensor
+    i4: Tensor
+    below: Tensor
 
 
 class Density:
@@ -158,7 +167,7 @@ class Density:
             if self.guarded:
                 small = j < LEAST_VOLUME
                 below, at = torch.where(small, j - LEAST_VOLUME, 0.0), torch.where(small, LEAST_VOLUME, j)
-            v = SimpleNamespace(i1=i1, i2=i2, j=at, i4=i4, below=below)
+            v = _Invariants(i1, i2, at, i4, below)
             return [torch.as_tensor(r, dtype=j.dtype, device=j.device) for r in raw(v, parameters)]
 
         return evaluate
@@ -184,8 +193,7 @@ class Density:
 
         one: Ones of any shape with which that of the result is broadcast.
         """
-        at_rest = SimpleNamespace(i1=3 * one, i2=3 * one, j=one, i4=one, below=0 * one)
-        (bend,) = self._fibre_bend(at_rest, parameters)
+        (bend,) = self._fibre_bend(_Invariants(3 * one, 3 * one, one, one, 0 * one), parameters)
         return 4 * (one * bend).clamp(min=0)  # a number where nothing varies: no copy to the device
 
     @cached_property

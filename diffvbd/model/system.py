@@ -11,6 +11,7 @@ import torch
 from .. import ops
 from .._common.checks import check_kind, check_positive, fail
 from .._common.constants import CONTACT, ELASTIC, EXACT_BLOCK, FILTER_ETA, PAPER_BLOCK, SATURATION_EPS
+from .._common.context import not_compiled
 from .._contact.surface import ContactSurface
 from ..ops import regimes
 from .coarse import check_coupled, plan_of
@@ -71,6 +72,7 @@ class System(Model):
         if not self.energy_mask & ELASTIC:
             fail("subspace", "no coarse space without StableNeoHookean", repr(self.coarse))
 
+    @not_compiled
     def _arrange_coarse(self) -> None:
         """The coarse space, in float64, on the CPU, then placed."""
         assert self.coarse is not None

@@ -16,9 +16,10 @@ from .load import raw
 
 @contextlib.contextmanager
 def one_thread(like: Tensor) -> Iterator[None]:
-    """On the CPU, dense algebra of torch in one thread: MKL splits products and factors by their number."""
-    threads = torch.get_num_threads()
-    if like.is_cuda or threads == 1:
+    """On the CPU, dense algebra of torch in one thread: MKL splits products and factors by their number. Code that
+    torch.compile makes runs as it is."""
+    threads = 1 if like.is_cuda or torch.compiler.is_compiling() else torch.get_num_threads()
+    if threads == 1:
         yield
         return
     torch.set_num_threads(1)

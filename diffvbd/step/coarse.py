@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .. import ops
 from .._common.constants import VERTEX_ENERGIES
-from .._common.context import replaced
+from .._common.context import not_compiled, replaced
 from ..model.coarse import CoarsePlan
 from ..model.material import shape_gradients
 from ..model.system import System
@@ -109,6 +109,7 @@ class _FibreIndex(NamedTuple):
     members: Tensor  # int64 [groups, most], which of the n tets are of each group; n: none
 
 
+@not_compiled
 def _fibre_index(model: System) -> _FibreIndex:
     g, tets = model.coarse_geometry, model._topology[0].cpu().numpy()
     tet = np.flatnonzero(g.tet_group >= 0)

@@ -66,6 +66,14 @@ def test_compile_of_a_step_with_coarse_corrections(device: str, fresh_compiler: 
     compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False, solver=solver)
 
 
+def test_compile_of_a_first_step_with_coarse_corrections(device: str, fresh_compiler: None) -> None:
+    model, solver = small_model(device), replace(STEP["solver"], subspace=dv.CoarseSpace(functions=4, groups=1))
+    arguments = small_inputs(model)
+    x, v = torch.compile(lambda a: run_step(model, a, solver=solver), backend="eager")(arguments)  # with graph breaks
+    expected = run_step(model, arguments, solver=solver)
+    assert torch.equal(x, expected[0]) and torch.equal(v, expected[1])
+
+
 @pytest.mark.slow
 def test_compile_with_inductor(device: str, fresh_compiler: None) -> None:
     compiled_gradients(device, "inductor", ARGUMENTS, plain=False)
