@@ -107,9 +107,9 @@ DIFFVBD_OPERATOR(Out<8>, contact_detect, In x, In origin, In collider, In collid
   });
 }
 
-// The motion of bodies, contact/motion.h: a displacement [B, V, 3], the longest ones [5, B, bodies] and sums [B,
-// bodies, 4]. Their islands [B, bodies] int32 with translations [B, bodies, 3], and both radii [B, bodies + 1],
-// contact/ trust_region.h. Then the pairs within these. gravity_move may be empty; floor: planes in the data of
+// The motion of bodies (contact/motion.h): a displacement [B, V, 3], the longest ones [5, B, bodies] and sums
+// [B, bodies, 4]. Their islands [B, bodies] int32 with translations [B, bodies, 3] and both radii [B, bodies + 1]
+// (contact/trust_region.h). Then the pairs within these radii. gravity_move may be empty; floor: planes in the data of
 // FloorBarrier, or empty.
 DIFFVBD_OPERATOR(Out<15>, contact_find, In x, In origin, In collider, In collider_next, In mass, In move,
                  In gravity_move, In floor, In rest, In radius, In triangles, In edges, In points, In planes, In body,

@@ -69,7 +69,7 @@ DIFFVBD_OPERATOR(Out<8>, contact_start, In x, In move, In u, In rigid, In trust_
 // --- near pairs ------------------------------------------------------------------------------------------------------
 
 // What is left of the trust-region radii about x [scenes, vertices], and the pairs that can matter within them
-// (contact/ pair_list.h): their rows in the list, and their list. own_center and own_radius may be empty. exact: of
+// (contact/pair_list.h): their rows in the list, and their list. own_center and own_radius may be empty. exact: of
 // their number, on the CPU; else as long as the whole list, with -1 in empty rows.
 DIFFVBD_OPERATOR(Out<6>, contact_near, In x, In origin, In collider, In center, In own_center, In trust_radius,
                  In own_radius, In pinned, In pairs, In constants, In ptr, In entry, bool exact) {
