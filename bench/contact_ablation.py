@@ -94,7 +94,6 @@ RULES: dict[str, Callable[[], Any]] = {
         IncreaseInputs, increases_potential=lambda self, x, to: torch.zeros(x.shape[:2], dtype=torch.bool,
                                                                             device=x.device)),
     "rigid correction before the sweeps": no_first_correction,
-    "more rigid corrections after the sweeps": lambda: numbers(contact, MOST_CORRECTIONS=1),
     "more substeps while vertices are truncated": lambda: numbers(contact, MOST_DETECTIONS=0),
 }  # fmt: skip
 

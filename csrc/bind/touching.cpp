@@ -22,41 +22,33 @@ struct Correcting {
 // majorizes: friction has the stiffness of the block of a vertex, with which no motion is too long, and not its exact
 // derivative.
 //
-// One correction of the bodies of a mask, or, if that is empty, of all; and of those that touch them. The state after
-// the admissible fraction of each motion [scenes, V, 3]; that fraction [scenes, bodies], zero where none was sought
-// or found; whether a body has a motion; whether it was blocked, in a scene where some blocked body has moved on;
-// whether it was solved for alone, since too many touch; and the translation that it did not take [m].
-DIFFVBD_OPERATOR(Out<6>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
-                 double friction_eps, bool majorizes, In moving) {
+// One correction of all bodies. The state after the admissible fraction of each motion [scenes, V, 3]; what each body
+// took [scenes, bodies, 2]: that fraction, zero where none was found, and a number of the island whose common shift
+// it took whole, or -1; and the translation that it did not take [m].
+DIFFVBD_OPERATOR(Out<3>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Ints data_count, double time_step,
+                 double friction_eps, bool majorizes) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
   return dispatch_float(x, [&]<class T>(T) {
     Correcting<T> work(f, {data_count, time_step, friction_eps, majorizes}, device, true);
     contact::RigidStep<T>& s = work.step;
     const int64_t b = x.size(0), n = s.in.bodies();
-    const bool all = moving.dim() == 1 && moving.size(0) == 0;
-    const bool* mask = array<bool>("moving", moving, x, ScalarType::Bool, all ? 0 : b * n);
-    s.in.moving = all ? nullptr : mask;
-    const Tensor end = device.like_x(), fraction = device.empty({b, n}, ScalarType::Double),
-                 moved = device.empty({b, n}, ScalarType::Bool), blocked = device.empty({b, n}, ScalarType::Bool),
-                 alone = device.empty({b, n}, ScalarType::Bool), remaining = device.empty({b, n});
-    s.out = {data<bool>(moved), data<bool>(blocked), data<bool>(alone), data<T>(remaining)};
+    const Tensor end = device.like_x(), taken = device.empty({b, n, 2}, ScalarType::Double),
+                 fraction = device.empty({b, n}, ScalarType::Double), remaining = device.empty({b, n});
+    s.out = {data<double>(taken), data<T>(remaining)};
     s.fraction = data<double>(fraction), s.x_end = data<T>(end);
     if (b * n > 0) DIFFVBD_RUN(device, contact_rigid_correct<T>, s);
-    return Out<6>(end, fraction, moved, blocked, alone, remaining);
+    return Out<3>(end, taken, remaining);
   });
 }
 
-// The adjoint of corrections in sequence, each from `at` [scenes, V, 3] by its fraction. x_bar [scenes, V, 3]: adjoint
-// of the state after the last one. Returned: adjoints of the first `at`, x_prev, y and mass, of data as of
-// rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus the contribution of each
-// listed pair to that of kappa, and of lag.
-DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Tensors at, Tensors fraction, In x_bar,
-                 Ints data_count, double time_step, double friction_eps, bool majorizes, bool wants_data) {
+// The adjoint of a correction. x_bar [scenes, V, 3]: adjoint of the state after it. Returned: adjoints of x, x_prev, y
+// and mass, of data as of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus
+// the contribution of each listed pair to that of kappa, and of lag.
+DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) In taken, In x_bar, Ints data_count,
+                 double time_step, double friction_eps, bool majorizes, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const Device device(x);
-  require(fraction.size() == at.size() && !at.empty(),
-          "diffvbd::contact_rigid_reverse: expected as many at as fraction, one at least");
   return dispatch_float(x, [&]<class T>(T) {
     const Reader<T> read(x);
     Correcting<T> memory(f, {data_count, time_step, friction_eps, majorizes}, device, false);
@@ -69,26 +61,21 @@ DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) Te
     const Tensor floor_out = device.zeros({s.in.planes > 0 ? b : 0, v, s.in.planes, contact::kFloorLag});
     const Tensor collider_out = device.zeros({b, corners - v, 3}),
                  collider_prev_out = device.zeros({b, corners - v, 3});
-    const Tensor moving = device.empty({b, n}, ScalarType::Bool), alone = device.empty({b, n}, ScalarType::Bool);
-    s.in.moving = data<bool>(moving), s.out.alone = data<bool>(alone);
+    const Tensor moving = device.empty({b, n}, ScalarType::Bool), bar = device.empty({b, n, 3}, ScalarType::Double);
+    s.in.moving = data<bool>(moving);
     const contact::VirtualMotions<T> given{data<T>(p), data<T>(q)};
     contact::RigidReverse<T> r{s,
                                {s.in, given, pairs_out.view<T>(), pairs_out.sums<T>()},
-                               nullptr,
+                               read.doubles("taken", taken, 2 * b * n),
                                data<bool>(moving),
+                               data<double>(bar),
                                read.vectors("x_bar", x_bar),
                                data<T>(p),
                                data<T>(q),
                                data<T>(displacement),
                                {bars.pointers<T>(nullptr, nullptr), data_or_null<T>(floor_out), data<T>(collider_out),
                                 data<T>(collider_prev_out)}};
-    for (size_t k = at.size(); k-- > 0;) {
-      const T* from = read.vectors("at", at[k]);
-      r.step.in.scene.x = r.step.in.gate.x = r.work.in.scene.x = r.work.in.gate.x = from;
-      r.fraction = read.doubles("fraction", fraction[k], b * n);
-      if (b * n > 0) DIFFVBD_RUN(device, contact_rigid_reverse<T>, r);
-      r.end_bar = r.out.vertices.x;
-    }
+    if (b * n > 0) DIFFVBD_RUN(device, contact_rigid_reverse<T>, r);
     return Out<11>(bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_out, collider_out,
                    collider_prev_out, pairs_out.by_kappa, pairs_out.lag_bar);
   });

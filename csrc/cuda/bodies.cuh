@@ -18,7 +18,7 @@ constexpr int kTinyTile =
 constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fill the device with one thread each
 constexpr int kThreads = 256, kWarps = kThreads / 32;
 constexpr int32_t kOfWarp = 256;                // vertices up to which one warp of a block takes a body
-constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers in one sum of a team
+constexpr int kMostSums = 5 + 6 + rigid::kSix;  // numbers in one sum of a team
 constexpr int kFewSums = 4;                     // numbers that every thread of a block sums over the warps itself
 // Cost model of a large body, from times on an H100: 0.27 ms of a block for 9,261 vertices; for the whole device 15 us
 // for 17,576 and 80 us for 195,112 vertices.

@@ -273,6 +273,7 @@ struct CoarseStep : TrialStep<T> {
     return square_root(dot(d, d));
   }
   DIFFVBD_FN double slope(int64_t unit) const { return own.slope[unit]; }
+  DIFFVBD_FN bool moves(int64_t unit) const { return this->fraction[unit] > 0; }
 };
 
 struct BeginTrials {  // each scene
@@ -318,7 +319,13 @@ void coarse_move(const Run& run, const CoarseStep<T>& s) {
   run.each(Displace{}, s, s.c.vertices());
   run.each(FindCoefficients{}, s, s.c.vertices());
   run.bodies(FindSlope{}, s);
-  try_fractions(run, s, kFractions, 1);
+  run.bodies(FindReach{}, s);
+  find_islands(run, s);
+  run.each(ListNear{}, s, s.c.vertices());
+  for (int trial = 0; trial < kFractions; ++trial) {
+    if (try_fraction(run, s, fraction_of(trial))) break;
+  }
+  run.each(EndVertex{}, s, s.c.vertices());
 }
 
 // --- the transpose. With l the solution for P' (adjoint of the displacement -P a), everything that g and H read gets

@@ -4,7 +4,9 @@
 //     (J' H J) d = -J' g,        x <- x moved by s d,
 //
 // where s is the first of 1, 1/4, ... that raises no potential and that nothing blocks, for each island of bodies; and
-// its transpose. In double precision. Runs are those of trials.h.
+// its transpose. The shift that all bodies of an island have in common changes no gap between them: an island on which
+// nothing else acts takes it whole with any s, 0 among them, and so keeps its momentum. In double precision. Runs are
+// those of trials.h.
 #pragma once
 
 #include "cholesky.h"
@@ -17,8 +19,9 @@ constexpr int kTrials = 6, kHalvings = 2;  // fractions 1, 1/4, ..., 1/1024 befo
 
 // Memory of a correction beyond that of its trials, by body [B, bodies] and by place [B, bodies].
 struct RigidMemory {
-  uint8_t *some, *solved;     // by scene [B]; by body
+  uint8_t* solved;            // by body
   double *center, *motion;    // by body [3], [6]
+  double *rest, *common;      // by body: sum of m (y - x), and mass, 0 where a vertex energy acts; Common [4]
   double *solution, *matrix;  // by place: six; and as Groups::matrix() says
   uint64_t* blocks;           // by place
   int32_t* groups;            // [B, 4, bodies]
@@ -26,7 +29,7 @@ struct RigidMemory {
   // take(pointer, items), for so many scenes, and bodies of all of them; size: of the matrices of a scene
   template <class Take>
   void parts(Take& take, int64_t scenes, int64_t units, int64_t size) {
-    take(some, scenes), take(solved, units), take(blocks, units);
+    take(solved, units), take(blocks, units), take(rest, 4 * units), take(common, 4 * units);
     take(center, 3 * units), take(motion, kUnknowns * units), take(solution, kUnknowns * units);
     take(matrix, scenes * size), take(groups, kGroupRows * units);
   }
@@ -35,11 +38,14 @@ struct RigidMemory {
 // The result of a correction, of each body [B, bodies].
 template <class T>
 struct RigidOutcome {
-  bool* moved;  // whether it has a motion
-  // whether it was blocked, in a scene in which some blocked bodies have moved: others may move on now
-  bool* blocked;
-  bool* alone;  // whether it is solved for alone, since too many touch
-  T* left;      // the rest of its shift [m]
+  double* taken;  // [2]: fraction of its motion; the first body of the island whose common shift it took whole, or -1
+  T* left;        // the rest of its shift [m]
+};
+
+// The common shift of an island, the mean of y - x by mass, and its mass; 0 and 0 where something else acts on it.
+struct Common {
+  Vector shift;
+  double mass;
 };
 
 // The groups of the inputs are those of the memory.
@@ -54,8 +60,16 @@ struct RigidStep : TrialStep<T> {
   DIFFVBD_FN Vector arm(const Body<T>& b, int32_t v) const {
     return b.position(v) - wide_at(r.center + 3 * this->unit(b.scene, b.body));
   }
+  DIFFVBD_FN Vector common(int64_t unit) const { return wide_at(r.common + 4 * unit); }
+  DIFFVBD_FN bool shares(int64_t unit) const { return 0 < r.common[4 * unit + 3]; }
+  DIFFVBD_FN void share(int64_t unit, const Common& a) const {
+    put(r.common + 4 * unit, a.shift), r.common[4 * unit + 3] = a.mass;
+  }
   DIFFVBD_FN Vector displacement(const Body<T>& b, int32_t v, double fraction) const {
-    return displaced(motion_of(b), fraction, arm(b, v));
+    return displaced(motion_of(b), fraction, arm(b, v)) + (1 - fraction) * common(this->unit(b.scene, b.body));
+  }
+  DIFFVBD_FN bool moves(int64_t unit) const {
+    return this->fraction[unit] > 0 || (this->m.decided[unit] && shares(unit));
   }
   DIFFVBD_FN double smooth_change(const Body<T>&, int32_t, double, double&) const { return 0; }
   DIFFVBD_FN double length(const Body<T>& b, int32_t v) const {
@@ -70,7 +84,7 @@ struct RigidStep : TrialStep<T> {
 struct Begin {  // each scene
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t) const {
-    s.m.active[scene] = s.in.moving == nullptr, s.r.some[scene] = 0;
+    s.m.active[scene] = s.in.moving == nullptr;
   }
 };
 struct BeginBody {  // each body
@@ -121,7 +135,6 @@ struct FindPlace {  // each body
     g.member(before + rank) = k;
     g.first(k) = left ? before + rank : before, g.rank(k) = left ? 0 : rank;
     g.size(before + rank) = left ? kLeft : rank == 0 ? size : 0;
-    s.out.alone[s.unit(scene, k)] = left;
   }
 };
 template <class Run>
@@ -160,8 +173,8 @@ struct Assemble {  // bodies
     const bool free = in.free[b.body] && 0 < whole.mass;
     if (team.leads()) put(s.r.center + 3 * s.unit(b.scene, b.body), whole.center);
     if (!in.moves(b.scene, g, first)) return;
-    double total[kOwn + 1];  // and the sum of m r^2
-    team.template sum<kOwn + 1>(free ? b.size() : 0, total, [&](int32_t i, double* to) {
+    double total[kOwn + 5];  // and sums of m r^2 and m (y - x), and on how many vertices an energy acts
+    team.template sum<kOwn + 5>(free ? b.size() : 0, total, [&](int32_t i, double* to) {
       const int32_t v = b.vertex(i);
       const Vector arm = b.position(v) - whole.center;
       Vector force;
@@ -170,6 +183,8 @@ struct Assemble {  // bodies
       add_floor_friction(in, b, v, force, H);
       rigid::add_vertex(arm, force, H, to, to + kUnknowns);
       to[kOwn] += b.mass(v) * dot(arm, arm);
+      add_to(to + kOwn + 1, b.mass(v) * (b.target(v) - b.position(v)));
+      to[kOwn + 4] += H.xx + H.yy + H.zz > 3 * b.mass(v);
       s.each_listed(b.scene, v, [&](int64_t row, int corner) {
         const PairForce& a = s.m.forces[row];
         const int side = corner == 0 ? 0 : 1;
@@ -185,6 +200,8 @@ struct Assemble {  // bodies
     double* const rows = s.r.matrix + in.matrix_size() * b.scene + g.matrix(first) + int64_t{kUnknowns} * rank * size;
     if (team.leads()) {
       double* solution = s.r.solution + kUnknowns * s.unit(b.scene, g.place(b.body));
+      double* rest = s.r.rest + 4 * s.unit(b.scene, b.body);
+      put(rest, vector_at(total + kOwn + 1)), rest[3] = free && total[kOwn + 4] == 0 ? whole.mass : 0;
       for (int i = 0; i < kUnknowns; ++i) {
         solution[i] = -total[i];
         total[kUnknowns + rigid::at6(i, i)] += !free ? 1 : i < 3 ? kLeastInertia * total[kOwn] : 0;
@@ -269,35 +286,73 @@ DIFFVBD_FN void system_of_bodies(const Run& run, const RigidStep<T>& s) {
   run.groups(Solve<true>{}, s);
 }
 
+// --- what the bodies of an island have in common
+
+// Calls f(unit) for the bodies of the island whose first is k.
+template <class T, class F>
+DIFFVBD_FN void each_of_island(const RigidStep<T>& s, int64_t scene, int64_t k, const F& f) {
+  const int64_t first = s.unit(scene, 0);
+  if (s.m.label[first + k] != k) return;
+  for (int64_t j = k; j < (s.m.joined[first + k] ? s.in.bodies() : k + 1); ++j) {
+    if (s.m.label[first + j] == k) f(first + j);
+  }
+}
+struct Share {  // each body
+  template <class T>
+  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
+    Common common{};
+    bool alone = true;
+    each_of_island(s, scene, k, [&](int64_t unit) {
+      const double* rest = s.r.rest + 4 * unit;
+      common.shift += wide_at(rest), common.mass += rest[3];
+      alone = alone && 0 < rest[3] && !s.m.held[unit];
+    });
+    common.shift = (1 / common.mass) * common.shift;
+    const double length = square_root(dot(common.shift, common.shift));
+    each_of_island(s, scene, k, [&](int64_t unit) {
+      s.share(unit, alone ? common : Common{});
+      if (alone) s.m.reach[2 * unit] += (1 + kRounded) * length;
+    });
+  }
+};
+struct Hold {  // rows: no island comes near another by its common shift
+  template <class T>
+  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t row) const {
+    if (!s.is_listed(row) || s.m.near[row] || !s.exists(row) || s.owner(row) < 0) return;
+    const int32_t* of = s.record(row);
+    const int64_t first = s.unit(of[5], 0);
+    const int32_t a = moving_body(s.in, of[0]), b = moving_body(s.in, of[sides(of[4])]);
+    if (0 <= a && 0 <= b && s.m.label[first + a] == s.m.label[first + b]) return;
+    if (!may_touch(s.in, row, s.m.reach + 2 * first)) return;
+    if (0 <= a) mark(s.m.held + first + a);
+    if (0 <= b) mark(s.m.held + first + b);
+  }
+};
+// Takes it from islands that are held, or of those that are not decided.
+template <bool decided>
+struct Drop {  // each body
+  template <class T>
+  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
+    bool drops = false;
+    each_of_island(s, scene, k,
+                   [&](int64_t unit) { drops = drops || (decided ? !s.m.decided[unit] : s.m.held[unit]); });
+    if (drops) each_of_island(s, scene, k, [&](int64_t unit) { s.share(unit, {}); });
+  }
+};
+
 // --- the end of the step
 
 struct EndBody {  // each body
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
     const int64_t unit = s.unit(scene, k);
-    const double* motion = s.r.motion + kUnknowns * unit;
-    if (!s.r.solved[unit] || !s.in.free[k]) s.fraction[unit] = 0;  // it passes no adjoint on
-    const double fraction = s.fraction[unit];
-    bool moved = false;
-    for (int i = 0; i < kUnknowns; ++i) moved = moved || motion[i] != 0;
-    const Vector shift = wide_at(motion + 3);
-    s.out.moved[unit] = moved, s.out.blocked[unit] = moved && fraction < 1;
-    s.out.left[unit] = T((1 - fraction) * square_root(dot(shift, shift)));
-    if (s.out.blocked[unit] && 0 < fraction) mark(s.r.some + scene);
-  }
-};
-struct EndBlocked {  // each body
-  template <class T>
-  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
-    if (!s.r.some[scene]) s.out.blocked[s.unit(scene, k)] = false;
-  }
-};
-struct EndAtRest {  // each body
-  template <class T>
-  DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
-    const int64_t unit = s.unit(scene, k);
-    s.out.moved[unit] = s.out.blocked[unit] = s.out.alone[unit] = false;
-    s.fraction[unit] = 0, s.out.left[unit] = T(0);
+    const bool passes_on = s.r.solved[unit] && s.in.free[k];  // an adjoint
+    const double fraction = passes_on ? s.fraction[unit] : 0;
+    const bool shares = passes_on && s.moves(unit) && fraction < 1 && s.shares(unit);
+    const Vector rest = wide_at(s.r.motion + kUnknowns * unit + 3) - (shares ? s.common(unit) : Vector{});
+    s.out.taken[2 * unit] = fraction;
+    s.out.taken[2 * unit + 1] = shares ? s.m.label[unit] : -1;
+    s.out.left[unit] = T((1 - fraction) * square_root(dot(rest, rest)));
   }
 };
 
@@ -305,15 +360,21 @@ DIFFVBD_RUNS
 template <class Run, class T>
 DIFFVBD_FN void correct_bodies(const Run& run, const RigidStep<T>& s) {
   const int64_t n = s.in.bodies();
-  if (!begin_bodies(run, s)) {
-    run.each(EndAtRest{}, s, n);
-    run.each(EndVertex{}, s, s.in.scene.vertices);
-    return;
-  }
+  begin_bodies(run, s);
   system_of_bodies(run, s);
-  try_fractions(run, s, kTrials, kHalvings);
+  run.bodies(FindReach{}, s);
+  find_islands(run, s);
+  run.each(Share{}, s, n);
+  run.rows(Hold{}, s);
+  run.each(Drop<false>{}, s, n);
+  run.each(ListNear{}, s, s.in.scene.vertices);
+  bool done = false;
+  for (int trial = 0; trial < kTrials && !done; ++trial) done = try_fraction(run, s, fraction_of(kHalvings * trial));
+  if (!done) done = try_fraction(run, s, 0);
+  if (!done) run.each(Drop<true>{}, s, n);
+  for (int trial = 1; trial < kTrials && !done; ++trial) done = try_fraction(run, s, fraction_of(kHalvings * trial));
+  run.each(EndVertex{}, s, s.in.scene.vertices);
   run.each(EndBody{}, s, n);
-  run.each(EndBlocked{}, s, n);
 }
 
 // --- the transpose: the work of pairs in two virtual motions, then that of a correction that took its fractions
@@ -380,8 +441,9 @@ template <class T>
 struct RigidReverse {
   RigidStep<T> step;
   WorkStep<T> work;
-  const double* fraction;   // [B, bodies]
-  bool* moving;             // of the step: bodies with a fraction
+  const double* taken;      // as of RigidOutcome
+  bool* moving;             // of the step: bodies that have moved
+  double* bar;              // by body [3]: of a shift of it
   const T* end_bar;         // [B, V, 3]; may be out.vertices.x
   T *p, *q, *displacement;  // as of virtual_motion() and reverse_end()
   CorrectionAdjoints<T> out;
@@ -397,7 +459,7 @@ struct FindMoving {  // each body
   template <class T>
   DIFFVBD_FN void operator()(const RigidReverse<T>& r, int64_t scene, int64_t k) const {
     const int64_t unit = r.step.unit(scene, k);
-    r.moving[unit] = r.fraction[unit] != 0;
+    r.moving[unit] = r.taken[2 * unit] > 0 || r.taken[2 * unit + 1] >= 0;
   }
 };
 struct PassOn {  // each vertex, where nothing moved
@@ -407,11 +469,39 @@ struct PassOn {  // each vertex, where nothing moved
     put(r.out.vertices.x + at, vector_at(r.end_bar + at));
   }
 };
+struct SumEnd {  // bodies, the adjoint of a shift of each
+  template <class T, class Team>
+  DIFFVBD_FN void operator()(const RigidReverse<T>& r, const Body<T>& b, const Team& team) const {
+    const int64_t unit = r.step.unit(b.scene, b.body);
+    if (r.taken[2 * unit + 1] < 0) return;
+    double sum[3];
+    team.template sum<3>(b.size(), sum,
+                         [&](int32_t i, double* to) { add_to(to, wide_at(r.end_bar + 3 * b.row(b.vertex(i)))); });
+    if (team.leads()) put(r.bar + 3 * unit, vector_at(sum));
+  }
+};
 struct ReverseEnd {  // bodies
   template <class T, class Team>
   DIFFVBD_FN void operator()(const RigidReverse<T>& r, const Body<T>& b, const Team& team) const {
-    reverse_end(b, team, r.motion(b), r.fraction[r.step.unit(b.scene, b.body)], r.end_bar, r.solution(b),
-                r.displacement, r.out.vertices.mass);
+    const int64_t unit = r.step.unit(b.scene, b.body);
+    reverse_end(b, team, r.motion(b), r.taken[2 * unit], r.end_bar, r.solution(b), r.displacement, r.out.vertices.mass);
+    if (r.taken[2 * unit + 1] < 0) return;
+    Common common{};
+    Vector bar{};
+    for (int32_t k = 0; k < r.step.in.bodies(); ++k) {
+      const int64_t other = r.step.unit(b.scene, k);
+      if (r.taken[2 * other + 1] != r.taken[2 * unit + 1]) continue;
+      const double* rest = r.step.r.rest + 4 * other;
+      common.shift += wide_at(rest), common.mass += rest[3], bar += wide_at(r.bar + 3 * other);
+    }
+    const Vector shift = (1 / common.mass) * common.shift, each = ((1 - r.taken[2 * unit]) / common.mass) * bar;
+    team.each(b.size(), [&](int32_t i) {
+      const int32_t v = b.vertex(i);
+      const int64_t row = b.row(v);
+      add_to(r.displacement + 3 * row, -b.mass(v) * each);
+      add_to(r.out.vertices.y + 3 * row, b.mass(v) * each);
+      r.out.vertices.mass[row] += T(dot(b.target(v) - b.position(v) - shift, each));
+    });
   }
 };
 struct Virtual {  // bodies
@@ -443,6 +533,7 @@ DIFFVBD_FN void reverse_bodies(const Run& run, const RigidReverse<T>& r) {
     return;
   }
   system_of_bodies(run, r.step);
+  run.bodies(SumEnd{}, r);
   run.bodies(ReverseEnd{}, r);
   run.groups(Solve<false>{}, r.step);
   run.bodies(Virtual{}, r);

@@ -108,7 +108,7 @@ struct TrialMemory {
   uint8_t *near, *active;             // by row: whether it may act after the displacement; by scene [B]
   int32_t* label;                     // by body: the first body of its island
   double *reach, *sum, *own, *after;  // by body [2]: Farthest; by body and vertex [2]: change, size; by row
-  uint8_t *decided, *joined;          // by body
+  uint8_t *decided, *joined, *held;   // by body; held: near what does not move
   T* move;                            // by vertex [3]; of the inputs
   AdvanceState<T> state;
   Motion<T>* motions;  // by vertex, that of `state`
@@ -120,7 +120,7 @@ struct TrialMemory {
     take(forces, rows), take(active, scenes), take(label, units);
     if (!trials) return;
     take(near, rows), take(after, rows), take(reach, 2 * units), take(sum, 2 * units), take(own, 2 * vertices);
-    take(decided, units), take(joined, units), take(move, 3 * vertices), take(motions, vertices);
+    take(decided, units), take(joined, units), take(held, units), take(move, 3 * vertices), take(motions, vertices);
     take(state.fraction, units), take(state.now, units), take(state.blocked, units), take(state.stamp, units);
   }
 };
@@ -131,9 +131,10 @@ struct Farthest {
   double displacement, size;
 };
 
-// Of a Step, displacement(body, v, fraction), smooth_change(body, v, fraction, size), the change of what pairs, vertex
-// energies and inertia are not, whose terms' sizes are added, length(body, v), of any fraction, and slope(unit), of the
-// potential along the whole displacement; 0 asks for no decrease.
+// Of a Step, displacement(body, v, fraction), moves(unit), whether a body has a displacement in the end,
+// smooth_change(body, v, fraction, size), the change of what pairs, vertex energies and inertia are not, whose terms'
+// sizes are added, length(body, v), of any fraction, and slope(unit), of the potential along the whole displacement; 0
+// asks for no decrease.
 template <class T>
 struct TrialStep : Rows<T> {
   using Scalar = T;
@@ -174,7 +175,7 @@ struct FindReach {  // bodies
     });
     if (!team.leads()) return;
     s.m.reach[2 * unit] = most[0], s.m.reach[2 * unit + 1] = most[1];
-    s.m.label[unit] = b.body, s.m.decided[unit] = !active, s.m.joined[unit] = 0;
+    s.m.label[unit] = b.body, s.m.decided[unit] = !active, s.m.joined[unit] = s.m.held[unit] = 0;
     s.fraction[unit] = 0;
     const AdvanceState<T>& state = s.m.state;
     state.fraction[unit] = T(0), state.now[unit] = T(1), state.blocked[unit] = state.stamp[unit] = 0;
@@ -207,6 +208,7 @@ struct Near {  // rows
     if (!near) return;
     s.m.near[row] = 1;
     const int32_t a = moving_body(s.in, of[0]), b = moving_body(s.in, of[sides(of[4])]);
+    if (a < 0 || b < 0) mark(s.m.held + first + (a < 0 ? b : a));
     if (a < 0 || b < 0 || a == b) return;
     Run::unite(s.m.label + first, a, b);
     mark(s.m.joined + first + a), mark(s.m.joined + first + b);
@@ -304,31 +306,30 @@ struct EndVertex {  // each vertex
     using T = typename Step::Scalar;
     const auto v = static_cast<int32_t>(of);
     const Body<T> b{s.in.scene, scene, s.in.gate.body[v]};
-    const double fraction = s.fraction[s.unit(scene, b.body)];
-    const Vector d = fraction > 0 ? s.displacement(b, v, fraction) : Vector{};  // what was refused may be no number
+    const int64_t unit = s.unit(scene, b.body);
+    const Vector d = s.moves(unit) ? s.displacement(b, v, s.fraction[unit]) : Vector{};  // the refused may be no number
     put(s.x_end + 3 * b.row(v), vector_at(s.in.scene.x + 3 * b.row(v)) + Vec3<T>{T(d.x), T(d.y), T(d.z)});
   }
 };
 
-// Takes the first of so many fractions, each of which is halved so often. The scenes that are active, and the forces
-// before, are known.
+// The scenes that are active, and the forces before, are known.
 DIFFVBD_RUNS
 template <class Run, class Step>
-DIFFVBD_FN void try_fractions(const Run& run, const Step& s, int trials, int halvings) {
-  const int64_t n = s.in.bodies(), vertices = s.in.scene.vertices;
-  run.bodies(FindReach{}, s);
+DIFFVBD_FN void find_islands(const Run& run, const Step& s) {
   run.rows(Near<Run>{}, s);
-  run.each(Flatten<Run>{}, s, n);
-  run.each(ListNear{}, s, vertices);
-  for (int trial = 0; trial < trials; ++trial) {
-    const double fraction = fraction_of(halvings * trial);
-    run.each(MoveVertex{fraction}, s, vertices);
-    run.rows(MoveRow{}, s);
-    run.bodies(SumBody{}, s);
-    run.each(Decide{fraction}, s, n);
-    if (run.all(s.m.decided, s.in.scene.scenes * n)) break;
-  }
-  run.each(EndVertex{}, s, vertices);
+  run.each(Flatten<Run>{}, s, s.in.bodies());
+}
+
+// Islands that are not decided take a fraction, if they can. Whether all are decided, as far as the host knows.
+DIFFVBD_RUNS
+template <class Run, class Step>
+DIFFVBD_FN bool try_fraction(const Run& run, const Step& s, double fraction) {
+  const int64_t n = s.in.bodies();
+  run.each(MoveVertex{fraction}, s, s.in.scene.vertices);
+  run.rows(MoveRow{}, s);
+  run.bodies(SumBody{}, s);
+  run.each(Decide{fraction}, s, n);
+  return run.all(s.m.decided, s.in.scene.scenes * n);
 }
 
 }  // namespace diffvbd::contact

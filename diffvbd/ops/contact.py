@@ -243,23 +243,20 @@ class Corrected(NamedTuple):
     """Result of :func:`rigid_correct`."""
 
     x: Tensor  # [B, V, 3]
-    fraction: Tensor  # float64 [B, bodies]: step fraction of each motion; zero where none was sought or found
-    moved: Tensor  # bool [B, bodies]: the body has a motion
-    blocked: Tensor  # bool [B, bodies]: the body was blocked, in a scene where some blocked body has moved on
-    alone: Tensor  # bool [B, bodies]: the body was solved for alone, since too many touch
+    # float64 [B, bodies, 2]: step fraction of each motion, zero where none was found; a number of the group of bodies
+    # whose common shift it took whole, or -1
+    taken: Tensor
     remaining: Tensor  # [B, bodies]: translation that was not taken [m]
 
 
 def rigid_correct(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
-                  majorizes: bool, moving: Tensor | None = None) -> Corrected:  # fmt: skip
+                  majorizes: bool) -> Corrected:  # fmt: skip
     """State after the admissible fraction of one Newton step of the step's potential over a turn and a shift of every
-    body (csrc/subspace/rigid_step.h).
+    body (csrc/subspace/rigid_step.h). A group of bodies on which nothing else acts takes its common shift whole.
 
     friction_eps: [m], 0 without friction.  majorizes: Whether friction has the stiffness of a vertex's block.
-    moving: bool [B, bodies]: these move, and those that touch them; or None.
     """
-    moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
-    return Corrected(*raw.contact_rigid_correct(*fields, data_count, time_step, friction_eps, majorizes, moving))
+    return Corrected(*raw.contact_rigid_correct(*fields, data_count, time_step, friction_eps, majorizes))
 
 
 class RigidAdjoints(NamedTuple):
@@ -277,13 +274,11 @@ class RigidAdjoints(NamedTuple):
     lag: Tensor  # [lagged, 9]
 
 
-def rigid_reverse(fields: TouchingFields, at: Sequence[Tensor], fraction: Sequence[Tensor], x_bar: Tensor,
-                  data_count: Sequence[int], time_step: float, friction_eps: float, majorizes: bool,
-                  wants_data: bool) -> RigidAdjoints:  # fmt: skip
-    """Adjoint of corrections, each from ``at`` [B, V, 3] by its fraction, of the state x_bar [B, V, 3] after the last
-    one. fields: Of all corrections, but for x."""
-    out = raw.contact_rigid_reverse(*fields, list(at), list(fraction), x_bar.contiguous(), data_count, time_step,
-                                    friction_eps, majorizes, wants_data)  # fmt: skip
+def rigid_reverse(fields: TouchingFields, taken: Tensor, x_bar: Tensor, data_count: Sequence[int], time_step: float,
+                  friction_eps: float, majorizes: bool, wants_data: bool) -> RigidAdjoints:  # fmt: skip
+    """Adjoint of a correction; x_bar [B, V, 3]: of the state after it."""
+    out = raw.contact_rigid_reverse(*fields, taken, x_bar.contiguous(), data_count, time_step, friction_eps, majorizes,
+                                    wants_data)  # fmt: skip
     return adjoints_of(out, data_count, wants_data)
 
 

@@ -178,7 +178,7 @@ def _contact_start(a: Any) -> Any:
 
 def _contact_rigid_correct(a: Any) -> Any:
     size = a.x.shape[0], a.free.shape[0]
-    return torch.empty_like(a.x), *(new(a.x, *size, dtype=dtype) for dtype in (DOUBLE, BOOL, BOOL, BOOL, a.x.dtype))
+    return torch.empty_like(a.x), new(a.x, *size, 2, dtype=DOUBLE), new(a.x, *size)
 
 
 def _pairs(a: Any) -> tuple[int, int]:

@@ -333,8 +333,7 @@ def contact_step(
             state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, substep, bound,
                               partial(_between, renew, correct, between))  # fmt: skip
             renew(state)
-            for fractions in substep.corrections[1 + len(between) :]:  # of those that do not move again it is 0
-                state = correct(state, fractions)
+            state = correct(state, substep.corrections[-1])
         if substep.going is not None:
             state = torch.where(substep.going.reshape(*x.shape[:-2], 1, 1), state, begun)
         remaining = torch.where(rows(substep.truncated[..., None]) > 0, y - state, 0.0)

@@ -27,9 +27,11 @@ class Correction:
         pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
         self.free = ~pinned.to(y.device)
 
-    def __call__(self, x: Tensor, fraction: Tensor, majorizes: bool = False) -> Tensor:
-        """The state [..., 3, V] after each body [B, bodies] has taken its fraction of its motion. majorizes: Whether
-        friction has the stiffness of a vertex's block."""
+    def __call__(self, x: Tensor, taken: Tensor, majorizes: bool = False) -> Tensor:
+        """The state [..., 3, V] after each body has moved. taken: [B, bodies, 2], its fraction of its motion, and a
+        number of the bodies whose common shift it takes whole, or -1. majorizes: Whether friction has the stiffness of
+        a vertex's block."""
+        fraction, group = taken.to(x).unbind(-1)
         lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(fraction), -1, 3)
         mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(fraction), -1)
         total = mass.new_zeros(len(fraction), self.count).index_add(1, self.body, mass)
@@ -64,7 +66,16 @@ class Correction:
         g, matrix = self._of_free(g, matrix, least)
         motion = -torch.linalg.solve(matrix, g).reshape(z.shape)
         moves = (fraction != 0)[..., None]  # the others may have no motion: their matrix may be indefinite
-        return state(fraction.to(x)[..., None] * torch.where(moves, motion, 0.0))
+        moved = state(fraction[..., None] * torch.where(moves, motion, 0.0))
+        common = self._common(rows, mass, total, group) * (1 - fraction)[..., None]
+        return moved + common[:, self.body].transpose(-1, -2).reshape(x.shape)
+
+    def _common(self, rows: Tensor, mass: Tensor, total: Tensor, group: Tensor) -> Tensor:
+        """The mean of y - x by mass over the group of each body [B, bodies, 3]; zero where it has none."""
+        y = self.y.transpose(-1, -2).reshape(rows.shape)
+        off = torch.zeros_like(total)[..., None].expand(-1, -1, 3).index_add(1, self.body, mass[..., None] * (y - rows))
+        same = ((group[:, :, None] == group[:, None]) & (group >= 0)[:, None]).to(rows)
+        return (same @ off) / torch.where(group[..., None] >= 0, same @ total[..., None], 1.0)
 
     def _of_free(self, g: Tensor, matrix: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
         """Entries of others are zero, and their part of the matrix is the identity."""

@@ -500,7 +500,7 @@ LONGEST = 0.1  # [s] of the first time step of the refinement
 MOST_STEPS = 2**17
 FEWEST_THAT_RUN = 256  # steps: fewer than these may fail
 ORDERS = (0.5, 2.0)  # that are believed
-CLEAN = 0.6  # least order of two levels in a row from which contact counts as resolved
+CLEAN = 0.6  # least order of two levels in a row from which the motion counts as resolved
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 1.0  # [s] or so long,
@@ -563,7 +563,7 @@ class _Search:
         # impacts come early or late by up to a step: nothing can be extrapolated until steps resolve them
         self.smooth = not (trials.model.touches or trials.model.floor is not None)
         self.most = error if self.smooth else SAFE * error  # that a run may show
-        self.clean = self.smooth  # whether the last two runs can be extrapolated
+        self.clean = False  # whether the last two runs can be extrapolated
         self.levels: list[TrialRun] = []
         self.estimates: list[tuple[float, TrialRun]] = []  # of levels from the third on: what is asked for, and the run
         self.proven: list[Candidate] = []
@@ -658,16 +658,16 @@ class _Search:
             steps *= 2
 
     def _remaining(self, apart: list[float]) -> float:
-        """The error of the last run, by the order that the last runs show; with contact that is believed where two
-        levels in a row agree on one."""
+        """The error of the last run, by the order that the last runs show. It is believed where two levels in a row
+        agree on one: a single pair of runs may agree by luck."""
         low, high = ORDERS
         last = [max(a, 1e-300) for a in apart[-3:]]
         shown = [math.log2(a / b) for a, b in zip(last, last[1:], strict=False)]
-        self.order = min(max(shown[-1] if self.smooth else min(shown), low), high)
-        self.clean = self.smooth or (len(shown) > 1 and min(shown) >= CLEAN)
+        self.order = min(max(min(shown), low), high)
+        self.clean = len(shown) > 1 and min(shown) >= CLEAN
         if self.clean:
             return apart[-1] / (2**self.order - 1)
-        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
+        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)
 
     def _unresolved(self) -> float:
         """Motion that is lost with energy, and that runs which agree may therefore both lack. Vibrations swing within a

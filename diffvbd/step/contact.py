@@ -30,7 +30,7 @@ from ..ops.sweep import sweep
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
 from .contact_coarse import Corrections
-from .contact_rigid import MOST_CORRECTIONS, bodies_of, corrected, is_blocked, touching
+from .contact_rigid import bodies_of, corrected, is_blocked, touching
 from .predict import Begun
 
 MOST_CAPACITY = 2**26
@@ -156,7 +156,7 @@ class ContactStep:
             if self._reads(x):
                 self._check(r, detection.counts.tolist(), int(start.infeasible.sum()), records)
             begin = x
-            x, taken, _ = corrected(self, start.x, now, start, detection.listed)
+            x, *taken, _ = corrected(self, start.x, now, start, detection.listed)
             if barrier.self_contact:
                 start = replaced(start, own_center=start.own_center + (x - start.x).detach())
             at = x.detach()
@@ -171,8 +171,8 @@ class ContactStep:
                 records.swept.append(swept)
                 x, limits, lengths, between = swept
                 taken.extend(between)
-                x, fractions, back = corrected(self, x, now, start, detection.listed, MOST_CORRECTIONS)
-                taken.extend(fractions)
+                x, last, back = corrected(self, x, now, start, detection.listed)
+                taken.append(last)
                 # sweeps may have recovered what the start truncated, and corrections what sweeps did
                 blocked = is_blocked(self, x, back)
                 truncated = (limits[:, -1] > 0) | blocked
@@ -241,7 +241,7 @@ class ContactStep:
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
             swept = swept_substep(self, x, start, self.colliders, none, settings, policy, debug_step)
-            x = corrected(self, swept.x, self.colliders, start, none, MOST_CORRECTIONS).x
+            x = corrected(self, swept.x, self.colliders, start, none).x
             record_substeps(self.model, x, [swept])
         return self._finite(x)
 
@@ -390,7 +390,7 @@ class SweptSubstep(NamedTuple):
     x: Tensor  # [B, V, 3]
     limits: Tensor  # uint8 [B, K, V]
     lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
-    fractions: Sequence[Tensor] = ()  # of the rigid corrections between sweeps, [B, bodies] each
+    fractions: Sequence[Tensor] = ()  # of the rigid corrections between sweeps, [B, bodies, 2] each
 
 
 def sweeps_of_substeps(sweeps: int, substeps: int) -> list[int]:
@@ -423,7 +423,7 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
         ends = n + 1 == len(cycles)
         if of.model.rigid_bodies is not None and n:
             # Where friction reverses, its exact derivative makes a motion too long, and most of it is refused.
-            x, taken, _ = corrected(of, x, collider, start, listed, majorizes=True)
+            x, *taken, _ = corrected(of, x, collider, start, listed, majorizes=True)
             fractions += taken
         if matrix is not None and corrects:
             if corrections is None or of.begun.renews:
@@ -486,7 +486,8 @@ class Detection(NamedTuple):
         deformation_radius: The same relative to the body's rigid motion [m].
         fractions: Step fraction of each vertex at the start [B, V].
         truncated: Vertices that pairs or radii have truncated at the start, bool [B, V].
-        corrections: Step fractions of the rigid corrections before and after the sweeps, [B, bodies] each.
+        corrections: Of the rigid corrections before, between and after the sweeps, [B, bodies, 2] each: step fraction,
+            and a number of the group of bodies whose common shift it took whole, or -1.
         limits: Number of halvings of each update, uint8 [B, K, V]; 8: it was not made.
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
         kept: Rows of the listed pairs that sweeps can reach; None where the host must not read them, as on CUDA.
