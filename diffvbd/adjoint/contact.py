@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,6 @@ from ..energies import damped_fraction
 from ..model.inputs import parameter_of
 from ..model.patches import Averaged
 from ..model.system import System
-from ..ops import contact as ops_contact
 from ..ops.fields import CONSTANTS
 from ..ops.sums import segment_sum, sum_by
 from ..reference.energies import smoothed
@@ -76,16 +75,56 @@ def friction_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor | 
         x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa, damping: [1 | B].  origin: [B, V, 3] or empty.
         friction: [1 | B], or [1 | B, n, n] of each two bodies and colliders.  body: [N], of the corner points.
     """
-    scenes, inputs = x.shape[0], (x.contiguous(), collider.contiguous(), kappa.contiguous())
-    state, force, _ = ops_contact.pair_lag(*inputs, origin, *listed, body)
-    load, rate = torch.zeros_like(force), torch.zeros_like(force)
-    if friction is not None:
-        load = force * coefficients(friction, listed, body, scenes)
-    if damping is not None:
-        stiffness, own = (of_scene(ops.broadcast(t, (scenes,)), listed) for t in (kappa, damping))
-        dhat = torch.where(state[:, 1] > 0, listed.constants[:, 0], 1.0)  # rows that no pair fills hold anything
-        rate = own * damped_fraction(force, stiffness, dhat)
-    return torch.cat([torch.stack([load, rate], 1), state[:, 2:]], 1)
+    inputs = (x.contiguous(), collider.contiguous(), kappa.contiguous(), friction, damping)
+    return _friction_lag(*inputs, origin, body, *listed)[0]
+
+
+def _run_lag(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor | None, damping: Tensor | None,
+             origin: Tensor, body: Tensor, *listed: Tensor) -> tuple[Tensor, ...]:  # fmt: skip
+    state, force, bearer = ops.direct.contact_lag(x, origin, collider, kappa, *listed, body)
+    none, pairs, active = torch.zeros_like(force), Pairs(*listed), state[:, 1] > 0
+    coefficient = none if friction is None else coefficients(friction, pairs, body, len(x))
+    rate = none if damping is None else _damping(force, kappa, damping, active, len(x), pairs)
+    lag = torch.cat([torch.stack([force * coefficient, rate], 1), state[:, 2:]], 1)
+    return lag, force, bearer, active, coefficient
+
+
+def _damping(force: Tensor, kappa: Tensor, damping: Tensor, active: Tensor, scenes: int, listed: Pairs) -> Tensor:
+    """Damping of pairs [pairs] by their normal force."""
+    stiffness, own = (of_scene(ops.broadcast(t, (scenes,)), listed) for t in (kappa, damping))
+    dhat = torch.where(active, listed.constants[:, 0], 1.0)  # rows that no pair fills hold anything
+    return own * damped_fraction(force, stiffness, dhat)
+
+
+def _reverse_lag(bars: Any, saved: Any, rest: tuple, needs: Any) -> list[Tensor | None]:
+    x, collider, kappa, friction, damping, force, bearer, active, coefficient = saved
+    bar, (origin, body, *listed), scenes = bars[0], rest, len(x)
+    pairs, of_kappa, of_friction, of_damping = Pairs(*listed), 0.0, None, None
+    by_force = coefficient * bar[:, 0]
+    with torch.enable_grad():
+        if needs[3]:
+            given = friction.detach().requires_grad_()
+            found = coefficients(given, pairs, body, scenes)
+            (of_friction,) = torch.autograd.grad(found, given, force * bar[:, 0])
+        if damping is not None:
+            load, k, c = leaves = [t.detach().requires_grad_() for t in (force, kappa, damping)]
+            rate = _damping(load, k, c, active, scenes, pairs)
+            own, of_kappa, of_damping = torch.autograd.grad(rate, leaves, bar[:, 1])
+            by_force = by_force + own
+    # faces whose forces sum to less than nothing bear nothing
+    own = torch.where(force > 0, by_force, 0.0)[bearer][:, None]
+    points, kappa_bar = ops.direct.contact_lag_backward(
+        torch.cat([own, torch.zeros_like(own), bar[:, 2:]], 1), x, origin, collider, kappa, *listed
+    )
+    of_kappa = ops.sum_to(kappa_bar, kappa.shape) + of_kappa
+    return [points[:, : x.shape[1]], points[:, x.shape[1] :], of_kappa, of_friction, of_damping]
+
+
+# Of the arguments of friction_lag(), the list's last.
+_friction_lag = ops.Differentiable(
+    _run_lag, _reverse_lag, arguments=11, inputs=5, saved=lambda inputs, made: (*inputs[:5], *made[1:]),
+    rest=lambda inputs: inputs[5:],
+)  # fmt: skip
 
 
 def coefficients(friction: Tensor, listed: Pairs, body: Tensor, scenes: int) -> Tensor:

@@ -34,7 +34,7 @@ class Direct:
     def __init__(self, library: Any) -> None:
         self._library = library
 
-    def __getattr__(self, name: str) -> Callable[..., Any]:  # keeps nothing: torch.compile traces it
+    def __getattr__(self, name: str) -> Callable[..., Any]:
         operator = getattr(self._library, name).default
 
         def call(*args: Any) -> Any:
@@ -43,6 +43,8 @@ class Direct:
             with torch._C._AutoDispatchBelowAutograd():
                 return operator(*args)
 
+        if not torch.compiler.is_compiling():
+            setattr(self, name, call)  # is found before this the next time
         return call
 
 

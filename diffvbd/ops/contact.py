@@ -126,9 +126,10 @@ def contact_find(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Ten
             radius only with self-contact.
         factor, least: Radius over a body's displacement relative to its island, and what is added [m].
     """
-    return Found(*raw.contact_find(x, origin, collider, collider_next, mass, move, gravity_move, floor, *surface,
-                                   *bodies, self_contact, between_bodies, dhat, factor, least, capacity,
-                                   trim))  # fmt: skip
+    with torch.no_grad():
+        return Found(*raw.contact_find(x, origin, collider, collider_next, mass, move, gravity_move, floor, *surface,
+                                       *bodies, self_contact, between_bodies, dhat, factor, least, capacity,
+                                       trim))  # fmt: skip
 
 
 class Intersections(NamedTuple):
@@ -224,8 +225,9 @@ def contact_near(x: Tensor, origin: Tensor, collider: Tensor, center: Tensor, ow
         pinned: [V] or more, bool.  listed: pairs, constants, ptr, entry of :func:`contact_detect`.
     """
     exact = not x.is_cuda and not torch.compiler.is_compiling()
-    return Near(*raw.contact_near(x, origin, collider, center, own_center, trust_radius, own_radius, pinned, *listed,
-                                  exact))  # fmt: skip
+    with torch.no_grad():
+        return Near(*raw.contact_near(x, origin, collider, center, own_center, trust_radius, own_radius, pinned,
+                                      *listed, exact))  # fmt: skip
 
 
 def within(radius: float, x: Tensor, origin: Tensor, collider: Tensor, pinned: Tensor,
@@ -350,22 +352,6 @@ def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
 # --- differentiable operators -----------------------------------------------------------------------------------------
 
 
-def _split(points: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """The adjoints of vertices and of colliders, from those of corner points."""
-    return points[:, : x.shape[1]], points[:, x.shape[1] :]
-
-
-def _lag_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
-    x, collider, kappa, origin, force, bearer = saved
-    by_state, by_load = bars
-    if by_state is None or by_load is None:  # of neither friction nor damping
-        return [None] * 3
-    own = torch.where(force > 0, by_load, 0.0)[bearer]  # faces whose forces sum to less than nothing bear nothing
-    bar = torch.cat([own[:, None], by_state[:, 1:]], 1)
-    points, by_kappa = raw.contact_lag_backward(bar, x, origin, collider, kappa, *rest)
-    return *_split(points, x), by_kappa
-
-
 def _start_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> Bars:
     (bar, *_), (*_, fraction, pinned) = bars, saved
     assert bar is not None
@@ -377,14 +363,4 @@ def _start_reverse(bars: Bars, saved: Sequence[Any], rest: tuple, needs: Sequenc
 _start = Differentiable(
     lambda *args: raw.contact_start(*args, FILTER_ETA), _start_reverse, arguments=17, inputs=2,
     saved=lambda inputs, made: (inputs[0], inputs[0], made[5], inputs[10]), rest=lambda inputs: (),
-)  # fmt: skip
-
-
-# Of each pair: activity, normal and weights in [pairs, 9], whose first column is not differentiable; the normal force
-# that it bears, and the pair that bears its own [pairs]; of x, collider, kappa, origin; pairs, constants, ptr, entry,
-# body.
-pair_lag = Differentiable(
-    lambda x, collider, kappa, origin, *listed: raw.contact_lag(x, origin, collider, kappa, *listed), _lag_reverse,
-    arguments=9, inputs=3, outputs=2, saved=lambda inputs, made: (*inputs[:4], *made[1:]),
-    rest=lambda inputs: inputs[4:8],
 )  # fmt: skip

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .._common.constants import CONTACT
-from .._common.context import MorePairs, checking, in_segment, is_captured, not_compiled, recorders, replaced
+from .._common.context import MorePairs, checking, in_segment, is_captured, not_compiled, recorders
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
@@ -39,13 +39,19 @@ LOST = ("x: positions became non-finite {}: check that v, forces and materials a
         "time_step or softer materials, or look with diffvbd.testing.debug_checks()")  # fmt: skip
 
 
+def may_read(x: Tensor) -> bool:
+    """Whether values may decide sizes; on CUDA the host would wait."""
+    return not x.is_cuda
+
+
 class ContactStep:
     """Data that the substeps of one step share."""
 
     def __init__(self, model: System, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
-        begun = replaced(begun, x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
+        begun = begun._replace(x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
         self.model, self.begun, self.prepared = model, begun, prepared
         self.x_prev = begun.x_prev
+        self.reads = may_read(begun.x_prev)
         # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
         self.before = before.contiguous()
         self.colliders = self.before if colliders is before else colliders.contiguous()
@@ -55,9 +61,10 @@ class ContactStep:
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
         self.none = begun.x_prev.new_empty((0,))
         self.planes = self.none if self.floor_data is None else self.floor_data.detach()
+        self.capacity = self._capacity()
         unchecked = prepared.settings.sweeps == 0 or begun.law is not None
-        if unchecked and self._reads(self.x_prev):  # for what sweeps raise
-            plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=(), sweeps=0)
+        if unchecked and self.reads:  # for what sweeps raise
+            plain = prepared.settings._replace(energies=prepared.settings.energies & ~CONTACT, coarse=(), sweeps=0)
             with torch.no_grad():
                 sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
         self.substeps = (None if self.barrier is None else self.barrier.detections) or 1
@@ -104,11 +111,6 @@ class ContactStep:
         barrier = self.barrier
         return barrier is not None and (barrier.damping > 0 or "pair_damping" in self.prepared.parameters)
 
-    @staticmethod
-    def _reads(x: Tensor) -> bool:
-        """Whether values may decide sizes; on CUDA the host would wait."""
-        return not x.is_cuda
-
     def gaps_before(self, listed: Pairs) -> Tensor:
         """Gaps of pairs at the start of the step [n] [m]. Those of planes in a detection are of its end."""
         if self.colliders is self.before:
@@ -137,7 +139,7 @@ class ContactStep:
         planned, r = self.substeps, 0
         going = None
         while r < self.substeps:
-            was, now = (self._colliders_at(min(1.0, n / planned)) for n in (r, r + 1))
+            was, now = self._colliders_at(r / planned), self._colliders_at((r + 1) / planned)
             # the whole displacement in the first substep; prescribed motion and truncated displacements go on later
             move = remaining
             if pins and planned > 1:
@@ -145,28 +147,29 @@ class ContactStep:
             detection = self.detect(x, was, now, move, h2a)
             sweeps = sweeps_of_substep(settings.sweeps, planned, r)
             records.found.append(detection)
-            if self._reads(x):  # before any work
-                self._check(r, detection.counts.tolist(), 0, records)
+            counts = detection.counts.tolist() if self.reads else []
+            if self.reads:  # before any work
+                self._check(r, counts, 0, records)
             if r == 0:
                 self._lag_friction(detection.listed)
             start = start_substep(x, self._as_wholes(move), detection.u, detection.rigid, detection.trust_radius,
                                   detection.deformation_radius, self.planes, self.origin, was.detach(), now.detach(),
                                   surface.pinned, surface.body, surface.unit, detection.listed)  # fmt: skip
             records.infeasible.append(start.infeasible)
-            if self._reads(x):
-                self._check(r, detection.counts.tolist(), int(start.infeasible.sum()), records)
+            if self.reads:
+                self._check(r, counts, int(start.infeasible.sum()), records)
             begin = x
             x, *taken, _ = corrected(self, start.x, now, start, detection.listed)
+            at, own_center = x.detach(), start.own_center
             if barrier.self_contact:
-                start = replaced(start, own_center=start.own_center + (x - start.x).detach())
-            at = x.detach()
-            left, kept, *near = contact_near(at, self.origin, now.detach(), start.center, start.own_center,
+                own_center = own_center + (at - start.x.detach())
+            left, kept, *near = contact_near(at, self.origin, now.detach(), start.center, own_center,
                                              start.trust_radius, start.own_radius, surface.pinned,
                                              detection.listed)  # fmt: skip
-            swept_from = replaced(start, center=at, trust_radius=left)
+            swept_from = start._replace(center=at, trust_radius=left)
             limits, lengths, blocked, truncated = None, None, start.truncated, start.truncated
             if sweeps:
-                own = replaced(settings, sweeps=sweeps)
+                own = settings._replace(sweeps=sweeps)
                 swept = swept_substep(self, x, swept_from, now, Pairs(*near), own, policy, debug_step)
                 records.swept.append(swept)
                 x, limits, lengths, between = swept
@@ -182,10 +185,10 @@ class ContactStep:
                 x, truncated = torch.where(going, x, begin), torch.where(going[..., 0], truncated, records.truncated)
                 blocked = blocked & going[..., 0]
             records.truncated = truncated
-            records.found[r] = replaced(detection, fractions=start.fractions, truncated=start.truncated,
-                                        corrections=tuple(taken), limits=limits,
-                                        kept=kept if self._reads(x) else None, lengths=lengths, sweeps=sweeps,
-                                        going=going, resting=resting)  # fmt: skip
+            records.found[r] = detection._replace(fractions=start.fractions, truncated=start.truncated,
+                                                  corrections=tuple(taken), limits=limits,
+                                                  kept=kept if self.reads else None, lengths=lengths, sweeps=sweeps,
+                                                  going=going, resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.substeps < MOST_DETECTIONS:
@@ -248,20 +251,20 @@ class ContactStep:
     def _colliders_at(self, fraction: float) -> Tensor:
         if self.colliders is self.before:
             return self.before
-        return self.before + fraction * (self.colliders - self.before)
+        return self.before + min(1.0, fraction) * (self.colliders - self.before)
 
     def _sweep(self, x: Tensor, center: Tensor, trust_radius: Tensor, collider: Tensor, listed: Pairs,
                settings: SweepSettings, policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
         if self.begun.renews and settings.sweeps > 1:  # each with the bounds about its own start
             numbers, limits = settings.numbers, []
-            within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
+            within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
             for n in range(settings.sweeps):
-                one = replaced(settings if n + 1 == settings.sweeps else within, sweeps=1)
+                one = (settings if n + 1 == settings.sweeps else within)._replace(sweeps=1)
                 x, limit = self._sweep(x, center, trust_radius, collider, listed, one, policy, debug_step)
                 limits.append(limit)
             return x, torch.cat(limits, 1)
-        fields = replaced(self.fields, **{"energy_data": self.begun.data, **self.begun.renewed(x)}, x_start=x,
+        fields = self.fields._replace(**{"energy_data": self.begun.data, **self.begun.renewed(x)}, x_start=x,
                           center=center, trust_radius=trust_radius, collider=collider, collider_prev=self.before,
                           kappa=self.kappa, **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs,
                           lag_ptr=lagged.ptr, lag_entry=lagged.entry, floor_lag=self.floor_lag)  # fmt: skip
@@ -298,17 +301,17 @@ class ContactStep:
 
     def _finite(self, x: Tensor) -> Tensor:
         """x; raises where it is not finite, if it may be read."""
-        if self._reads(x) and not bool(torch.isfinite(x).all()):
+        if self.reads and not bool(torch.isfinite(x).all()):
             self._refuse_what_is_not_finite()
             raise RuntimeError(LOST.format("in the step"))
         return x
 
-    @property
-    def capacity(self) -> int:
+    def _capacity(self) -> int:
         """Pairs of all scenes that fit in a list."""
         surface, barrier, scenes = self.surface, self.barrier, self.x_prev.shape[0]
-        assert surface is not None and barrier is not None
-        if barrier.capacity is None and not self.x_prev.is_cuda:
+        if surface is None or barrier is None:
+            return 0
+        if barrier.capacity is None and self.reads:
             return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, LEAST_CAPACITY if scenes and barrier.capacity is None else 0)
 
@@ -400,6 +403,8 @@ def sweeps_of_substeps(sweeps: int, substeps: int) -> list[int]:
 
 def sweeps_of_substep(sweeps: int, planned: int, substep: int) -> int:
     """Number of sweeps of one substep. One beyond the planned ones has as many as the last of these, at least one."""
+    if planned == 1:
+        return sweeps
     shared = sweeps_of_substeps(sweeps, planned)
     return shared[substep] if substep < planned else max(shared[-1], min(sweeps, 1))
 
@@ -411,13 +416,13 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
     def sweep(x: Tensor, settings: SweepSettings) -> tuple[Tensor, Tensor]:
         return of._sweep(x, start.center, start.trust_radius, collider, listed, settings, policy, debug_step)
 
-    settings = replaced(settings, coarse=())  # the operator would correct without pairs
+    settings = settings._replace(coarse=())  # the operator would correct without pairs
     cycles = _cycles(of.model, settings.sweeps)
     if len(cycles) <= 1:
         return SweptSubstep(*sweep(x, settings))
     corrections, matrix = None, of.coarse_matrix
     numbers = settings.numbers
-    within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
+    within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
     limits, lengths, fractions = [], [], []
     for n, (corrects, count) in enumerate(cycles):
         ends = n + 1 == len(cycles)
@@ -428,11 +433,11 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
         if matrix is not None and corrects:
             if corrections is None or of.begun.renews:
                 fields = touching(of, x, collider, start, listed)
-                own = of.fields if of.begun.law is None else replaced(of.fields, **of.begun.renewed(x))
+                own = of.fields if of.begun.law is None else of.fields._replace(**of.begun.renewed(x))
                 corrections = Corrections(of.model, own, fields, matrix, settings)
             x, length = corrections.correct(x)
             lengths.append(length)
-        x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))
+        x, limit = sweep(x, (settings if ends else within)._replace(sweeps=count))
         limits.append(limit)
     return SweptSubstep(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None, fractions)
 
@@ -453,7 +458,7 @@ def _cycles(model: System, sweeps: int) -> list[tuple[bool, int]]:
 def of_going(substep: SweptSubstep, going: Tensor) -> SweptSubstep:
     """Result of a substep in the scenes that go on, bool [B, 1, 1]; in others it is discarded."""
     lengths = substep.lengths
-    return substep if lengths is None else replaced(substep, lengths=torch.where(going[:, 0], lengths, 0.0))
+    return substep if lengths is None else substep._replace(lengths=torch.where(going[:, 0], lengths, 0.0))
 
 
 def record_substeps(model: System, x: Tensor, substeps: Sequence[SweptSubstep]) -> None:
@@ -546,7 +551,7 @@ class Records:
 
     def outcome(self, capacity: int, x: Tensor) -> Outcome:
         """capacity: Pairs of all scenes that fit.  x: [B, V, 3] at the start of the step."""
-        counts, smallest = (_stack([getattr(d, name) for d in self.found]) for name in ("counts", "smallest"))
+        counts, smallest = _stack([d.counts for d in self.found]), _stack([d.smallest for d in self.found])
         infeasible = _stack(self.infeasible) if self.infeasible else torch.zeros_like(smallest, dtype=torch.int64)
         truncated = torch.zeros_like(x[..., 0], dtype=torch.bool) if self.truncated is None else self.truncated
         return Outcome(counts, infeasible, capacity, truncated, smallest)

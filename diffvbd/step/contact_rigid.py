@@ -48,9 +48,9 @@ def _run(*args: Any) -> Corrected:
 
 def _reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, needs: Sequence[bool]) -> list[Any]:
     """Adjoints of the fields. saved: These, and what each body took."""
-    f, taken, (model, *options) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS], rest
+    f, taken, (model, h, eps, majorizes) = ops.TouchingFields(*saved[:_FIELDS]), saved[_FIELDS], rest
     wants = dict(zip(f._fields, needs, strict=True))
-    own = rigid_reverse(f, taken, bars[0], model._data_count, *options, wants["energy_data"])._asdict()
+    own = rigid_reverse(f, taken, bars[0], model._data_count, h, eps, majorizes, wants["energy_data"])._asdict()
     by_kappa = own.pop("by_kappa")
     if wants["kappa"]:
         own["kappa"] = -sum_of_scenes(by_kappa, listed_of(f), f.x.shape[0])

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.ops import contact as ops_contact
+from diffvbd import ops
+from diffvbd.adjoint.contact import Pairs, friction_lag
 from diffvbd.reference.contact import loads
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import SCENES
@@ -28,7 +29,8 @@ def listed_of(name: str, device: str) -> tuple[list[Tensor], list[Tensor]]:
 @pytest.mark.parametrize("name", ["stacked", "batched", "folded"])
 def test_one_face_bears_the_load_of_all(name: str, device: str) -> None:
     given, listed = listed_of(name, device)
-    state, force, _ = ops_contact.pair_lag(*given, *listed)
+    x, collider, kappa, origin = given
+    state, force, _ = ops.direct.contact_lag(x, origin, collider, kappa, *listed)
     rows = listed[0][listed[0][:, 4] >= 0].long().cpu()
     own, found = state[: len(rows), 0].cpu(), force[: len(rows)].cpu()
     expected = loads(own, rows[:, :4], rows[:, 4], rows[:, 5], listed[-1].long().cpu())
@@ -45,9 +47,10 @@ def test_faces_that_sum_to_less_than_nothing_bear_nothing(device: str) -> None:
     x, kappa = (given[k].clone().requires_grad_() for k in (0, 2))
 
     def weighed(counts: Tensor) -> Any:
-        state, force, _ = ops_contact.pair_lag(x, given[1], kappa, given[3], listed[0], counts, *listed[2:])
+        own = Pairs(listed[0], counts, *listed[2:4])
+        force = friction_lag(x, given[1], kappa, kappa.new_ones((1,)), None, given[3], listed[4], own)[:, 0]
         between = faces & (force.detach() >= 0)
-        return force, torch.autograd.grad((force * between).sum() + 0 * state.sum(), (x, kappa))
+        return force, torch.autograd.grad((force * between).sum(), (x, kappa))
 
     force, slopes = weighed(constants)
     assert not force[faces].any() and all(float(slope.abs().max()) == 0 for slope in slopes)

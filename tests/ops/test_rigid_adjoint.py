@@ -73,8 +73,12 @@ def test_adjoint_is_that_of_central_differences(name: str, device: str, monkeypa
     model, x, v = (t.to(device) for t in pile(*energies, **options))
     leaves, shared = leaves_of(model, x, v), []
     original = rigid_contact.rigid_reverse
-    monkeypatch.setattr(rigid_contact, "rigid_reverse",
-                        lambda f, taken, *rest: (shared.append(taken[..., 1] >= 0), original(f, taken, *rest))[1])  # fmt: skip
+
+    def reverse(fields: Any, taken: Tensor, *rest: Any) -> Any:
+        shared.append(taken[..., 1] >= 0)
+        return original(fields, taken, *rest)
+
+    monkeypatch.setattr(rigid_contact, "rigid_reverse", reverse)
     for leaf in leaves.values():
         leaf.requires_grad_()
     found = torch.autograd.grad(objective(model, leaves), list(leaves.values()))
