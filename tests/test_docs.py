@@ -33,7 +33,8 @@ def slug(heading: str) -> str:
 
 
 # What a page computes may take a minute: those that everyone reads first are quick.
-LONG = [page for page in PAGES if page.parent.name == "guides" or page.name == "performance.md"]
+LENGTHY = ("performance", "attachments", "damping")
+LONG = [page for page in PAGES if page.parent.name == "guides" or page.stem in LENGTHY]
 QUICK = [page for page in PAGES if page not in LONG]
 
 

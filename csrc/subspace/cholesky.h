@@ -77,7 +77,7 @@ DIFFVBD_FN void factor(const Team& team, int32_t count, double* a, uint64_t* blo
       if (c > r) return;
       double* to = row_of(r) + size * own + int64_t{kBlock} * nth_bit(below, c);
       const double *x = row_of(r) + size * own + kBlock * k, *y = row_of(c) + kBlock * k;
-      for (int j = 0; j < kBlock; ++j) {
+      for (int j = 0; j < (c < r ? kBlock : own + 1); ++j) {
         double sum = to[j];
         for (int e = 0; e < kBlock; ++e) sum -= x[e] * y[size * j + e];
         to[j] = sum;

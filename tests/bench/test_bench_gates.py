@@ -1,20 +1,23 @@
 """Benchmarks whose quick run is a gate: what they measure of physics, of advice and of silence holds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from helpers.marks import quick_and_slow
 
 import diffvbd as dv
-from bench import contact_gates, extremes, tables
+from bench import contact, contact_gates, extremes, tables
 from bench.__main__ import main
 from diffvbd.testing import tolerance
 
 QUICK = [case for case in extremes.FEATURE_CASES if case.axis in extremes.QUICK_AXES]
 QUICK_EXTREMES = [case for case in extremes.CASES if case.quick]
 FEW = ("coarse, free", "BDF2, free", "floor, friction", "pairs, friction")
+LONG = ("pairs, friction", "float32, size 1e-4 m")
 
 
 def results_of(name: str, out: Path, *arguments: str) -> dict[str, Any]:
@@ -43,6 +46,13 @@ def test_advice_is_kept_and_sure(tmp_path: Path) -> None:
         assert row["reached"] and 0 < row["true"] <= row["asked"] and row["unsure"] < 0.5 * row["asked"]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_crosses_in_a_few_scenes_that_are_drawn(seed: int) -> None:
+    crossings, lost, steps, cut = contact._crossings(seed, "cpu", batch=2)
+    assert crossings == lost == 0 and steps > 0 and cut > 0
+
+
+@pytest.mark.slow
 def test_nothing_crosses_in_scenes_that_are_drawn(tmp_path: Path) -> None:
     rows = results_of("contact", tmp_path, "--only", "fuzz")["fuzz"]["rows"]
     assert sum(row["scene_steps"] for row in rows) >= 120  # a batch ends where a scene leaves its bodies no way
@@ -50,12 +60,11 @@ def test_nothing_crosses_in_scenes_that_are_drawn(tmp_path: Path) -> None:
     assert max(row["cut"] for row in rows) > 0.05
 
 
-def test_gates_of_contact_that_are_met(tmp_path: Path) -> None:
-    results = results_of("contact_gates", tmp_path, "--only", "gradient,violent")
-    for group in ("gradient", "violent"):
-        for row in results[group]["rows"]:
-            assert {"gate", "case", "value", "reference", "bar", "seconds", "note"} <= set(row)
-            assert row["met"] and row["seconds"] > 0, row
+@pytest.mark.parametrize("group", quick_and_slow(["gradient"], ["gradient", "violent"]))
+def test_gates_of_contact_that_are_met(group: str, tmp_path: Path) -> None:
+    for row in results_of("contact_gates", tmp_path, "--only", group)[group]["rows"]:
+        assert {"gate", "case", "value", "reference", "bar", "seconds", "note"} <= set(row)
+        assert row["met"] and row["seconds"] > 0, row
 
 
 def raising(device: str) -> None:
@@ -96,10 +105,12 @@ def test_two_ranks_have_the_bits_of_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(c, marks=[] if c.feature in FEW else pytest.mark.slow) for c in QUICK],
+    quick_and_slow([c for c in QUICK if c.feature in FEW and (c.feature, c.axis) != LONG], QUICK),
     ids=lambda c: f"{c.feature}: {c.axis}",
 )
 def test_extremes_are_finite_cross_nothing_and_are_not_silent(case: extremes.Case) -> None:
+    if case.feature.startswith("pairs, ") and case.axis.startswith("float32"):
+        case = replace(case, steps=8)  # of which each takes a second; "pairs" takes all
     row = extremes.check_feature(case)
     assert row["finite"] and not row["raised"] and not row["silent"] and row["crossings"] == 0, row
     if case.axis == "none":

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import DEVICES
-from helpers.marks import quick_and_slow, slow
+from helpers.marks import hours, slow
 from helpers.spreads import PARALLEL, assert_near_contact
 from helpers.touching import TIME_STEP, pressed, stack
 from torch import Tensor
@@ -18,6 +18,8 @@ from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import SCENES, Scene, compiled, noise, unrolled
 
 SPACE = dv.CoarseSpace(functions=6, groups=2, every=2)
+EVERY = [(name, *run) for name in SCENES for run in ((1, 7), (2, 6))]  # steps, sweeps
+QUICK, LONG = [(name, 1, 7) for name in ("obstacles", "batched", "thrown")], ("fast", 2, 6)
 
 
 @functools.cache
@@ -39,8 +41,10 @@ def check(scene: Scene, steps: int, sweeps: int, device: str, rounding: float = 
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("steps", "sweeps"), [(1, 7), slow(2, 6)])
-@pytest.mark.parametrize("name", quick_and_slow(("obstacles", "batched", "thrown"), SCENES))
+@pytest.mark.parametrize(
+    ("name", "steps", "sweeps"),
+    [run if run in QUICK else (hours if run == LONG else slow)(*run) for run in EVERY],
+)
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, device: str) -> None:
     lengths = check(scene_of(name), steps, sweeps, device, PARALLEL.get(name, 1.0))
     assert (lengths == 1).any() or name in ("fast", "thrown")

@@ -6,6 +6,7 @@ energy that turns in the air: the straight ways of its vertices stretch it, and 
 
 import pytest
 import torch
+from helpers.marks import slow
 
 import diffvbd as dv
 from diffvbd import reference
@@ -30,8 +31,7 @@ def energy(model: dv.Model, body: dv.Model, x: torch.Tensor, v: torch.Tensor) ->
     return float((0.5 * model.mass[:, None] * v.square()).sum()) + elastic
 
 
-@pytest.mark.parametrize("sweeps", (1, 5, 10))
-@pytest.mark.parametrize("speed", (2.0, 8.0))
+@pytest.mark.parametrize(("speed", "sweeps"), [(2.0, 1), (2.0, 5), (2.0, 10), (8.0, 1), (8.0, 5), slow(8.0, 10)])
 def test_an_impact_gains_no_energy(speed: float, sweeps: int) -> None:
     model, v = heap(speed)
     body, x = dv.Model(model.mesh), model.rest_points

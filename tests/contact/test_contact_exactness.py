@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import DEVICES
-from helpers.marks import slow
+from helpers.marks import hours, slow
 from helpers.spreads import PARALLEL, assert_near_contact
 
 import diffvbd as dv
@@ -57,8 +57,9 @@ def check(name: str, steps: int, sweeps: int, device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("name", "steps", "sweeps"),
-    [(name, *run) if (name, *run) in QUICK else slow(name, *run) for name in SCENES for run in RUNS],
-)
+    [run if run in QUICK else (hours if run == ("fast", 4, 5) else slow)(*run)
+     for run in ((name, *run) for name in SCENES for run in RUNS)],
+)  # fmt: skip
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, device: str) -> None:
     check(name, steps, sweeps, device)
 
@@ -67,9 +68,9 @@ def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps:
 @pytest.mark.parametrize(
     ("name", "steps", "sweeps"),
     [*(slow(name, *OTHERS.get((name, run), run)) for name in SCENES for run in SLOW),
-     *(pytest.param(name, *run, marks=pytest.mark.slow if i % 2 == (run == LONG[0]) else pytest.mark.hours)
+     *((slow if i % 2 == (run == LONG[0]) else hours)(name, *run)
        for i, name in enumerate(SCENES) for run in LONG if name not in SHORT),
-     *(pytest.param(name, *run, marks=pytest.mark.hours) for name in SCENES if name not in SHORT for run in HOURS)],
+     *(hours(name, *run) for name in SCENES if name not in SHORT for run in HOURS)],
 )  # fmt: skip
 def test_gradients_of_longer_runs(name: str, steps: int, sweeps: int, device: str) -> None:
     check(name, steps, sweeps, device)

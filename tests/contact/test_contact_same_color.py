@@ -14,6 +14,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.colors import colors
+from helpers.marks import slow
 from helpers.spreads import assert_near_contact
 from torch import Tensor
 
@@ -87,7 +88,7 @@ def met(model: dv.Model, part: Substep, x: Tensor) -> tuple[int, int]:
     return inside, third
 
 
-@pytest.mark.parametrize(("name", "sweeps"), [("two_tets", 1), ("two_on_one", 1), ("two_on_one", 5), ("twins", 1),
+@pytest.mark.parametrize(("name", "sweeps"), [("two_tets", 1), ("two_on_one", 1), slow("two_on_one", 5), ("twins", 1),
                                               ("twins", 5), ("batch_of_stacks", 2), ("folded", 2)])  # fmt: skip
 def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
     scene, steps = SCENES[name](), 1 if name == "folded" else 2

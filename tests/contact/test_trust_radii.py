@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -229,7 +230,7 @@ def test_as_plain_torch_says(device: str, speed: float, pinned: bool, plane: boo
 
 # one body; more than a CUDA block has warps, and more than it takes; bodies larger than a warp takes, and scenes larger
 # than a block does
-@pytest.mark.parametrize(("bodies", "points"), [(1, 2), (12, 2), (40, 2), (2, 7), (2, 14)])
+@pytest.mark.parametrize(("bodies", "points"), [(1, 2), (12, 2), (40, 2), (2, 7), slow(2, 14)])
 def test_in_scenes_of_other_sizes(device: str, bodies: int, points: int) -> None:
     check(given(device, speed=0.5, pinned=True, plane=True, self_contact=True, bodies=bodies, points=points))
 

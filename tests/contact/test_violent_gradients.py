@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from helpers.marks import hours, slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -32,6 +33,8 @@ SCENES = (
     (60.0, 10.0, 3, 2, "plane", True, 1 / 300),
     (60.0, 40.0, 2, 3, "floor", False, 1 / 60),
 )
+RUNS = [(number, sweeps) for number in range(len(SCENES)) for sweeps in (2, 8)]
+LONG = [(6, 8), (9, 8), (11, 2), (11, 8)]
 TRIES = 4  # numbers of sweeps, since with some of them a scene lies at a kink
 
 
@@ -121,14 +124,11 @@ def errors(number: int, sweeps: int, steps: int) -> list[float]:
     return out
 
 
-@pytest.mark.parametrize("sweeps", (2, 8))
-@pytest.mark.parametrize("number", range(len(SCENES)))
+@pytest.mark.parametrize(("number", "sweeps"), [slow(*run) if run in LONG else run for run in RUNS])
 def test_one_step(number: int, sweeps: int) -> None:
     check(number, sweeps, steps=1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sweeps", (2, 8))
-@pytest.mark.parametrize("number", range(len(SCENES)))
+@pytest.mark.parametrize(("number", "sweeps"), [(hours if run in [(9, 8), (10, 8)] else slow)(*run) for run in RUNS])
 def test_three_steps(number: int, sweeps: int) -> None:
     check(number, sweeps, steps=3)

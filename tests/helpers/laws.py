@@ -1,6 +1,7 @@
 """Laws of one's own in tests: compiled once for all processes of a session, in a temporary folder; a beam of one law
 with every invariant and function, and all its inputs."""
 
+import functools
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -33,9 +34,9 @@ MESH = dv.mesh.beam(3, 2, 2, size=(0.3, 0.2, 0.2))
 PINNED = MESH.points[:, 0] == 0.0
 
 
-def law_of(text: str = TEXT) -> Any:
-    law = dv.law(text, **VALUES, a0=(1.0, 0.3, -0.2)) if text == TEXT else dv.law(text, mu=4e4, lam=9e4)
-    return law
+@functools.cache  # sympy takes seconds
+def law_of(text: str) -> Any:
+    return dv.law(text, **VALUES, a0=(1.0, 0.3, -0.2)) if text == TEXT else dv.law(text, mu=4e4, lam=9e4)
 
 
 def model_of(*energies: Any, pinned: Any = PINNED, text: str = TEXT) -> dv.Model:

@@ -11,6 +11,11 @@ def slow(*values: Any) -> Any:
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+def hours(*values: Any) -> Any:
+    """A case that is run by hand before a release, like the others at still greater length."""
+    return pytest.param(*values, marks=pytest.mark.hours)
+
+
 def quick_and_slow(quick: Iterable[Any], every: Iterable[Any]) -> list[Any]:
     """The values of `every` for one argument, slow where they are not among the quick ones."""
     quick = list(quick)

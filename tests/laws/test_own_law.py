@@ -12,7 +12,7 @@ import torch
 from helpers.coupled import coupled
 from helpers.coupled import inputs_of as inputs_of_coupled
 from helpers.executed import assert_executed, assert_like_differences, run_of
-from helpers.laws import MESH, PINNED, STABLE, VALUES, compiled_laws, inputs_of_law, law_of, model_of
+from helpers.laws import LOG, MESH, PINNED, STABLE, TEXT, VALUES, compiled_laws, inputs_of_law, law_of, model_of
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -56,7 +56,7 @@ def test_batches_floors_anchors() -> None:
 
 def held_and_pulled(**options: Any) -> tuple[dv.Model, dict[str, Tensor]]:
     """Bodies of the law with springs, tendons and pressure, and every input."""
-    model = coupled(law=law_of(), **options)
+    model = coupled(law=law_of(TEXT), **options)
     inputs = inputs_of_coupled(model)
     stiff = inputs["mu"]
     inputs |= {"c": stiff / 5, "m": stiff / 4, "k": stiff / 2, "s": VALUES["s"] + 0 * stiff}
@@ -82,7 +82,7 @@ def test_rest_states_with_couplings() -> None:
     end, route = (dv.Embedding.of_points(MESH, p) for p in ([[0.3, 0.1, 0.12]], [[0.28, 0.2, 0.1], [0.05, 0.2, 0.07]]))
     springs = dv.Springs(end, torch.tensor([[0.35, 0.3, 0.2]], dtype=F64), 900.0, 0.1)
     model = model_of(springs, dv.Tendons(route, [[0, 1]], 500.0, 0.2))
-    law, x, solver = law_of(), model.rest_points, dv.VBD(1.0, 0, subspace="coarse")
+    law, x, solver = law_of(TEXT), model.rest_points, dv.VBD(1.0, 0, subspace="coarse")
     names = ("spring_stiffness", "spring_rest_length", "spring_points", "tendon_stiffness", "tendon_rest_length")
     inputs = {f"{e.name}_{k}": v for e in model.couplings for k, v in model.constants(e).items()}
     inputs = {name: inputs[name] for name in names} | {k: v.expand(model.num_tets) for k, v in law.values.items()}
@@ -109,12 +109,9 @@ def test_rest_states_with_couplings() -> None:
 
 def test_a_step_to_an_infinite_energy_is_not_taken() -> None:
     """The first whole Newton step stretches fibres until the exponential overflows."""
-    model = coupled(law=law_of())
+    model = coupled(law=law_of(TEXT))
     done = dv.equilibrium(model, model.rest_points, dv.VBD(1.0, 0))
     assert done.converged and float((done.x - model.rest_points).abs().max()) > 5e-3
-
-
-LOG = "mu/2*(I1 - 3) - mu*log(J) + lam/2*log(J)**2"
 
 
 @pytest.mark.hours  # other laws are compiled; all of their terms are in TEXT
@@ -139,7 +136,7 @@ def test_coarse_corrections() -> None:
 def test_coarse_corrections_know_of_stiff_fibres() -> None:
     """400 times as stiff as the rest: with coarse corrections eight sweeps are nearer than 20 without."""
     mesh = dv.mesh.box((13, 3, 3), (0.8, 0.1, 0.1))
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] == 0.0, energies=(law_of(),))
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] == 0.0, energies=(law_of(TEXT),))
     x = model.rest_points
 
     def end(sweeps: int, subspace: Any) -> Tensor:

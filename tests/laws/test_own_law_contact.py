@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.laws import LOG, STABLE, compiled_laws
+from helpers.laws import STABLE, TEXT, compiled_laws, law_of
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -23,7 +23,7 @@ def scene_of(name: str, text: str) -> Scene:
     """A scene of contact whose bodies are of a law of one's own; its inputs mu and lam are the law's."""
     scene = SCENES[name]()
     model = scene.model
-    energies = (dv.law(text, mu=2e4, lam=4e4), *(e for e in model.energies if not isinstance(e, dv.StableNeoHookean)))
+    energies = (law_of(text), *(e for e in model.energies if not isinstance(e, dv.StableNeoHookean)))
     scene.model = dv.Model(model.mesh, pinned=model.pinned, energies=energies, colliders=model.colliders)
     return scene
 
@@ -47,7 +47,7 @@ def test_the_built_in_law_as_ones_own(subspace: Any) -> None:
 
 @pytest.mark.parametrize(("name", "steps", "sweeps"), [("stacked", 1, 1), ("stacked", 2, 4), ("fast", 1, 4)])
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int) -> None:
-    scene = scene_of(name, LOG)
+    scene = scene_of(name, TEXT)
     result, parts = compiled(scene, steps, scene.solver(sweeps))
     expected = unrolled(scene, steps, scene.solver(sweeps), parts)
     for key, value in expected.items():
@@ -57,7 +57,7 @@ def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps:
 
 @pytest.mark.parametrize("subspace", [None, "coarse"])
 def test_central_differences(subspace: Any) -> None:
-    scene = scene_of("stacked", LOG)
+    scene = scene_of("stacked", TEXT)
     solver, weight = scene.solver(3, subspace=subspace), torch.linspace(-1, 1, scene.x.numel()).view_as(scene.x)
     leaves = scene.leaves()
 
@@ -81,11 +81,12 @@ def test_a_block_pressed_between_planes_has_its_closed_form_load() -> None:
     size, mu, lam, kappa, dhat = 0.2, 2e4, 4e4, 1e7, 5e-4
     planes = [dv.colliders.Plane((0, 0, 0)), dv.colliders.Plane((0, 0.9 * size, 0), (0, -1, 0))]
     mesh, weak = dv.mesh.box(4, size), dv.Anchor(0.05)  # against sliding
-    energies = (dv.law(LOG, mu=mu, lam=lam), dv.PairBarrier(kappa, dhat=dhat, self_contact=False), weak)
+    energies = (law_of(TEXT), dv.PairBarrier(kappa, dhat=dhat, self_contact=False), weak)
     model = dv.Model(mesh, energies=energies, colliders=planes)
     rest = model.rest_points
     squeezed = rest * rest.new_tensor([1.0, 0.89, 1.0]) + rest.new_tensor([0.0, 0.005 * size, 0.0])
-    y = dv.equilibrium(model, squeezed, dv.VBD(1.0, 1), gravity=(0, 0, 0)).x[:, 1]
+    given = {"mu": mu, "lam": lam, "c": 0.0, "m": 0.0, "k": 0.0, "gravity": (0, 0, 0)}
+    y = dv.equilibrium(model, squeezed, dv.VBD(1.0, 1), **given).x[:, 1]
     top, bottom = rest[:, 1] > size - 1e-9, rest[:, 1] < 1e-9
     stretch = float(y[top].mean() - y[bottom].mean()) / size
     wide, gap = 1.0, 0.9 * size - y[top]

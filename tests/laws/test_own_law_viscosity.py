@@ -1,11 +1,12 @@
 """Claim: a law of one's own has the viscosity that the built-in law has, with the exact gradient of the executed step:
 in sweeps, corrections, integrators and contact; it damps no rigid motion."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
-from helpers.laws import LOG, STABLE, compiled_laws, inputs_of_law, model_of
+from helpers.laws import STABLE, TEXT, compiled_laws, inputs_of_law, model_of
 from helpers.paths import needs_csrc
 from torch import Tensor
 
@@ -15,6 +16,15 @@ from diffvbd.testing import evaluate, relative_error
 pytestmark = [needs_csrc, pytest.mark.slow]  # a law is compiled
 __all__ = ["compiled_laws"]
 F64 = torch.float64
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_with_less_optimisation(compiled_laws: None) -> Iterator[None]:
+    """But for the law without viscosity, which the other tests have, too."""
+    model_of(text=TEXT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DIFFVBD_QUICK", "1")
+        yield
 
 
 def viscous(model: dv.Model, jitter: float = 0.01) -> dict[str, Tensor]:
@@ -39,7 +49,7 @@ def both(model: dv.Model, solver: dv.VBD, inputs: dict[str, Any], second: Any, b
 
 @pytest.mark.parametrize("sweeps", [1, 4])
 def test_gradients_are_those_of_the_executed_sweeps(sweeps: int) -> None:
-    model = model_of(text=LOG)
+    model = model_of(text=TEXT)
     both(model, dv.VBD(0.01, sweeps, relaxation=1.3), viscous(model), (model, dv.Unrolled()))
 
 
@@ -54,7 +64,7 @@ def test_the_built_in_law_as_ones_own(options: Any) -> None:
 @pytest.mark.parametrize("options", [{"subspace": "coarse"}, {"integrator": dv.SDIRK2()}, {"integrator": dv.BDF2()}],
                          ids=str)  # fmt: skip
 def test_central_differences(options: Any) -> None:
-    model, solver = model_of(text=LOG), dv.VBD(0.01, 3, **options)
+    model, solver = model_of(text=TEXT), dv.VBD(0.01, 3, **options)
     x, v = model.rest_points, 0.3 * torch.cos(torch.arange(3 * model.num_vertices, dtype=F64)).view(-1, 3)
 
     def end(viscosity: Tensor, mu: Tensor) -> Tensor:
@@ -71,12 +81,12 @@ def test_central_differences(options: Any) -> None:
 
 def test_no_rigid_motion_is_damped() -> None:
     """A turn by half a radian in one step is where the step ends, with viscosity too; a stretch by a tenth is not."""
-    model, solver = model_of(text=LOG, pinned=None), dv.VBD(1e-2, 3, start="predictor", subspace=None)
+    model, solver = model_of(text=TEXT, pinned=None), dv.VBD(1e-2, 3, start="predictor", subspace=None)
     x, turn = model.rest_points, torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.2], [0.5, 0.0, 0.1],
                                                                       [-0.2, -0.1, 0.0]], dtype=F64))  # fmt: skip
     for motion, is_rigid in ((turn, True), (1.1 * torch.eye(3, dtype=F64), False)):
         y = x @ motion.mT
-        end, free = (dv.step(model, x, (y - x) / 1e-2, solver, gravity=(0.0, 0.0, 0.0), **given)[0]
-                     for given in ({"viscosity": 500.0, "volume_viscosity": 500.0}, {}))  # fmt: skip
+        end, free = (dv.step(model, x, (y - x) / 1e-2, solver, gravity=(0.0, 0.0, 0.0), viscosity=rate,
+                             volume_viscosity=rate)[0] for rate in (500.0, 0.0))  # fmt: skip
         assert (float((end - y).abs().max()) < 1e-12) is is_rigid
         assert is_rigid or float((end - free).abs().max()) > 1e-3 * float((y - x).abs().max())

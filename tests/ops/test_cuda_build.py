@@ -96,7 +96,7 @@ def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
 UNITS = [*KERNELS, *map(Path, INSTANCES)]
 TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(UNITS)]
 STEMS = [k.stem for k in UNITS]
-QUICK = ("scene_reverse_float", "contact_float")  # the sweep, all energies with their adjoints, pairs
+QUICK = ("contact_float",)  # pairs; the slow ones have the sweep and all energies with their adjoints
 HOURS = ("reverse_state", "reverse_material")  # instances of what reverse_rest has, with fewer gradients
 
 
@@ -247,6 +247,7 @@ def test_jit_compiles_once_for_what_it_depends_on(fake: Fake, monkeypatch: pytes
     assert native.jit_build() == first and len(fake.runs()) == 4
 
 
+@pytest.mark.slow
 def test_jit_survives_a_killed_build(fake: Fake) -> None:
     """Both builds are processes of their own with a time limit, so that a hang fails this test, not the whole suite."""
     fake.mode("hang")

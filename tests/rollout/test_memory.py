@@ -172,7 +172,7 @@ ROLLOUTS = [
 ROLLOUTS_OF = [(*case, True) for case in ROLLOUTS] + [(*case, False) for case in ROLLOUTS if case[0] == "recompute"]
 # each tape, schedule and choice of states once
 ONCE = [("full", None, "last"), ("full", 5, 3), ("compact", 4, "all"), ("recompute", None, "all")]
-ROLLOUTS_OF = [case if (case[0], *case[2:4]) in ONCE else slow(*case) for case in ROLLOUTS_OF]
+ROLLOUTS_OF = [case if case[4] and (case[0], *case[2:4]) in ONCE else slow(*case) for case in ROLLOUTS_OF]
 
 
 @pytest.mark.parametrize(("tape", "steps", "schedule", "save", "pinned"), ROLLOUTS_OF)

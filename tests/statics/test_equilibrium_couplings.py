@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.coupled import coupled, inputs_of
-from helpers.marks import quick_and_slow
+from helpers.marks import quick_and_slow, slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -122,7 +122,7 @@ def test_float32_rests_where_float64_does(device: str) -> None:
     assert float((ends[0] - ends[1]).abs().max()) < 1e-4 < float((ends[0] - double.rest_points).abs().max())
 
 
-@pytest.mark.parametrize("short", (2e-3, 1e-2))
+@pytest.mark.parametrize("short", (2e-3, slow(1e-2)))
 def test_hinges_between_stiff_links_bend_until_moments_balance(short: float) -> None:
     finger = Linked.of(8)
     inputs = {"tendon_rest_length": 0.14 - short, "tendon_stiffness": 10.0}
@@ -132,6 +132,7 @@ def test_hinges_between_stiff_links_bend_until_moments_balance(short: float) -> 
     assert finger.angle(x) == pytest.approx(finger.balanced(float(tension)), rel=tolerance("beam_of_tets"))
 
 
+@pytest.mark.slow
 def test_each_scene_of_a_batch_rests_as_it_does_alone(device: str) -> None:
     model = coupled(gas=True, device=device)
     x, pressure = model.rest_points, torch.tensor([[0.0], [2000.0]], dtype=torch.float64, device=device)

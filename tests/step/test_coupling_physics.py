@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.coupled import hollow_box
+from helpers.marks import hours, slow
 
 import diffvbd as dv
 from diffvbd.testing import tolerance
@@ -181,7 +182,7 @@ def blown(h: float, sweeps: int, *, gas: bool = False, explicit: bool = False, d
     return (motion.x - x)[:, x[:, 0] > 0.0999, 1].mean(1).double()
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.hours)])
+@pytest.mark.parametrize("dtype", [slow(torch.float64), hours(torch.float32)])
 def test_a_blown_finger_moves_alike_at_long_and_short_steps(dtype: torch.dtype) -> None:
     short, long = blown(1e-3, 8, dtype=dtype), blown(1e-2, 60, dtype=dtype)
     assert float(short[250:].mean()) < -2e-3

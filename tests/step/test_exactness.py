@@ -49,7 +49,7 @@ def table(request: pytest.FixtureRequest):
 
 def pairwise() -> tuple[list[tuple], list[tuple]]:
     """Quick rows and slow ones: each case with every sweep count; mesh kinds and steps rotate, so that all their pairs
-    occur. One sweep is always quick; longer runs and larger meshes are so for every sixth case."""
+    occur. One sweep is always quick; longer runs and larger meshes are so for every twelfth case."""
     rows, quick = [], []
     for i, case in enumerate(CASES):
         for j, sweeps in enumerate(SWEEPS):
@@ -59,7 +59,7 @@ def pairwise() -> tuple[list[tuple], list[tuple]]:
         rows.append((case, KINDS[(i + 1) % 3], "medium", 5, 1))
     for case, kind, size, sweeps, steps in rows:
         short = size == "small" and (sweeps == 1 or (sweeps < 20 and steps == 1))
-        if short or list(CASES).index(case) % 6 == 0:
+        if short or list(CASES).index(case) % 12 == 0:
             quick.append((case, kind, size, sweeps, steps))
     rows += [("plain", "delaunay", "large", 2, 1), ("paper", "random", "large", 1, 4)]
     rows += [("floor_filtered", "structured", "large", 5, 1), ("inverted", "delaunay", "large", 1, 1)]
