@@ -57,7 +57,7 @@ class ContactStep:
         self.colliders = self.before if colliders is before else colliders.contiguous()
         self.fields = begun.fields(model, prepared)
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
-        self.surface, self.barrier = model.surface_of_contact, model.contact
+        self.surface, self.barrier, self.bodies = model.surface_of_contact, model.contact, bodies_of(model)
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
         self.none = begun.x_prev.new_empty((0,))
         self.planes = self.none if self.floor_data is None else self.floor_data.detach()
@@ -231,7 +231,7 @@ class ContactStep:
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """The step with friction on a floor and without pairs: only the floor limits motion."""
         x, none = self.x_prev, no_pairs(self.x_prev, math.prod(self.x_prev.shape[:2]))
-        free, pinned, labels = bodies_of(self.model)[2:]
+        free, pinned, labels = self.bodies[2:]
         body = labels[: x.shape[1]].long()
         scenes, bodies = len(x), len(free)
         far, nowhere = x.new_full((scenes, bodies + 1), FAR), x.new_zeros((scenes, bodies, 3))

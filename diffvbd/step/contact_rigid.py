@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -16,13 +16,6 @@ from ..ops.contact import Corrected, SubstepStart, rigid_correct, rigid_reverse
 # --- the rigid correction of bodies that touch ------------------------------------------------------------------------
 
 _FIELDS = len(ops.TouchingFields._fields)
-
-
-def correct(model: System, fields: ops.TouchingFields, time_step: float, friction_eps: float,
-            majorizes: bool = False) -> Corrected:  # fmt: skip
-    """State after a rigid correction of every free body; all but x is index data. friction_eps: [m], 0 without
-    friction. majorizes: As of rigid_correct(). Differentiable in ops.TOUCHING_ADJOINTS."""
-    return Corrected(*_correct(*[t.contiguous() for t in fields], model, time_step, friction_eps, majorizes))
 
 
 def bodies_of(model: System) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -76,17 +69,19 @@ BLOCKED = 0.01  # of its displacement in the step plus dhat: a body that misses 
 
 def corrected(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs,
               majorizes: bool = False) -> Corrected:  # fmt: skip
-    """State after a rigid correction of a step; majorizes as of correct()."""
+    """State after a rigid correction of every free body; all but x is index data. majorizes: As of rigid_correct().
+    Differentiable in ops.TOUCHING_ADJOINTS."""
     numbers = of.prepared.settings.numbers
-    eps = 0.0 if of.model.friction is None else numbers.friction_eps
-    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, majorizes)
+    eps = 0.0 if of.model.friction is None else numbers.friction_eps  # [m], 0 without friction
+    fields = [t.contiguous() for t in touching(of, x, collider, start, listed)]
+    return Corrected(*_correct(*fields, of.model, numbers.time_step, eps, majorizes))
 
 
 def touching(of: Any, x: Tensor, collider: Tensor, start: SubstepStart, listed: Pairs) -> ops.TouchingFields:
     """Fields of the rigid correction, at x [B, V, 3]."""
-    lagged = of.lagged
+    lagged, bodies = of.lagged, cast("tuple[Tensor, Tensor, Tensor, Tensor, Tensor]", of.bodies)
     return ops.TouchingFields(
-        x, of.x_prev, of.begun.y, of.fields.mass, of.begun.at(x).data, of.origin, *bodies_of(of.model), collider,
+        x, of.x_prev, of.begun.y, of.fields.mass, of.begun.at(x).data, of.origin, *bodies, collider,
         of.before, of.kappa, *listed, of.lag, lagged.pairs, lagged.ptr, lagged.entry, of.floor_lag, start.center,
         start.trust_radius,
     )  # fmt: skip
