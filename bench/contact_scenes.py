@@ -299,7 +299,7 @@ def risen(number: int, device: str) -> dict[str, float]:
 
     def note(part: str, x: Tensor, to: Tensor) -> None:
         before, after = potential(x.detach()), potential(to.detach())
-        now["size"] = now["size"] or before
+        now["size"], now["swept"] = now["size"] or before, now["swept"] or part == PARTS[2]
         worst[part] = max(worst.get(part, -math.inf), (after - before) / now["size"])
 
     def watched(owner: Any, name: str, part: str, read: Callable[[Any], Tensor]) -> Any:
@@ -315,7 +315,7 @@ def risen(number: int, device: str) -> dict[str, float]:
     detect, start, corrected = step.detect, contact.start_substep, contact.corrected
 
     def detected(of: Any, *given: Any) -> Any:
-        now["step"] = of
+        now.update(step=of, swept=False)
         return detect(of, *given)
 
     def started(x: Tensor, *given: Any) -> Any:
@@ -325,7 +325,7 @@ def risen(number: int, device: str) -> dict[str, float]:
 
     def moved(of: Any, x: Tensor, *given: Any) -> Any:
         end = corrected(of, x, *given)
-        note(PARTS[4] if len(given) > 3 else PARTS[1], x, end.x)  # so many may follow sweeps
+        note(PARTS[4 if now["swept"] else 1], x, end.x)
         return end
 
     with ExitStack() as patches, torch.no_grad():

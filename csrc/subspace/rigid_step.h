@@ -305,7 +305,7 @@ struct Share {  // each body
     each_of_island(s, scene, k, [&](int64_t unit) {
       const double* rest = s.r.rest + 4 * unit;
       common.shift += wide_at(rest), common.mass += rest[3];
-      alone = alone && 0 < rest[3] && !s.m.held[unit];
+      alone = alone && 0 < rest[3] && s.r.solved[unit] && !s.m.held[unit];
     });
     common.shift = (1 / common.mass) * common.shift;
     const double length = square_root(dot(common.shift, common.shift));
@@ -328,14 +328,14 @@ struct Hold {  // rows: no island comes near another by its common shift
     if (0 <= b) mark(s.m.held + first + b);
   }
 };
-// Takes it from islands that are held, or of those that are not decided.
-template <bool decided>
+// Takes it from islands that are held, or from those that are not decided.
+template <bool undecided>
 struct Drop {  // each body
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t scene, int64_t k) const {
     bool drops = false;
     each_of_island(s, scene, k,
-                   [&](int64_t unit) { drops = drops || (decided ? !s.m.decided[unit] : s.m.held[unit]); });
+                   [&](int64_t unit) { drops = drops || (undecided ? !s.m.decided[unit] : s.m.held[unit]); });
     if (drops) each_of_island(s, scene, k, [&](int64_t unit) { s.share(unit, {}); });
   }
 };
