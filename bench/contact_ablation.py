@@ -62,13 +62,17 @@ def each_vertex(unit: Any, given: dict[str, Any]) -> Any:
 
 @contextmanager
 def no_first_correction() -> Iterator[None]:
-    work = contact.corrected
+    start, work, first = contact.start_substep, contact.corrected, [False]
 
-    def after(of: Any, x: Any, *given: Any) -> Any:  # what has a number of corrections follows the sweeps
-        made = work(of, x, *given)
-        return made if len(given) > 3 else made._replace(x=x)
+    def started(*given: Any) -> Any:
+        first[0] = True
+        return start(*given)
 
-    with mock.patch.object(contact, "corrected", after):
+    def after(of: Any, x: Any, *given: Any, **options: Any) -> Any:
+        made, skips, first[0] = work(of, x, *given, **options), first[0], False
+        return made._replace(x=x) if skips else made
+
+    with mock.patch.multiple(contact, start_substep=started, corrected=after):
         yield
 
 

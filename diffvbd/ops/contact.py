@@ -245,8 +245,8 @@ class Corrected(NamedTuple):
     """Result of :func:`rigid_correct`."""
 
     x: Tensor  # [B, V, 3]
-    # float64 [B, bodies, 2]: step fraction of each motion, zero where none was found; a number of the group of bodies
-    # whose common shift it took whole, or -1
+    # float64 [B, bodies, 2]: step fraction of each motion, zero where none was found; a number of the island whose
+    # common shift it took whole where the fraction is not, or -1
     taken: Tensor
     remaining: Tensor  # [B, bodies]: translation that was not taken [m]
 
@@ -254,7 +254,7 @@ class Corrected(NamedTuple):
 def rigid_correct(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
                   majorizes: bool) -> Corrected:  # fmt: skip
     """State after the admissible fraction of one Newton step of the step's potential over a turn and a shift of every
-    body (csrc/subspace/rigid_step.h). A group of bodies on which nothing else acts takes its common shift whole.
+    body (csrc/subspace/rigid_step.h). An island on which nothing else acts takes its common shift whole.
 
     friction_eps: [m], 0 without friction.  majorizes: Whether friction has the stiffness of a vertex's block.
     """

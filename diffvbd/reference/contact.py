@@ -31,7 +31,7 @@ class Substep(NamedTuple):
     u: Tensor  # [B, bodies, 3]: translation of each body's island
     fractions: Tensor  # [B, V]: step fraction of each vertex at the start
     truncated: Tensor  # bool [B, V]: vertices whose displacement goes on in the next substep
-    # [1 to 3, B, bodies]: step fractions of the rigid motions before and after the sweeps
+    # [corrections, B, bodies, 2]: of the rigid ones, step fraction, and the island whose common shift is taken or -1
     corrections: Tensor
     limits: Tensor | None = None  # [K, B, V]: step fraction of each update
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections

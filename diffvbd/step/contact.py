@@ -159,7 +159,8 @@ class ContactStep:
             if self.reads:
                 self._check(r, counts, int(start.infeasible.sum()), records)
             begin = x
-            x, *taken, _ = corrected(self, start.x, now, start, detection.listed)
+            x, first, _ = corrected(self, start.x, now, start, detection.listed)
+            taken = [first]
             at, own_center = x.detach(), start.own_center
             if barrier.self_contact:
                 own_center = own_center + (at - start.x.detach())
@@ -393,7 +394,7 @@ class SweptSubstep(NamedTuple):
     x: Tensor  # [B, V, 3]
     limits: Tensor  # uint8 [B, K, V]
     lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
-    fractions: Sequence[Tensor] = ()  # of the rigid corrections between sweeps, [B, bodies, 2] each
+    taken: Sequence[Tensor] = ()  # by the rigid corrections between sweeps, [B, bodies, 2] each
 
 
 def sweeps_of_substeps(sweeps: int, substeps: int) -> list[int]:
@@ -423,13 +424,13 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
     corrections, matrix = None, of.coarse_matrix
     numbers = settings.numbers
     within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
-    limits, lengths, fractions = [], [], []
+    limits, lengths, taken = [], [], []
     for n, (corrects, count) in enumerate(cycles):
         ends = n + 1 == len(cycles)
         if of.model.rigid_bodies is not None and n:
             # Where friction reverses, its exact derivative makes a motion too long, and most of it is refused.
-            x, *taken, _ = corrected(of, x, collider, start, listed, majorizes=True)
-            fractions += taken
+            x, own, _ = corrected(of, x, collider, start, listed, majorizes=True)
+            taken.append(own)
         if matrix is not None and corrects:
             if corrections is None or of.begun.renews:
                 fields = touching(of, x, collider, start, listed)
@@ -439,7 +440,7 @@ def swept_substep(of: ContactStep, x: Tensor, start: SubstepStart, collider: Ten
             lengths.append(length)
         x, limit = sweep(x, (settings if ends else within)._replace(sweeps=count))
         limits.append(limit)
-    return SweptSubstep(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None, fractions)
+    return SweptSubstep(x, torch.cat(limits, 1), torch.stack(lengths) if lengths else None, taken)
 
 
 def _cycles(model: System, sweeps: int) -> list[tuple[bool, int]]:
@@ -492,7 +493,7 @@ class Detection(NamedTuple):
         fractions: Step fraction of each vertex at the start [B, V].
         truncated: Vertices that pairs or radii have truncated at the start, bool [B, V].
         corrections: Of the rigid corrections before, between and after the sweeps, [B, bodies, 2] each: step fraction,
-            and a number of the group of bodies whose common shift it took whole, or -1.
+            and a number of the island whose common shift it took whole where the fraction is not, or -1.
         limits: Number of halvings of each update, uint8 [B, K, V]; 8: it was not made.
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
         kept: Rows of the listed pairs that sweeps can reach; None where the host must not read them, as on CUDA.

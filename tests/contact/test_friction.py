@@ -366,7 +366,7 @@ def test_the_derivative_of_rest_is_that_of_rest(support: str) -> None:
 
 def test_stacks_of_many_bodies_stand() -> None:
     """Thirty-five stacks of two cubes, pushed by half of what friction holds, creep and do not fall. Without a share of
-    friction for each side, or with one correction after the sweeps, they slide and fall."""
+    friction for each side they slide and fall."""
     cube = dv.mesh.cube(2, size=0.1)
     cube = cube.translate((0.0, -float(cube.points[:, 1].min()), 0.0))
     places = [(0.3 * k, 0.0, 0.0) for k in range(35)] + [(0.3 * k + 0.01, 0.1 - LOW, 0.01) for k in range(35)]

@@ -89,7 +89,7 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor) -> reference.Subs
         tail = torch.stack((kind, torch.full_like(kind, b)), 1)
         rows.append(torch.cat((corners, tail), 1)[listed])
         constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, measure), 1)[listed])
-    fractions, corrections = torch.ones(x.shape[:2]), torch.ones((2, len(x), 2))
+    fractions, corrections = torch.ones(x.shape[:2]), torch.tensor([1.0, -1.0]).expand(2, len(x), 2, 2)
     return reference.Substep(torch.cat(rows), torch.cat(constants), x.new_zeros((len(x), 2, 3)), fractions,
                              fractions < 1, corrections)  # fmt: skip
 
