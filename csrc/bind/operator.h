@@ -18,7 +18,6 @@ using torch::stable::Tensor;
 
 // The types of parameters, as entries spell them.
 using In = const Tensor&;
-using Tensors = const std::vector<Tensor>&;
 using Ints = const std::vector<int64_t>&;
 using Numbers = const std::vector<double>&;
 using Flags = const std::vector<bool>&;
@@ -38,8 +37,8 @@ constexpr size_t returns(const std::tuple<T...>*) {
 // "In x, double h" -> "name(Tensor x, float h) -> (Tensor, Tensor)"
 inline std::string schema_of(const char* name, const std::string& parameters, size_t tensors) {
   const std::pair<const char*, const char*> types[] = {
-      {"In", "Tensor"},    {"Tensors", "Tensor[]"}, {"Ints", "int[]"},   {"Numbers", "float[]"},
-      {"Flags", "bool[]"}, {"int64_t", "int"},      {"double", "float"}, {"bool", "bool"},
+      {"In", "Tensor"},   {"Ints", "int[]"},   {"Numbers", "float[]"}, {"Flags", "bool[]"},
+      {"int64_t", "int"}, {"double", "float"}, {"bool", "bool"},
   };
   std::string out = std::string(name) + "(";
   for (size_t begin = 0; begin < parameters.size();) {

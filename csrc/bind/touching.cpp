@@ -42,9 +42,9 @@ DIFFVBD_OPERATOR(Out<3>, contact_rigid_correct, DIFFVBD_PARAMETERS(TOUCHING) Int
   });
 }
 
-// The adjoint of a correction. x_bar [scenes, V, 3]: adjoint of the state after it. Returned: adjoints of x, x_prev, y
-// and mass, of data as of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus
-// the contribution of each listed pair to that of kappa, and of lag.
+// The adjoint of a correction. taken: What it returned. x_bar [scenes, V, 3]: adjoint of the state after it. Returned:
+// adjoints of x, x_prev, y and mass, of data as of rigid_backward(), of floor_lag, of colliders at the end and at the
+// start of the step, minus the contribution of each listed pair to that of kappa, and of lag.
 DIFFVBD_OPERATOR(Out<11>, contact_rigid_reverse, DIFFVBD_PARAMETERS(TOUCHING) In taken, In x_bar, Ints data_count,
                  double time_step, double friction_eps, bool majorizes, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};

@@ -444,7 +444,7 @@ struct RigidReverse {
   const double* taken;      // as of RigidOutcome
   bool* moving;             // of the step: bodies that have moved
   double* bar;              // by body [3]: of a shift of it
-  const T* end_bar;         // [B, V, 3]; may be out.vertices.x
+  const T* end_bar;         // [B, V, 3]
   T *p, *q, *displacement;  // as of virtual_motion() and reverse_end()
   CorrectionAdjoints<T> out;
 

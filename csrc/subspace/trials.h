@@ -108,7 +108,7 @@ struct TrialMemory {
   uint8_t *near, *active;             // by row: whether it may act after the displacement; by scene [B]
   int32_t* label;                     // by body: the first body of its island
   double *reach, *sum, *own, *after;  // by body [2]: Farthest; by body and vertex [2]: change, size; by row
-  uint8_t *decided, *joined, *held;   // by body; held: near what does not move
+  uint8_t *decided, *joined, *held;   // by body; held: near what is not of its island
   T* move;                            // by vertex [3]; of the inputs
   AdvanceState<T> state;
   Motion<T>* motions;  // by vertex, that of `state`
@@ -133,8 +133,8 @@ struct Farthest {
 
 // Of a Step, displacement(body, v, fraction), moves(unit), whether a body has a displacement in the end,
 // smooth_change(body, v, fraction, size), the change of what pairs, vertex energies and inertia are not, whose terms'
-// sizes are added, length(body, v), of any fraction, and slope(unit), of the potential along the whole displacement; 0
-// asks for no decrease.
+// sizes are added, length(body, v), of any fraction of a motion, and slope(unit), of the potential along the whole
+// displacement; 0 asks for no decrease.
 template <class T>
 struct TrialStep : Rows<T> {
   using Scalar = T;

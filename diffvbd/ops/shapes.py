@@ -35,7 +35,7 @@ from .fields import (
 from .load import raw
 
 Row = Callable[[Any], Any]
-INT, LONG, BOOL, BYTE, DOUBLE = torch.int32, torch.int64, torch.bool, torch.uint8, torch.float64
+INT, LONG, BYTE, DOUBLE = torch.int32, torch.int64, torch.uint8, torch.float64
 
 
 def new(like: Tensor, *shape: Any, dtype: torch.dtype | None = None) -> Tensor:

@@ -404,8 +404,6 @@ def sweeps_of_substeps(sweeps: int, substeps: int) -> list[int]:
 
 def sweeps_of_substep(sweeps: int, planned: int, substep: int) -> int:
     """Number of sweeps of one substep. One beyond the planned ones has as many as the last of these, at least one."""
-    if planned == 1:
-        return sweeps
     shared = sweeps_of_substeps(sweeps, planned)
     return shared[substep] if substep < planned else max(shared[-1], min(sweeps, 1))
 
