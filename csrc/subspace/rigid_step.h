@@ -5,8 +5,8 @@
 //
 // where s is the first of 1, 1/4, ... that raises no potential and that nothing blocks, for each island of bodies; and
 // its transpose. The shift that all bodies of an island have in common changes no gap between them: an island on which
-// nothing else acts takes it whole with any s, 0 among them, and so keeps its momentum. In double precision. Runs are
-// those of trials.h.
+// nothing else acts takes it whole with any s, 0 among them, in place of s times its mean motion, and so keeps its
+// momentum. In double precision. Runs are those of trials.h.
 #pragma once
 
 #include "cholesky.h"
@@ -17,11 +17,13 @@ namespace diffvbd::contact {
 
 constexpr int kTrials = 6, kHalvings = 2;  // fractions 1, 1/4, ..., 1/1024 before 0
 
+constexpr int kCommon = 7;  // scalars of Common
+
 // Memory of a correction beyond that of its trials, by body [B, bodies] and by place [B, bodies].
 struct RigidMemory {
   uint8_t* solved;            // by body
   double *center, *motion;    // by body [3], [6]
-  double *rest, *common;      // by body: sum of m (y - x), and mass, 0 where a vertex energy acts; Common [4]
+  double *rest, *common;      // by body: sum of m (y - x), and mass, 0 where a vertex energy acts; Common [7]
   double *solution, *matrix;  // by place: six; and as Groups::matrix() says
   uint64_t* blocks;           // by place
   int32_t* groups;            // [B, 4, bodies]
@@ -29,7 +31,7 @@ struct RigidMemory {
   // take(pointer, items), for so many scenes, and bodies of all of them; size: of the matrices of a scene
   template <class Take>
   void parts(Take& take, int64_t scenes, int64_t units, int64_t size) {
-    take(solved, units), take(blocks, units), take(rest, 4 * units), take(common, 4 * units);
+    take(solved, units), take(blocks, units), take(rest, 4 * units), take(common, kCommon * units);
     take(center, 3 * units), take(motion, kUnknowns * units), take(solution, kUnknowns * units);
     take(matrix, scenes * size), take(groups, kGroupRows * units);
   }
@@ -42,10 +44,15 @@ struct RigidOutcome {
   T* left;        // the rest of its shift [m]
 };
 
-// The common shift of an island, the mean of y - x by mass, and its mass; 0 and 0 where something else acts on it.
+// Of an island: the mean of y - x by mass, its common shift; that of the shifts of its bodies, which differs where they
+// were too many for one system; its mass. All 0 where something else acts on it.
 struct Common {
-  Vector shift;
+  Vector shift, mean;
   double mass;
+  DIFFVBD_FN void add(const double* rest, const double* motion) {
+    shift += wide_at(rest), mean += rest[3] * wide_at(motion + 3), mass += rest[3];
+  }
+  DIFFVBD_FN void divide() { shift = (1 / mass) * shift, mean = (1 / mass) * mean; }
 };
 
 // The groups of the inputs are those of the memory.
@@ -60,13 +67,18 @@ struct RigidStep : TrialStep<T> {
   DIFFVBD_FN Vector arm(const Body<T>& b, int32_t v) const {
     return b.position(v) - wide_at(r.center + 3 * this->unit(b.scene, b.body));
   }
-  DIFFVBD_FN Vector common(int64_t unit) const { return wide_at(r.common + 4 * unit); }
-  DIFFVBD_FN bool shares(int64_t unit) const { return 0 < r.common[4 * unit + 3]; }
+  DIFFVBD_FN Common common(int64_t unit) const {
+    const double* at = r.common + kCommon * unit;
+    return {wide_at(at), wide_at(at + 3), at[6]};
+  }
+  DIFFVBD_FN bool shares(int64_t unit) const { return 0 < common(unit).mass; }
   DIFFVBD_FN void share(int64_t unit, const Common& a) const {
-    put(r.common + 4 * unit, a.shift), r.common[4 * unit + 3] = a.mass;
+    double* to = r.common + kCommon * unit;
+    put(to, a.shift), put(to + 3, a.mean), to[6] = a.mass;
   }
   DIFFVBD_FN Vector displacement(const Body<T>& b, int32_t v, double fraction) const {
-    return displaced(motion_of(b), fraction, arm(b, v)) + (1 - fraction) * common(this->unit(b.scene, b.body));
+    const Common a = common(this->unit(b.scene, b.body));
+    return displaced(motion_of(b), fraction, arm(b, v)) + (a.shift - fraction * a.mean);
   }
   DIFFVBD_FN bool moves(int64_t unit) const {
     return this->fraction[unit] > 0 || (this->m.decided[unit] && shares(unit));
@@ -304,10 +316,10 @@ struct Share {  // each body
     bool alone = true;
     each_of_island(s, scene, k, [&](int64_t unit) {
       const double* rest = s.r.rest + 4 * unit;
-      common.shift += wide_at(rest), common.mass += rest[3];
+      common.add(rest, s.r.motion + kUnknowns * unit);
       alone = alone && 0 < rest[3] && s.r.solved[unit] && !s.m.held[unit];
     });
-    common.shift = (1 / common.mass) * common.shift;
+    common.divide();
     const double length = square_root(dot(common.shift, common.shift));
     each_of_island(s, scene, k, [&](int64_t unit) {
       s.share(unit, alone ? common : Common{});
@@ -348,10 +360,12 @@ struct EndBody {  // each body
     const int64_t unit = s.unit(scene, k);
     const bool passes_on = s.r.solved[unit] && s.in.free[k];  // an adjoint
     const double fraction = passes_on ? s.fraction[unit] : 0;
-    const bool shares = passes_on && s.moves(unit) && fraction < 1 && s.shares(unit);
-    const Vector rest = wide_at(s.r.motion + kUnknowns * unit + 3) - (shares ? s.common(unit) : Vector{});
+    const int32_t island = s.m.label[unit];
+    const bool shares = passes_on && s.moves(unit) && s.shares(unit) &&
+                        (fraction < 1 || s.m.joined[s.unit(scene, island)]);  // one body has taken it
+    const Vector rest = wide_at(s.r.motion + kUnknowns * unit + 3) - (shares ? s.common(unit).mean : Vector{});
     s.out.taken[2 * unit] = fraction;
-    s.out.taken[2 * unit + 1] = shares ? s.m.label[unit] : -1;
+    s.out.taken[2 * unit + 1] = shares ? island : -1;
     s.out.left[unit] = T((1 - fraction) * square_root(dot(rest, rest)));
   }
 };
@@ -443,7 +457,7 @@ struct RigidReverse {
   WorkStep<T> work;
   const double* taken;      // as of RigidOutcome
   bool* moving;             // of the step: bodies that have moved
-  double* bar;              // by body [3]: of a shift of it
+  double* bar;              // by body [3]: of a shift of it, and then of its island by mass
   const T* end_bar;         // [B, V, 3]
   T *p, *q, *displacement;  // as of virtual_motion() and reverse_end()
   CorrectionAdjoints<T> out;
@@ -480,28 +494,43 @@ struct SumEnd {  // bodies, the adjoint of a shift of each
     if (team.leads()) put(r.bar + 3 * unit, vector_at(sum));
   }
 };
+struct SumIsland {  // each body, and by mass
+  template <class T>
+  DIFFVBD_FN void operator()(const RigidReverse<T>& r, int64_t scene, int64_t k) const {
+    const RigidStep<T>& s = r.step;
+    const auto each = [&](const auto& f) {
+      for (int64_t unit = s.unit(scene, k); unit < s.unit(scene, s.in.bodies()); ++unit) {
+        if (r.taken[2 * unit + 1] == k) f(unit);
+      }
+    };
+    if (r.taken[2 * s.unit(scene, k) + 1] != k) return;
+    Common common{};
+    Vector bar{};
+    each([&](int64_t unit) {
+      common.add(s.r.rest + 4 * unit, s.r.motion + kUnknowns * unit), bar += wide_at(r.bar + 3 * unit);
+    });
+    common.divide();
+    each([&](int64_t unit) { s.share(unit, common), put(r.bar + 3 * unit, (1 / common.mass) * bar); });
+  }
+};
 struct ReverseEnd {  // bodies
   template <class T, class Team>
   DIFFVBD_FN void operator()(const RigidReverse<T>& r, const Body<T>& b, const Team& team) const {
     const int64_t unit = r.step.unit(b.scene, b.body);
-    reverse_end(b, team, r.motion(b), r.taken[2 * unit], r.end_bar, r.solution(b), r.displacement, r.out.vertices.mass);
+    const double fraction = r.taken[2 * unit];
+    reverse_end(b, team, r.motion(b), fraction, r.end_bar, r.solution(b), r.displacement, r.out.vertices.mass);
     if (r.taken[2 * unit + 1] < 0) return;
-    Common common{};
-    Vector bar{};
-    for (int32_t k = 0; k < r.step.in.bodies(); ++k) {
-      const int64_t other = r.step.unit(b.scene, k);
-      if (r.taken[2 * other + 1] != r.taken[2 * unit + 1]) continue;
-      const double* rest = r.step.r.rest + 4 * other;
-      common.shift += wide_at(rest), common.mass += rest[3], bar += wide_at(r.bar + 3 * other);
-    }
-    const Vector shift = (1 / common.mass) * common.shift, each = ((1 - r.taken[2 * unit]) / common.mass) * bar;
+    const Common common = r.step.common(unit);
+    const Vector each = wide_at(r.bar + 3 * unit),
+                 off = common.shift + fraction * (wide_at(r.motion(b) + 3) - common.mean);
     team.each(b.size(), [&](int32_t i) {
       const int32_t v = b.vertex(i);
       const int64_t row = b.row(v);
       add_to(r.displacement + 3 * row, -b.mass(v) * each);
       add_to(r.out.vertices.y + 3 * row, b.mass(v) * each);
-      r.out.vertices.mass[row] += T(dot(b.target(v) - b.position(v) - shift, each));
+      r.out.vertices.mass[row] += T(dot(b.target(v) - b.position(v) - off, each));
     });
+    if (team.leads()) add_to(r.solution(b) + 3, -(fraction * r.step.r.rest[4 * unit + 3]) * each);
   }
 };
 struct Virtual {  // bodies
@@ -534,6 +563,7 @@ DIFFVBD_FN void reverse_bodies(const Run& run, const RigidReverse<T>& r) {
   }
   system_of_bodies(run, r.step);
   run.bodies(SumEnd{}, r);
+  run.each(SumIsland{}, r, r.step.in.bodies());
   run.bodies(ReverseEnd{}, r);
   run.groups(Solve<false>{}, r.step);
   run.bodies(Virtual{}, r);

@@ -246,7 +246,7 @@ class Corrected(NamedTuple):
 
     x: Tensor  # [B, V, 3]
     # float64 [B, bodies, 2]: step fraction of each motion, zero where none was found; a number of the island whose
-    # common shift it took whole where the fraction is not, or -1
+    # common shift it took whole, or -1
     taken: Tensor
     remaining: Tensor  # [B, bodies]: translation that was not taken [m]
 

@@ -29,7 +29,7 @@ class Correction:
 
     def __call__(self, x: Tensor, taken: Tensor, majorizes: bool = False) -> Tensor:
         """The state [..., 3, V] after each body has moved. taken: [B, bodies, 2], its fraction of its motion, and a
-        number of the bodies whose common shift it takes whole, or -1. majorizes: Whether friction has the stiffness of
+        number of the island whose common shift it takes whole, or -1. majorizes: Whether friction has the stiffness of
         a vertex's block."""
         fraction, group = taken.to(x).unbind(-1)
         lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(fraction), -1, 3)
@@ -66,14 +66,16 @@ class Correction:
         g, matrix = self._of_free(g, matrix, least)
         motion = -torch.linalg.solve(matrix, g).reshape(z.shape)
         moves = (fraction != 0)[..., None]  # the others may have no motion: their matrix may be indefinite
-        moved = state(fraction[..., None] * torch.where(moves, motion, 0.0))
-        common = self._common(rows, mass, total, group) * (1 - fraction)[..., None]
-        return moved + common[:, self.body].transpose(-1, -2).reshape(x.shape)
+        motion = fraction[..., None] * torch.where(moves, motion, 0.0)
+        common = self._common(rows, mass, total, motion[..., 3:], group)
+        return state(motion) + common[:, self.body].transpose(-1, -2).reshape(x.shape)
 
-    def _common(self, rows: Tensor, mass: Tensor, total: Tensor, group: Tensor) -> Tensor:
-        """The mean of y - x by mass over the group of each body [B, bodies, 3]; zero where it has none."""
+    def _common(self, rows: Tensor, mass: Tensor, total: Tensor, shift: Tensor, group: Tensor) -> Tensor:
+        """The mean of y - x less that of the shifts [B, bodies, 3], by mass, over the island of each body; zero where
+        it has none."""
         y = self.y.transpose(-1, -2).reshape(rows.shape)
         off = torch.zeros_like(total)[..., None].expand(-1, -1, 3).index_add(1, self.body, mass[..., None] * (y - rows))
+        off = off - total[..., None] * shift
         same = ((group[:, :, None] == group[:, None]) & (group >= 0)[:, None]).to(rows)
         return (same @ off) / torch.where(group[..., None] >= 0, same @ total[..., None], 1.0)
 

@@ -491,7 +491,7 @@ class Detection(NamedTuple):
         fractions: Step fraction of each vertex at the start [B, V].
         truncated: Vertices that pairs or radii have truncated at the start, bool [B, V].
         corrections: Of the rigid corrections before, between and after the sweeps, [B, bodies, 2] each: step fraction,
-            and a number of the island whose common shift it took whole where the fraction is not, or -1.
+            and a number of the island whose common shift it took whole, or -1.
         limits: Number of halvings of each update, uint8 [B, K, V]; 8: it was not made.
         lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
         kept: Rows of the listed pairs that sweeps can reach; None where the host must not read them, as on CUDA.

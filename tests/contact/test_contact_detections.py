@@ -10,6 +10,7 @@ from conftest import DEVICES
 
 import diffvbd as dv
 from diffvbd.mesh import box, join
+from diffvbd.ops.fields import MOST_COUPLED
 from diffvbd.step.contact import MOST_DETECTIONS
 from diffvbd.testing.tolerances import tolerance
 
@@ -92,6 +93,18 @@ def test_a_row_that_is_struck_keeps_its_momentum(count: int, gap: float, speed: 
         shares += [part.corrections for part in found]
     assert float(v[-1, 0]) > 0.05 * speed
     assert speed == 1 or any(bool((taken[..., 1] >= 0).any()) for part in shares for taken in part)  # held up
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("sweeps", (1, 5))
+def test_a_row_too_long_for_one_system_keeps_its_momentum(sweeps: int, device: str) -> None:
+    model, x, v = row(MOST_COUPLED + 6, 5e-4, 1.0, device)
+    mass = model.mass[:, None]
+    first = (mass * v).sum(0)
+    for _ in range(2):
+        x, v = dv.step(model, x, v, dv.VBD(0.01, sweeps), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
+        assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
+    assert float(v[64:].norm()) > 0
 
 
 @pytest.mark.parametrize("device", DEVICES)
