@@ -152,10 +152,11 @@ class VertexEnergy:
         return torch.stack(columns, -1)
 
 
-def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
-    """b'(gap) [N] of the log barrier; 0 where a gap is not in (0, dhat)."""
+def log_barrier(gap: Tensor, kappa: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """b = -kappa (gap - dhat)^2 log(gap / dhat) [J], b' [N] and b'' [N/m]; 0 where a gap is not in (0, dhat)."""
     d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
-    return -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
+    log, past, part = torch.log(d / dhat), d - dhat, 1 - dhat / d
+    return -kappa * past**2 * log, -kappa * (2 * past * log + past**2 / d), -kappa * (2 * log + 4 * part - part * part)
 
 
 def damped_fraction(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
@@ -163,13 +164,6 @@ def damped_fraction(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     whole = force + FADE * kappa * dhat
     some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
     return torch.where(some, force / torch.where(some, whole, 1.0), 0.0)
-
-
-def barrier_curvature(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
-    """b''(gap) [N/m] of the log barrier; 0 where a gap is not in (0, dhat)."""
-    d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
-    part = 1 - dhat / d
-    return -kappa * (2 * torch.log(d / dhat) + 4 * part - part * part)
 
 
 def _approach(normal: Tensor, x: Tensor, x_prev: Tensor) -> Tensor:
@@ -180,7 +174,7 @@ def _approach(normal: Tensor, x: Tensor, x_prev: Tensor) -> Tensor:
 
 def _share(before: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """Of its damping that a vertex has which began the step at a gap ``before`` [m]."""
-    return damped_fraction(-_barrier_slope(before, kappa, dhat), kappa, dhat)
+    return damped_fraction(-log_barrier(before, kappa, dhat)[1], kappa, dhat)
 
 
 @init_names_checked
@@ -277,7 +271,7 @@ class FloorBarrier(VertexEnergy):
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         damping = damping * _share(before, kappa, dhat)
-        return h * h * _barrier_slope(gap, kappa, dhat) + h * damping * _approach(normal, x, x_prev), normal
+        return h * h * log_barrier(gap, kappa, dhat)[1] + h * damping * _approach(normal, x, x_prev), normal
 
     def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Normal [1 | B, 1 | V, P, 3], kappa, dhat, damping [1 | B, 1 | V, P]."""
@@ -305,13 +299,13 @@ class FloorBarrier(VertexEnergy):
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
-        size = h * h * barrier_curvature(gap, kappa, dhat) + h * damping * _share(before, kappa, dhat)
+        size = h * h * log_barrier(gap, kappa, dhat)[2] + h * damping * _share(before, kappa, dhat)
         return (size[..., None, None] * normal[..., None] * normal[..., None, :]).sum(2)
 
     def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, 1 | V, planes, 3]."""
         gap, normal, kappa, dhat = self.gaps(x, data, origin)
-        return -_barrier_slope(gap, kappa, dhat), normal
+        return -log_barrier(gap, kappa, dhat)[1], normal
 
 
 @init_names_checked

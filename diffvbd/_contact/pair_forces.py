@@ -16,9 +16,9 @@ from .._common.checks import fail
 from .._contact.barrier import PairBarrier
 from .._contact.detection import detect
 from .._contact.surface import LEAST_CAPACITY, ContactSurface
-from ..energies import damped_fraction
+from ..energies import damped_fraction, log_barrier
 from ..reference.contact import loads
-from ..reference.distance import EDGE_EDGE, distance, log_barrier, weight, with_gradient
+from ..reference.distance import EDGE_EDGE, distance, weight, with_gradient
 from ..reference.energies import smoothed
 
 ADVANCES = 8  # of continuous detection after the first; fewer are on the safe side

@@ -19,8 +19,9 @@ from .._contact.pair_forces import (
     lagged_forces,
     lagged_stiffness,
     near_pairs,
+    pair_energy,
 )
-from ..energies import damped_fraction
+from ..energies import damped_fraction, log_barrier
 from ..model.inputs import parameter_of
 from ..model.patches import Averaged
 from ..model.system import System
@@ -225,12 +226,8 @@ class StepContact:
         Raises:
             ValueError: Where surfaces touch there, or positions are not finite.
         """
-        surface, barrier = self.model.surface_of_contact, self.model.contact
         points = corner_points(x, self.origin, self.colliders)
-        if surface is None or barrier is None:
-            pairs = _no_pairs(points)
-        else:
-            pairs = near_pairs(x, self.origin, self.colliders, self.colliders, surface, barrier)
+        pairs = self._near(x, points)
         pushes = barrier_forces(pairs, points, self._number("pair_kappa"))
         damping = friction = points.new_zeros((0, 4, 3))
         if self.lag is not None:
@@ -238,6 +235,23 @@ class StepContact:
                                               self.coefficients, self.h, self.reach)  # fmt: skip
         lagged = None if self.lag is None else self.lag.pairs
         return ContactState(points, pairs, pushes, lagged, damping, friction, *self._floor(points[:, : x.shape[1]]))
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Energy of the barriers of each scene at x [B, V, 3] [J], [B]; raises as at()."""
+        points = corner_points(x, self.origin, self.colliders)
+        pairs = self._near(x, points)
+        own = pair_energy(pairs, pairs.positions(points), self._number("pair_kappa"))
+        total = points.new_zeros((len(x),)).index_add(0, pairs.scene, own)
+        if self.model.floor is None or self.planes is None:
+            return total
+        gap, _, kappa, dhat = self.model.floor.gaps(points[:, : x.shape[1]], self.planes, None)
+        return total + torch.where(self.model._pinned[:, None], 0.0, log_barrier(gap, kappa, dhat)[0]).sum((1, 2))
+
+    def _near(self, x: Tensor, points: Tensor) -> NearPairs:
+        surface, barrier = self.model.surface_of_contact, self.model.contact
+        if surface is None or barrier is None:
+            return _no_pairs(points)
+        return near_pairs(x, self.origin, self.colliders, self.colliders, surface, barrier)
 
     def _floor(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Normal and friction forces of each plane on each vertex, both [B, V, P, 3]."""

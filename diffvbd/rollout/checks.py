@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
 from .._common.context import is_captured, is_silent, looks_at, may_copy, replaced
 from .._common.messages import page, percent, warn
+from ..adjoint.contact import StepContact
 from ..laws.tets import energy
 from ..model.material import rest_metric
 from ..model.model import Model
@@ -22,7 +23,7 @@ from ..model.solver import Integrator
 from ..model.system import System
 from ..ops import SweepSettings
 from ..step.arguments import Prepared, acceleration_of, collider_state
-from ..step.contact import TRUNCATED, outcomes
+from ..step.contact import TRUNCATED
 from ..step.integrators import Solve
 from ..step.predict import begin, energy_data
 from ..step.residual import (
@@ -52,8 +53,8 @@ class Checks:
             CUDA graph is captured, nothing is checked: run the rollout once before the capture. On the CPU it also
             warns where all tets of a body are inverted, and with a PairBarrier where a body goes by more than its own
             size in a step.
-        energy: Whether to warn where a scene that only gravity drives has 5 % more energy (where barriers push at the
-            start, twice as much) than it began with and gravity gave it; where, without pairs, the sweeps leave the
+        energy: Whether to warn where a scene that only gravity drives has 5 % more energy than it began with and
+            gravity gave it, where its kinetic and elastic energy is largest; where, without pairs, the sweeps leave the
             motion off by an estimated 2 %; where thin tets bend. True: energy after any step. None: on the CPU, of ten
             steps or more, after six of them, most of them early (with a floor 12, with contact up to 64).
         contact: Whether to warn where pairs truncated the motion of more than 1 % of vertices in a step, or the last
@@ -259,7 +260,6 @@ def _warn_of_loss(which: str, finite: bool, fault: str) -> None:
 # --- what a rollout says of its energy --------------------------------------------------------------------------------
 
 GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
-GAIN_PRESSED = 1.0  # the same where barriers push at the start: what they hold comes in
 MANY = 100.0  # times as much as there was: then the gain is said in J, since there may have been next to nothing
 LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 6, 12, 64  # at a rollout, unasked
 CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
@@ -279,53 +279,67 @@ def _elastic_of(model: System, prepared: Prepared) -> Iterator[_Chunk]:
         yield mu, lam, rest, model.tets[rows].T.contiguous()
 
 
+class Gain(NamedTuple):
+    """What scenes have most gained [B], and how."""
+
+    energy: Tensor  # kinetic and elastic, less what gravity has done [J]
+    step: Tensor  # after which
+    x: Tensor  # [B, V, 3]
+    fallen: Tensor  # the most that gravity has done [J]
+
+
 @dataclass
 class EnergyLook:
-    """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps, [B] each."""
+    """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps."""
 
     model: System
     prepared: Prepared
     gravity: Tensor
-    start: Tensor
-    had: Tensor  # at the start: kinetic and elastic energy, and what gravity does over the scene's length [J]
+    start: Tensor  # [B, V, 3]
+    had: Tensor  # at the start [B]: kinetic and elastic energy, and what gravity does over the scene's length [J]
     at: frozenset[int]  # numbers of steps that are looked at, the first among them
     elastic: list[_Chunk] | None
-    pressed: Tensor  # scenes in which barriers push at the start, bool [B]; of pairs known after a step
-    found: dict[int, Tensor] = field(default_factory=dict)
+    most: Gain | None = None
+    seen: int = 0
 
     def see(self, step: int, x: Tensor, v: Tensor) -> None:
         """After a step; one that runs again is not seen twice."""
-        if step in self.at and step not in self.found:
-            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-                if not self.found and self.model.contact is not None and self.model.model in outcomes:
-                    self.pressed = self.pressed | (outcomes[self.model.model].smallest[0] < self.model.contact.dhat)
-                energy = mechanical_energy(self.model, self.prepared, x.detach(), v.detach(), self.elastic)
-                way = (x.detach().double() - self.start.double()) * self.gravity.double()
-                mass = _free_mass(self.model, self.prepared)
-                fallen = (mass * way.sum(-1).reshape(-1, mass.shape[-1])).sum(-1)  # what gravity has done [J]
-                self.found[step] = torch.stack([energy, fallen])
+        if step not in self.at or step <= self.seen:
+            return
+        self.seen = step
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+            x, v = (t.detach().reshape(self.start.shape) for t in (x, v))
+            energy = mechanical_energy(self.model, self.prepared, x, v, self.elastic)
+            way = (x.double() - self.start.double()) * self.gravity.double()
+            fallen = (_free_mass(self.model, self.prepared) * way.sum(-1)).sum(-1)
+            now = Gain(energy - self.had[0] - fallen, torch.full_like(energy, step), x, fallen.abs())
+            if (old := self.most) is None:
+                self.most = now
+                return
+            more = now.energy > old.energy
+            kept = (torch.where(more if a.dim() == 1 else more[:, None, None], a, b)
+                    for a, b in zip(now[:3], old[:3], strict=True))  # fmt: skip
+            self.most = Gain(*kept, torch.maximum(now.fallen, old.fallen))
 
     def warn(self) -> None:
         """Warns (UserWarning) of a gain."""
-        energy, fallen = torch.stack(list(self.found.values())).unbind(1)  # [looks, B]
-        begun, room = self.had[:2]
-        given = begun + room + fallen.abs().amax(0)
-        gain = (energy - begun - fallen) / given.clamp(min=math.ulp(0.0))
-        past = gain - torch.where(self.pressed, GAIN_PRESSED, GAIN)
-        if not float(past.max()) > 0:
+        if (most := self.most) is None:
             return
-        look, scene = divmod(int(past.argmax()), gain.shape[-1])
-        most, all_of = float(gain[look, scene]), float(given[scene])
-        size = f"{percent(most)} of the energy that it had and that gravity gave it"
-        if most > MANY:
-            size = f"{most * all_of:.3g} J, where it had and gravity gave it {all_of:.3g} J"
-        of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
+        with torch.no_grad(), torch.autocast(most.x.device.type, enabled=False):
+            first, last = (barrier_energy(self.model, self.prepared, x) for x in (self.start, most.x))
+        given = self.had.sum(0) + first + most.fallen
+        gain = (most.energy + last - first) / given.clamp(min=math.ulp(0.0))
+        scene = int(gain.argmax())
+        largest, all_of, step = (float(t[scene]) for t in (gain, given, most.step))
+        if not largest > GAIN:
+            return
+        size = f"{percent(largest)} of the energy that it had and that gravity gave it"
+        if largest > MANY:
+            size = f"{largest * all_of:.3g} J, where it had and gravity gave it {all_of:.3g} J"
+        of = f"scene {scene}" if len(gain) > 1 else "the scene"
         faster = "" if self.model.coarse is not None else ', subspace="coarse"'
-        pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
-        pressed += "farther apart, or take a smaller dhat"
-        pressed = pressed if bool(self.pressed[scene]) else ""
-        warn(f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
-             f"{pressed}; take more sweeps{faster} or a smaller time_step; {page('numerics.md')}")  # fmt: skip
+        warn(f"sweeps: after step {step:.0f} {of} has gained {size}: the sweeps have not converged; take more "
+             f"sweeps{faster} or a smaller time_step; {page('numerics.md')}")  # fmt: skip
 
 
 def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
@@ -344,24 +358,19 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
     given = (x, v, prepared.mu, prepared.lam, prepared.mass)
     taped = torch.is_grad_enabled() and any(t.requires_grad for t in given)
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        start, pull = x.detach(), acceleration_of(gravity, x).detach()
-        size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1).reshape(-1)  # [B]
+        start, pull = x.detach().reshape(-1, *x.shape[-2:]), acceleration_of(gravity, x).detach()
+        size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1)  # [B]
         room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
         elastic = None if taped else list(_elastic_of(model, prepared))  # a tape should be all that a rollout keeps
         begun = mechanical_energy(model, prepared, start, v.detach(), elastic)
         had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])
-        pressed = torch.zeros_like(begun, dtype=torch.bool)
-        if model.floor is not None:
-            planes = energy_data(model, prepared, None)[:, : model.floor.count()]
-            gap, _, _, dhat = model.floor.gaps(start.reshape(-1, *start.shape[-2:]), planes, None)
-            pressed = pressed | (gap < dhat).flatten(1).any(-1)
         # all steps where one asks; where bodies may hit something, whose gain may be over in a step, as many as cost
         # little beside such steps; else most of them early, when what a start has too much of comes out
         meets = model.touches or model.floor is not None
         looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
         count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
         at = frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
-        return EnergyLook(model, prepared, pull, start, had, at, elastic, pressed)
+        return EnergyLook(model, prepared, pull, start, had, at, elastic)
 
 
 def _free_mass(model: System, prepared: Prepared) -> Tensor:
@@ -403,6 +412,18 @@ def mechanical_energy(model: System, prepared: Prepared, x: Tensor, v: Tensor, e
         weight = model.patches.sum((lam / (6 * c6)).expand(change.shape))
         total = total + 0.5 * (weight * model.patches.mean(change, c6).square()).sum(-1)
     return moving + total
+
+
+def barrier_energy(model: System, prepared: Prepared, x: Tensor) -> Tensor:
+    """Energy of the barriers of each scene, whose colliders rest, at x [B, V, 3] [J], float64 [B]; 0 where surfaces
+    touch, which the next step refuses."""
+    where = collider_state(model, x, None, None)
+    points = x.new_zeros((len(x), 0, 3)) if where is None else where[1]
+    data = energy_data(model, prepared, None)
+    try:
+        return StepContact(model, data, prepared.parameters, points, points, None, None, 1.0, 0.0).energy(x)
+    except ValueError:
+        return torch.zeros_like(x[:, 0, 0], dtype=torch.float64)
 
 
 def _rest_of(model: System, prepared: Prepared, rows: slice) -> Tensor:

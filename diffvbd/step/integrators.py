@@ -21,7 +21,7 @@ from torch import Tensor
 
 from .._common.checks import check_tensor, fail, input_name
 from .._common.context import looks_at, recorders, refuse_transforms, replaced
-from ..energies import barrier_curvature
+from ..energies import log_barrier
 from ..model.solver import BDF2, SDIRK2, ImplicitEuler, Integrator
 from ..model.system import System
 from ..reference.distance import EDGE_EDGE, POINT_PLANE
@@ -321,7 +321,7 @@ def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, displacement: Tensor, ma
     """Whether a step of h resolves a barrier, so that its force may be extrapolated: its sides move by less than the
     gap [m], and its curvature where they may end, over masses [kg], vibrates slowly."""
     slow = displacement < SLOW * torch.minimum(gap, dhat)
-    return slow & (h * h * barrier_curvature(gap - displacement, kappa, dhat) < SOFT * mass)
+    return slow & (h * h * log_barrier(gap - displacement, kappa, dhat)[2] < SOFT * mass)
 
 
 def _near_floor(model: System, begun: Begun, prepared: Prepared, displacement: Tensor) -> Tensor:

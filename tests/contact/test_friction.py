@@ -15,7 +15,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference, results
-from diffvbd.energies import _barrier_slope
+from diffvbd.energies import log_barrier
 from diffvbd.mesh import box, join
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import noise, substep_of
@@ -75,7 +75,7 @@ def settle(block: Block, angle: float, shear: float) -> None:
         options["friction"] = 0.0
     for _ in range(80):
         kappa, dhat = torch.full_like(x[:, 1], KAPPA), torch.full_like(x[:, 1], DHAT)
-        load = torch.where(free, -_barrier_slope(x[:, 1] + GAP, kappa, dhat), 0.0)
+        load = torch.where(free, -log_barrier(x[:, 1] + GAP, kappa, dhat)[1], 0.0)
         weight = normal * (model.mass * free).sum()
         load = load * (weight / load.sum().clamp(min=1e-3 * weight))
         force = torch.stack([-shear * load, 0 * load, 0 * load], -1)

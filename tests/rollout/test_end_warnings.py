@@ -203,6 +203,48 @@ def test_energy_from_nowhere_is_warned_of_each_time(dtype: torch.dtype) -> None:
         )
 
 
+def pressed(dtype: torch.dtype) -> tuple[dv.Model, Tensor]:
+    """A box over a floor and under another one, both closer than dhat."""
+    lower, gap = box(3, 0.1), 5e-4
+    tets = dv.mesh.join([lower, lower.translate((0.01, 0.1 + gap, 0.0))])
+    floor = dv.FloorBarrier(height=-gap, kappa=1e4, dhat=0.01)
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False), floor)
+    model = dv.Model(tets, energies=energies, dtype=dtype)
+    return model, model.rest_points
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_energy_of_barriers_is_counted(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What barriers hold at the start becomes motion, which is no gain."""
+    model, x = pressed(dtype)
+    asked = {**SOFT, "mu": 1e5, "lam": 1e5, "solver": dv.VBD(0.005, 20), "checks": dv.Checks(energy=True)}
+
+    def said(**other: Any) -> list[str]:
+        return said_of_energy(lambda: dv.rollout(model, x, torch.zeros_like(x), steps=10, **asked | other))
+
+    assert said() == []
+    assert said(pair_kappa=torch.tensor(1e3, dtype=dtype), floor_kappa=torch.tensor(1e2, dtype=dtype)) == []
+    monkeypatch.setattr(checks, "barrier_energy", lambda model, prepared, x: x.new_zeros(len(x)).double())
+    assert len(said()) == 1
+
+
+def test_energy_of_barriers_is_that_of_their_forces() -> None:
+    model, x = pressed(torch.float64)
+    system = system_of(model, dv.VBD(1.0, 1))
+    prepared = prepare(system, (), material_of(mu=1e5, lam=1e5), time_step=1.0, sweeps=1)
+    w = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+
+    def energy(step: float) -> float:
+        return float(checks.barrier_energy(system, prepared, (x + step * w)[None]))
+
+    work = float((dv.contact.forces(model, x).vertices.normal * w).sum())
+    size = 1e-8
+    assert energy(0.0) > 0 and abs(work) > 0
+    assert (energy(-size) - energy(size)) / (2 * size) == pytest.approx(
+        work, rel=tolerance("contact_finite_difference")
+    )
+
+
 def test_what_helps_helps() -> None:
     model, x, v = bent_bar()
     solver = dv.VBD(0.01, 100, subspace="coarse", relaxation=1.5)
