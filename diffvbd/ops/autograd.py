@@ -62,6 +62,10 @@ _peek = torch._C._functorch.peek_interpreter_stack  # pyright: ignore[reportAttr
 CONTACT = "torch.func transforms and batched gradients (is_grads_batched) of a step with contact are not supported"
 
 
+def _is_transformed() -> bool:
+    return _peek() is not None or forward_ad._current_level >= 0
+
+
 def is_batched(grad: Tensor) -> bool:
     """Whether these are the gradients of torch.func.vmap or of is_grads_batched, which no vmap of a Function sees."""
     known = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
@@ -187,7 +191,9 @@ class Differentiable:
                     no_transforms(refuses)
                 needs = ctx.needs_input_grad[:count]
                 args = (*grads[:outputs], *kept, ctx.rest, needs)
-                out = iter(reversed_(*args) if torch.compiler.is_compiling() else _Reverse.apply(*args))
+                differentiated = torch.is_grad_enabled() or _is_transformed()  # which _Reverse refuses
+                work = _Reverse.apply if differentiated and not torch.compiler.is_compiling() else reversed_
+                out = iter(work(*args))
                 return tuple(next(out) if need else None for need in needs) + (None,) * (arguments - count)
 
             @staticmethod
@@ -199,7 +205,7 @@ class Differentiable:
         self.function = _Forward
 
     def __call__(self, *args: Any) -> Any:
-        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
+        if torch.compiler.is_compiling() or _is_transformed():
             return self.function.apply(*args)
         if torch.is_grad_enabled():
             for t in args[: self.count]:
@@ -250,7 +256,7 @@ class Linear:
         self.function, self.run = _Function, run
 
     def __call__(self, *args: Any) -> Tensor:
-        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
+        if torch.compiler.is_compiling() or _is_transformed():
             return self.function.apply(*args)
         if torch.is_grad_enabled() and args[0].requires_grad:
             return self.function.apply(*args)
@@ -262,12 +268,14 @@ def _rows_of_batch(info: Any, values: Tensor) -> Tensor:
 
 
 # [rows, columns] -> [rows], summed in an order that depends on nothing but the shape.
-_row_sum = Linear(lambda values: raw.row_sum(values.contiguous()),
+_row_sum = Linear(lambda values: direct.row_sum(values.contiguous()),
                   lambda bar, shape: bar[:, None].expand(-1, shape[1]), 1, _rows_of_batch)  # fmt: skip
 
 
 def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     """Sums the dimensions in which ``shape`` has 1 (same number of dimensions), in a fixed order."""
+    if tensor.shape == shape:
+        return tensor
     reduced = [d for d, n in enumerate(shape) if n == 1 and tensor.shape[d] != 1]
     if not reduced:
         return tensor

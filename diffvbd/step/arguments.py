@@ -122,10 +122,9 @@ def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], ow
     value = check_broadcast(name, check_tensor(name, value, like), lead + own, len(lead))
     shape = (1,) * (len(lead) + len(own) - value.dim()) + tuple(value.shape)
     scenes, rest = shape[: len(lead)], shape[len(lead) :]
-    value = value.reshape(shape)
     if math.prod(scenes) == 1:
         return value.reshape(1, *rest)
-    return ops.broadcast(value, (*lead, *rest)).reshape(-1, *rest)
+    return ops.broadcast(value.reshape(shape), (*lead, *rest)).reshape(-1, *rest)
 
 
 def given_of(model: Model, inputs: dict[str, Any]) -> Given:
