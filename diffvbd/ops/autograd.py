@@ -62,10 +62,6 @@ _peek = torch._C._functorch.peek_interpreter_stack  # pyright: ignore[reportAttr
 CONTACT = "torch.func transforms and batched gradients (is_grads_batched) of a step with contact are not supported"
 
 
-def _is_transformed() -> bool:
-    return _peek() is not None or forward_ad._current_level >= 0
-
-
 def is_batched(grad: Tensor) -> bool:
     """Whether these are the gradients of torch.func.vmap or of is_grads_batched, which no vmap of a Function sees."""
     known = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
@@ -191,7 +187,7 @@ class Differentiable:
                     no_transforms(refuses)
                 needs = ctx.needs_input_grad[:count]
                 args = (*grads[:outputs], *kept, ctx.rest, needs)
-                differentiated = torch.is_grad_enabled() or _is_transformed()  # which _Reverse refuses
+                differentiated = torch.is_grad_enabled() or _peek() is not None or forward_ad._current_level >= 0
                 work = _Reverse.apply if differentiated and not torch.compiler.is_compiling() else reversed_
                 out = iter(work(*args))
                 return tuple(next(out) if need else None for need in needs) + (None,) * (arguments - count)
@@ -205,7 +201,7 @@ class Differentiable:
         self.function = _Forward
 
     def __call__(self, *args: Any) -> Any:
-        if torch.compiler.is_compiling() or _is_transformed():
+        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
             return self.function.apply(*args)
         if torch.is_grad_enabled():
             for t in args[: self.count]:
@@ -256,7 +252,7 @@ class Linear:
         self.function, self.run = _Function, run
 
     def __call__(self, *args: Any) -> Tensor:
-        if torch.compiler.is_compiling() or _is_transformed():
+        if torch.compiler.is_compiling() or _peek() is not None or forward_ad._current_level >= 0:
             return self.function.apply(*args)
         if torch.is_grad_enabled() and args[0].requires_grad:
             return self.function.apply(*args)
