@@ -139,8 +139,8 @@ def equilibrium(
             raise RuntimeError(text)
         warn(text, RuntimeWarning)
     elif bool(outcome.turned.any()):
-        warn(f"equilibrium: tets of scene {int(outcome.turned.nonzero()[0])} ended inside out; load in increments, or "
-             "less; " + page("statics.md"))  # fmt: skip
+        warn(f"equilibrium: tets of scene {int(outcome.turned.nonzero()[0])} ended inside out: load less, or take a "
+             "law with a logarithm of J, see dv.law; " + page("statics.md"))  # fmt: skip
     return Equilibrium(end.to(x.dtype).reshape(x.shape), residual, outcome.iterations, converged)
 
 

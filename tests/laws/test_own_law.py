@@ -114,6 +114,17 @@ def test_a_step_to_an_infinite_energy_is_not_taken() -> None:
     assert done.converged and float((done.x - model.rest_points).abs().max()) > 5e-3
 
 
+def test_a_block_that_is_squeezed_to_a_fifth_keeps_its_tets() -> None:
+    """With a logarithm of J; the built-in law, which has none, turns tets inside out (test_equilibrium_interface)."""
+    mesh = dv.mesh.cube(4, size=0.2)
+    y = torch.tensor(mesh.points[:, 1])
+    model = dv.Model(mesh, pinned=(y < 1e-9) | (y > 0.2 - 1e-9), energies=(law_of(TEXT),))
+    low = torch.where(model.pinned[:, None], model.rest_points * y.new_tensor([1.0, 0.2, 1.0]), torch.nan)
+    done = dv.equilibrium(model, model.rest_points, dv.VBD(1.0, 0), prescribed=low)
+    corners = done.x[torch.tensor(mesh.tets)]
+    assert done.converged and bool((torch.linalg.det(corners[:, 1:] - corners[:, :1]) > 0).all())
+
+
 @pytest.mark.hours  # other laws are compiled; all of their terms are in TEXT
 @pytest.mark.parametrize("law", [
     dv.law("C10*(I1*J**(-2/3) - 3) + C01*(I2*J**(-4/3) - 3) + K/2*(J - 1)**2", C10=4e4, C01=1e4, K=4e5),
