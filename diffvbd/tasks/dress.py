@@ -62,7 +62,7 @@ class Version(NamedTuple):
     rounds: int  # of stage B
 
 
-FULL, QUICK = Version(20, 15, 80, 16, 32, 100, ROUNDS), Version(8, 6, 24, 8, 12, 25, 4)
+FULL, QUICK = Version(20, 15, 80, 16, 32, 150, ROUNDS), Version(8, 6, 24, 8, 12, 25, 4)
 
 
 def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], alone: bool = False) -> Problem:
