@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .. import ops
 from .._common.checks import check_bool, init_names_checked
 from .._common.constants import ELASTIC
 from .._common.context import is_captured, is_silent, looks_at, may_copy, replaced
@@ -294,8 +295,8 @@ class EnergyLook:
 
     model: System
     prepared: Prepared
-    gravity: Tensor
-    start: Tensor  # [B, V, 3]
+    gravity: Tensor  # [B, V, 3]
+    start: Tensor
     had: Tensor  # at the start [B]: kinetic and elastic energy, and what gravity does over the scene's length [J]
     at: frozenset[int]  # numbers of steps that are looked at, the first among them
     elastic: list[_Chunk] | None
@@ -358,7 +359,8 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
     given = (x, v, prepared.mu, prepared.lam, prepared.mass)
     taped = torch.is_grad_enabled() and any(t.requires_grad for t in given)
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        start, pull = x.detach().reshape(-1, *x.shape[-2:]), acceleration_of(gravity, x).detach()
+        start = x.detach().reshape(-1, *x.shape[-2:])
+        pull = ops.broadcast(acceleration_of(gravity, x).detach(), x.shape).reshape(start.shape)
         size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1)  # [B]
         room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
         elastic = None if taped else list(_elastic_of(model, prepared))  # a tape should be all that a rollout keeps

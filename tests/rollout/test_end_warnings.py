@@ -245,6 +245,20 @@ def test_energy_of_barriers_is_that_of_their_forces() -> None:
     )
 
 
+def test_each_scene_has_its_gravity() -> None:
+    """What gravity gives one is no gain, nor is it lent to others."""
+    model, x, v = bent_bar()
+    gravity = torch.zeros(2, 3, 1, 3, dtype=x.dtype)
+    gravity[0, :, 0, 1] = torch.tensor([-1.0, -9.0, -30.0])
+    x, v = x.expand(2, 3, -1, -1), torch.zeros_like(x).expand(2, 3, -1, -1)
+    seen = []
+    for given in (gravity, gravity.expand(2, 3, model.num_vertices, 3)):
+        run = dict(steps=10, **SOFT, gravity=given, checks=dv.Checks(energy=True))
+        assert said_of_energy(lambda run=run: seen.append(dv.rollout(model, x, v, **run))) == []
+    moved = (seen[0].x[-1] - x).abs().amax((-1, -2))
+    assert bool((moved[0, 1:] > moved[0, :-1]).all()) and float(moved[1].amax()) < 1e-12
+
+
 def test_what_helps_helps() -> None:
     model, x, v = bent_bar()
     solver = dv.VBD(0.01, 100, subspace="coarse", relaxation=1.5)
