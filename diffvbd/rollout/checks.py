@@ -318,9 +318,9 @@ class EnergyLook:
                 self.most = now
                 return
             more = now.energy > old.energy
-            kept = (torch.where(more if a.dim() == 1 else more[:, None, None], a, b)
-                    for a, b in zip(now[:3], old[:3], strict=True))  # fmt: skip
-            self.most = Gain(*kept, torch.maximum(now.fallen, old.fallen))
+            x = torch.where(more[:, None, None], now.x, old.x)
+            energy, step_of = (torch.where(more, *both) for both in zip(now[:2], old[:2], strict=True))
+            self.most = Gain(energy, step_of, x, torch.maximum(now.fallen, old.fallen))
 
     def warn(self) -> None:
         """Warns (UserWarning) of a gain."""
