@@ -17,7 +17,6 @@ constexpr int kUnknowns = 6;                // of a body: a turn and a shift
 constexpr int kMostCoupled = 64;            // bodies of a group
 constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: memory of matrices
 constexpr int kGroupRows = 4;               // member, first, rank and count
-constexpr int32_t kLeft = -1;               // count of a group: a body of too many that touch
 
 // The most bodies of a group.
 DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
@@ -26,7 +25,8 @@ DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
   return most < 1 ? 1 : most < bodies ? most : bodies;
 }
 
-// The groups of a scene. Bodies have places, those of a group in a row, in the order of their numbers.
+// The groups of a scene: bodies that touch, in parts of at most `capacity`. Bodies have places, those of a group in a
+// row, in the order of their numbers.
 struct Groups {
   int32_t bodies;
   int64_t capacity;  // bodies of a group
@@ -35,10 +35,9 @@ struct Groups {
   DIFFVBD_FN int32_t& member(int32_t place) const { return rows[place]; }
   DIFFVBD_FN int32_t& first(int32_t body) const { return rows[bodies + body]; }
   DIFFVBD_FN int32_t& rank(int32_t body) const { return rows[2 * bodies + body]; }
-  DIFFVBD_FN int32_t& size(int32_t place) const { return rows[3 * bodies + place]; }
+  // Of the group that begins at a place, or 0.
+  DIFFVBD_FN int32_t& count(int32_t place) const { return rows[3 * bodies + place]; }
   DIFFVBD_FN int32_t place(int32_t body) const { return first(body) + rank(body); }
-  // The size of the group that begins at a place, or 0.
-  DIFFVBD_FN int32_t count(int32_t place) const { return size(place) == kLeft ? 1 : size(place); }
   DIFFVBD_FN bool joined(int32_t a, int32_t b) const { return first(a) == first(b); }
   // The offset of the matrix of the group that begins at a place.
   DIFFVBD_FN int64_t matrix(int32_t place) const { return kUnknowns * kUnknowns * capacity * place; }

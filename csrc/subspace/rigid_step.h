@@ -116,19 +116,14 @@ DIFFVBD_FN bool begin_bodies(const Run& run, const RigidStep<T>& s) {
   return !run.none(s.m.active, s.in.scene.scenes);
 }
 
-// The bodies of what acts are of one group; -1 where no group has more than one.
+// The bodies of what acts are of one group.
 template <class Run>
 struct Join {  // rows
   template <class T>
   DIFFVBD_FN void operator()(const RigidStep<T>& s, int64_t row) const {
     const PairForce& a = s.m.forces[row];
-    if (a.body[0] < 0 || a.body[1] < 0) return;
-    int32_t* label = s.m.label + s.unit(s.record(row)[5], 0);
-    if (most_grouped(s.in.bodies()) > 1) {
-      Run::unite(label, a.body[0], a.body[1]);
-    } else {
-      label[a.body[0]] = label[a.body[1]] = -1;
-    }
+    if (a.body[0] < 0 || a.body[1] < 0 || most_grouped(s.in.bodies()) == 1) return;
+    Run::unite(s.m.label + s.unit(s.record(row)[5], 0), a.body[0], a.body[1]);
   }
 };
 struct FindPlace {  // each body
@@ -137,16 +132,17 @@ struct FindPlace {  // each body
     const Groups g = s.in.groups_of(scene);
     const int32_t* label = s.m.label + s.unit(scene, 0);
     const int32_t k = static_cast<int32_t>(of), own = label[k];
+    const auto most = static_cast<int32_t>(g.capacity);
     int32_t before = k, rank = 0, size = 1;
-    if (g.capacity > 1) {
+    if (most > 1) {
       before = rank = size = 0;
       for (int32_t j = 0; j < g.bodies; ++j) before += label[j] < own, size += label[j] == own;
       for (int32_t j = 0; j < k; ++j) rank += label[j] == own;
     }
-    const bool left = own < 0 || size > g.capacity;
+    const int32_t part = rank / most * most;  // bodies of its group in parts before its own
     g.member(before + rank) = k;
-    g.first(k) = left ? before + rank : before, g.rank(k) = left ? 0 : rank;
-    g.size(before + rank) = left ? kLeft : rank == 0 ? size : 0;
+    g.first(k) = before + part, g.rank(k) = rank - part;
+    g.count(before + rank) = rank > part ? 0 : size - part < most ? size - part : most;
   }
 };
 template <class Run>

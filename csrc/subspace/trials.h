@@ -156,7 +156,7 @@ struct Flatten {  // each body
   template <class T>
   DIFFVBD_FN void operator()(const TrialStep<T>& s, int64_t scene, int64_t k) const {
     int32_t* label = s.m.label + s.unit(scene, 0);
-    if (label[k] >= 0) label[k] = Run::root_of(label, static_cast<int32_t>(k));
+    label[k] = Run::root_of(label, static_cast<int32_t>(k));
   }
 };
 struct FindReach {  // bodies

@@ -97,14 +97,19 @@ def test_a_row_that_is_struck_keeps_its_momentum(count: int, gap: float, speed: 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("sweeps", (1, 5))
-def test_a_row_too_long_for_one_system_keeps_its_momentum(sweeps: int, device: str) -> None:
-    model, x, v = row(MOST_COUPLED + 6, 5e-4, 1.0, device)
-    mass = model.mass[:, None]
-    first = (mass * v).sum(0)
-    for _ in range(2):
-        x, v = dv.step(model, x, v, dv.VBD(0.01, sweeps), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
-        assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
-    assert float(v[64:].norm()) > 0
+def test_a_row_too_long_for_one_system_moves_as_a_shorter_one(sweeps: int, device: str) -> None:
+    """And keeps its momentum, though its motions do not sum to that of all. Solved for one by one, its bodies kept a
+    tenth of this energy."""
+    kept = []
+    for count in (MOST_COUPLED - 6, MOST_COUPLED + 6):
+        model, x, v = row(count, 5e-4, 1.0, device)
+        mass = model.mass[:, None]
+        first, energy = (mass * v).sum(0), float((mass * v**2).sum())
+        for _ in range(3):
+            x, v = dv.step(model, x, v, dv.VBD(0.01, sweeps), mu=4e5, lam=4e5, gravity=(0.0, 0.0, 0.0))
+            assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
+        kept.append(float((mass * v**2).sum()) / energy)
+    assert kept[1] > 0.7 * kept[0] > 0
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -318,7 +318,7 @@ STEPS, TIME_STEP = 60, 0.01
 
 
 def block(support: str, bodies: int = 1) -> dv.Model:
-    """Cubes in a row over a support; of more than 64 bodies each is corrected by itself."""
+    """Cubes in a row over a support, that do not touch each other."""
     cube = dv.mesh.cube(3, size=0.1)
     cube = cube.translate((0.0, -float(cube.points[:, 1].min()), 0.0))
     mesh = dv.mesh.join([cube.translate((0.2 * k, 0.0, 0.0)) for k in range(bodies)])

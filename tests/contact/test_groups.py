@@ -1,7 +1,4 @@
-"""Claim: bodies that touch are corrected together, however many others a scene has.
-
-Groups of more than MOST_COUPLED bodies are not: each of their bodies is solved for alone.
-"""
+"""Claim: bodies that touch are corrected together, however many others a scene has; more than MOST_COUPLED in parts."""
 
 import importlib
 from typing import Any

@@ -45,7 +45,7 @@ CASES = {
     "pairs": ((PAIRS, dv.Friction(0.4)), {}),
     "all": ((FLOOR, PAIRS, dv.Friction(0.4)), {"anchored": True, "heights": (3,)}),
     "batched": ((FLOOR, PAIRS, dv.Friction(0.4)), {"scenes": 3}),
-    # more than sixty-four: groups of three and two, and those of a stack that is too high, each alone
+    # more than sixty-four: groups of three and two, and a stack that is too high for one
     "many": ((PAIRS, dv.Friction(0.4, 0.05)), {"heights": (3, MOST_COUPLED + 1, 2, 1), "scenes": 2}),
     "single": ((FLOOR, PAIRS, dv.Friction(0.4)), {"dtype": torch.float32}),
     "held": ((PAIRS, dv.Friction(0.4)), {"heights": (3,), "closing": 6.0}),
