@@ -115,7 +115,8 @@ class Correction:
         maps = torch.where(mesh[..., None, None], jacobian[scene, corners], 0.0)  # [Q, 4, 3, 6]
         if not within:
             second = torch.where(p.kind == EDGE_EDGE, 2, 1)
-            apart = (body[:, :1] != body.gather(1, second[:, None])) | ~mesh.gather(1, second[:, None])
+            both = mesh[:, :1] & mesh.gather(1, second[:, None])
+            apart = (body[:, :1] != body.gather(1, second[:, None])) | ~both
             maps = torch.where(apart[..., None, None], maps, 0.0)
         pull = (maps.mT @ force[..., None])[..., 0]
         g = g.index_put((scene, body), pull, accumulate=True)

@@ -330,7 +330,7 @@ class EnergyLook:
             first, last = (barrier_energy(self.model, self.prepared, x) for x in (self.start, most.x))
         given = self.had.sum(0) + first + most.fallen
         gain = (most.energy + last - first) / given.clamp(min=math.ulp(0.0))
-        scene = int(gain.argmax())
+        scene = int(gain.nan_to_num(nan=-math.inf).argmax())  # what is lost is said of the end
         largest, all_of, step = (float(t[scene]) for t in (gain, given, most.step))
         if not largest > GAIN:
             return
@@ -362,7 +362,7 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
         start = x.detach().reshape(-1, *x.shape[-2:])
         pull = ops.broadcast(acceleration_of(gravity, x).detach(), x.shape).reshape(start.shape)
         size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1)  # [B]
-        room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
+        room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax(-1) * size
         elastic = None if taped else list(_elastic_of(model, prepared))  # a tape should be all that a rollout keeps
         begun = mechanical_energy(model, prepared, start, v.detach(), elastic)
         had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])

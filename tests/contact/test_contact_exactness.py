@@ -15,6 +15,7 @@ from helpers.marks import hours, slow
 from helpers.spreads import PARALLEL, assert_near_contact
 
 import diffvbd as dv
+from diffvbd import reference
 from diffvbd.testing import relative_error
 from diffvbd.testing.contact_scenes import GRAVITY, SCENES, compiled, noise, substep_of, unrolled
 from diffvbd.testing.tolerances import tolerance
@@ -137,3 +138,18 @@ def test_central_differences_over_fifty_steps(name: str) -> None:
         errors = (abs(float((run(h) - run(-h)) / (2 * h) - slope)) for h in (1e-5, 1e-6, 1e-4, 1e-7))
         assert abs(float(slope)) > 0
         assert any(error <= tolerance("contact_finite_difference") * abs(float(slope)) for error in errors)
+
+
+@pytest.mark.parametrize("thing", [dv.colliders.Sphere((0.04, -0.055, 0.045), 0.05),
+                                   dv.colliders.Capsule((0.0, -0.055, 0.045), (0.1, -0.055, 0.045), 0.05)])  # fmt: skip
+def test_a_round_collider_pushes_in_the_rigid_correction_of_the_reference(thing: Any, device: str) -> None:
+    """Its corner is the first of a pair, and is of no body."""
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01, self_contact=False))
+    model = dv.Model(dv.mesh.box(2, 0.1), energies=energies, colliders=[thing], device=device)
+    x, solver = model.rest_points, dv.VBD(0.01, 0)
+    v, material = torch.zeros_like(x), {"mu": 1e5, "lam": 1e5, "gravity": (0.0, 0.0, 0.0)}
+    with dv.record("contact") as found:
+        end = dv.step(model, x, v, solver, **material)
+    twin = reference.contact_step(model, x, v, solver, substeps=[substep_of(d) for d in found], **material)
+    assert float((end[0] - x).abs().max()) > 1e-4
+    assert relative_error(twin[0], end[0]) <= tolerance("contact_forward")

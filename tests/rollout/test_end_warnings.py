@@ -259,6 +259,20 @@ def test_each_scene_has_its_gravity() -> None:
     assert bool((moved[0, 1:] > moved[0, :-1]).all()) and float(moved[1].amax()) < 1e-12
 
 
+@pytest.mark.parametrize("other", ["gravity", "speed"])
+def test_no_scene_silences_another(other: str) -> None:
+    model, x, v = bent_bar()
+    x, v = torch.stack([x, x]), torch.stack([v, v])
+    gravity = x.new_tensor([[0.0, -9.81, 0.0]]).expand(2, 1, 3).clone()
+    if other == "gravity":
+        gravity[1] *= 1e3
+    else:
+        v[1, :, 2] += 1e160
+    found = said_of_energy(lambda: dv.rollout(model, x, v, steps=10, **STIFF, gravity=gravity,
+                                              checks=dv.Checks(energy=True)))  # fmt: skip
+    assert len(found) == 1 and "scene 0 has gained" in found[0]
+
+
 def test_what_helps_helps() -> None:
     model, x, v = bent_bar()
     solver = dv.VBD(0.01, 100, subspace="coarse", relaxation=1.5)
