@@ -55,9 +55,10 @@ class Checks:
             warns where all tets of a body are inverted, and with a PairBarrier where a body goes by more than its own
             size in a step.
         energy: Whether to warn where a scene that only gravity drives has 5 % more energy than it began with and
-            gravity gave it, where its kinetic and elastic energy is largest; where, without pairs, the sweeps leave the
-            motion off by an estimated 2 %; where thin tets bend. True: energy after any step. None: on the CPU, of ten
-            steps or more, after six of them, most of them early (with a floor 12, with contact up to 64).
+            gravity gave it; where, without pairs, the sweeps leave the motion off by an estimated 2 %; where thin tets
+            bend. True: energy after any step, which with pairs costs about a step. None: on the CPU, of ten steps or
+            more, after six of them, most of them early (with a floor 12, with contact up to 64), and that of barriers
+            only where the rest is largest.
         contact: Whether to warn where pairs truncated the motion of more than 1 % of vertices in a step, or the last
             one left more than 5 % of what friction can bear unbalanced. None: on the CPU, after ten steps or more. A
             look costs about a step and on CUDA waits for the device; nothing that is compiled or captured is looked at.
@@ -283,7 +284,7 @@ def _elastic_of(model: System, prepared: Prepared) -> Iterator[_Chunk]:
 class Gain(NamedTuple):
     """What scenes have most gained [B], and how."""
 
-    energy: Tensor  # kinetic and elastic, less what gravity has done [J]
+    energy: Tensor  # of what counts at each look, less what gravity has done [J]
     step: Tensor  # after which
     x: Tensor  # [B, V, 3]
     fallen: Tensor  # the most that gravity has done [J]
@@ -300,6 +301,7 @@ class EnergyLook:
     had: Tensor  # at the start [B]: kinetic and elastic energy, and what gravity does over the scene's length [J]
     at: frozenset[int]  # numbers of steps that are looked at, the first among them
     elastic: list[_Chunk] | None
+    each: bool  # whether barriers count at each look, not only where the rest of the energy is largest: it costs a step
     most: Gain | None = None
     seen: int = 0
 
@@ -311,6 +313,8 @@ class EnergyLook:
         with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
             x, v = (t.detach().reshape(self.start.shape) for t in (x, v))
             energy = mechanical_energy(self.model, self.prepared, x, v, self.elastic)
+            if self.each:
+                energy = energy + barrier_energy(self.model, self.prepared, x)
             way = (x.double() - self.start.double()) * self.gravity.double()
             fallen = (_free_mass(self.model, self.prepared) * way.sum(-1)).sum(-1)
             now = Gain(energy - self.had[0] - fallen, torch.full_like(energy, step), x, fallen.abs())
@@ -327,7 +331,8 @@ class EnergyLook:
         if (most := self.most) is None:
             return
         with torch.no_grad(), torch.autocast(most.x.device.type, enabled=False):
-            first, last = (barrier_energy(self.model, self.prepared, x) for x in (self.start, most.x))
+            first = barrier_energy(self.model, self.prepared, self.start)
+            last = 0.0 if self.each else barrier_energy(self.model, self.prepared, most.x)
         given = self.had.sum(0) + first + most.fallen
         gain = (most.energy + last - first) / given.clamp(min=math.ulp(0.0))
         scene = int(gain.nan_to_num(nan=-math.inf).argmax())  # what is lost is said of the end
@@ -372,7 +377,7 @@ def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, step
         looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
         count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
         at = frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
-        return EnergyLook(model, prepared, pull, start, had, at, elastic)
+        return EnergyLook(model, prepared, pull, start, had, at, elastic, bool(asked))
 
 
 def _free_mass(model: System, prepared: Prepared) -> Tensor:

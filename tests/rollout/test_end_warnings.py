@@ -226,6 +226,23 @@ def test_energy_of_barriers_is_counted(dtype: torch.dtype, monkeypatch: pytest.M
     assert said(pair_kappa=torch.tensor(1e3, dtype=dtype), floor_kappa=torch.tensor(1e2, dtype=dtype)) == []
     monkeypatch.setattr(checks, "barrier_energy", lambda model, prepared, x: x.new_zeros(len(x)).double())
     assert len(said()) == 1
+    assert len(said(checks=dv.Checks())) == 1
+
+
+def test_energy_that_barriers_come_to_hold_is_counted_where_one_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though kinetic and elastic energy is largest elsewhere."""
+    model, x = pressed(torch.float64)
+    v, given = torch.zeros_like(x), {**SOFT, "mu": 1e5, "lam": 1e5, "solver": dv.VBD(0.005, 20)}
+    looks = []
+
+    def held(model: Any, prepared: Any, x: Tensor) -> Tensor:
+        looks.append(x)
+        return x.new_full((len(x),), 1e3 * (len(looks) == 3))  # at the start of the rollout, if any, and of one look
+
+    monkeypatch.setattr(checks, "barrier_energy", held)
+    asked = dv.Checks(energy=True)
+    assert len(said_of_energy(lambda: dv.rollout(model, x, v, steps=10, **given, checks=asked))) == 1
+    assert len(looks) == 11
 
 
 def test_energy_of_barriers_is_that_of_their_forces() -> None:
