@@ -46,7 +46,7 @@ EXAMPLES = """examples:
                                                    solver (time step, sweeps, ...) that stays within an error of 1 %
 
 `diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. `identify` ends with status 1
-where it stalled, and warns wherever it did not converge; `advise` where the error cannot be reached. An interrupted
+where it stalled, and warns wherever it did not converge; `advise` where the error was not reached. An interrupted
 `run` or `identify` continues where it stopped when the same command is given again.
 """
 MODULI = {"mu": "shear modulus [Pa]", "lam": "first Lame parameter [Pa]"}

@@ -196,7 +196,7 @@ cuda::Choice choose(const StepInputs<T>& in, const Device& device, Ints launch, 
   require(lanes == cuda::kFewLanes || lanes == some || lanes == cuda::kManyLanes, "diffvbd: bad launch");
   cuda::Choice out{};
   out.regime = static_cast<int>(regime);
-  out.lanes = kOwnLaw ? cuda::kManyLanes : static_cast<int>(lanes);
+  out.lanes = static_cast<int>(lanes);
   out.wanted = wanted;
   out.multiprocessors = device.attribute(cudaDevAttrMultiProcessorCount);
   out.shared = device.attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin);
@@ -227,7 +227,7 @@ template <class T>
 void run_reverse(const Device& device, const HostPlan& host, const StepInputs<T>& in, const T* x, const T* tape,
                  const StepAdjoints<T>& out, Ints launch) {
   // the kinds of adjoints that a reverse kernel is compiled for
-  const int wanted = (out.material[0] ? kMaterial : 0) | (out.rest || kOwnLaw ? kMaterial | kRest : 0);
+  const int wanted = (out.material[0] ? kMaterial : 0) | (out.rest || kOwnLaw ? kAllAdjoints : 0);
   cuda::Choice choice = choose(in, device, launch, true, wanted);
   const Tensor work = workspace(device, host, in, &out, choice);
   DIFFVBD_RUN(device, run_reverse<T>, host, in, x, tape, out, choice, work.data_ptr());

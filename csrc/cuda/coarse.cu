@@ -324,7 +324,7 @@ cudaError_t Corrections<T>::gradients(int wanted) const {
   const size_t shared = of_warp * warps;
   GradientKernel<T> kernel = gradient_kernel_of<T, kForward>(in.energies, lanes);
   if (reverse) {
-    kernel = gradient_kernel_of<T, kMaterial | kRest>(in.energies, lanes);
+    kernel = gradient_kernel_of<T, kAllAdjoints>(in.energies, lanes);
     if constexpr (!kOwnLaw) {
       if (!(wanted & kRest)) kernel = gradient_kernel_of<T, kMaterial>(in.energies, lanes);
       if (!(wanted & kMaterial)) kernel = gradient_kernel_of<T, kState>(in.energies, lanes);

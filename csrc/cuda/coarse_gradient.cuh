@@ -188,7 +188,8 @@ constexpr GradientKernel<T> gradient_variant() {
 }
 template <class T, int wanted, int lanes, int... n>
 GradientKernel<T> pick_gradient(int index, std::integer_sequence<int, n...>) {
-  static constexpr GradientKernel<T> table[kFreeSets] = {gradient_variant<T, wanted, lanes, free_mask(n)>()...};
+  static constexpr GradientKernel<T> table[kFreeSets] = {
+      gradient_variant<T, wanted, lanes, compiled_mask(free_mask(n))>()...};
   return table[index];
 }
 

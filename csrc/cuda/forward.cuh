@@ -188,7 +188,7 @@ SweepKernel forward_variant() {
 
 template <class T, int lanes, int... n>
 SweepKernel pick_forward(int index, std::integer_sequence<int, n...>) {
-  static SweepKernel const table[kEnergySets] = {forward_variant<T, energy_mask(n), lanes>()...};
+  static SweepKernel const table[kEnergySets] = {forward_variant<T, compiled_mask(energy_mask(n)), lanes>()...};
   return table[index];
 }
 

@@ -335,7 +335,7 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const LaneL
     const T* data = s.data.data + at.scene * s.data.scene;
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
-      out.data_count[k] = E::per_vertex ? E::stride : s.data_count[k];
+      out.data_count[k] = E::per_vertex && !kOwnLaw ? E::stride : s.data_count[k];
       out.data[k] = data + s.data_start[k] + (E::per_vertex ? static_cast<int64_t>(vertex) * E::stride : 0);
     });
   }

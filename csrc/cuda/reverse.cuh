@@ -215,7 +215,7 @@ SweepKernel reverse_variant() {
 
 template <class T, int wanted, int lanes, int... n>
 SweepKernel pick_reverse(int index, std::integer_sequence<int, n...>) {
-  static SweepKernel const table[kEnergySets] = {reverse_variant<T, energy_mask(n), wanted, lanes>()...};
+  static SweepKernel const table[kEnergySets] = {reverse_variant<T, compiled_mask(energy_mask(n)), wanted, lanes>()...};
   return table[index];
 }
 

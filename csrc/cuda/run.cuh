@@ -339,8 +339,8 @@ template <class T, int wanted>
 SweepKernel reverse_kernel_for(int energies, int lanes) {
   if constexpr (!kOwnLaw) {
     if (lanes == kFewLanes) return reverse_kernel<T, wanted, kFewLanes>(energies);
-    if (lanes == kSomeReverseLanes) return reverse_kernel<T, wanted, kSomeReverseLanes>(energies);
   }
+  if (lanes == kSomeReverseLanes) return reverse_kernel<T, wanted, kSomeReverseLanes>(energies);
   return lanes == kManyLanes ? reverse_kernel<T, wanted, kManyLanes>(energies)
                              : reverse_kernel<T, wanted, kSpillLanes>(energies);
 }
@@ -350,7 +350,7 @@ SweepKernel reverse_kernel_for(int energies, int wanted, int lanes) {
     if (!(wanted & kMaterial)) return reverse_kernel_for<T, kState>(energies, lanes);
     if (!(wanted & kRest)) return reverse_kernel_for<T, kMaterial>(energies, lanes);
   }
-  return reverse_kernel_for<T, kMaterial | kRest>(energies, lanes);
+  return reverse_kernel_for<T, kAllAdjoints>(energies, lanes);
 }
 
 }  // namespace

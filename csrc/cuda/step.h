@@ -191,11 +191,9 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int stages, int
   return stages * stage_scalars<T>() + groups * (3 * degree + (reverse ? contributions : 0));
 }
 
-// With contact a vertex has many threads or some; the variant with few is not built. A generated law is compiled at its
-// first use, so for many threads only, with all adjoints.
-constexpr bool is_built(int mask, int lanes) {
-  return is_compiled(mask) && (kOwnLaw ? gathers(lanes) : (mask & kContact) == 0 || lanes != kFewLanes);
-}
+// The variant with few threads is not built with contact, nor for a generated law, which is compiled at its first use.
+constexpr bool has_few(int mask) { return !kOwnLaw && (mask & kContact) == 0; }
+constexpr bool is_built(int mask, int lanes) { return is_compiled(mask) && (lanes != kFewLanes || has_few(mask)); }
 
 // Plan with the numbers that the host needs.
 struct HostPlan {
@@ -224,7 +222,7 @@ int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool r
     return shared_scalars<T>(host.degree, host.valence, stages, lanes, reverse) * sizeof(T);
   };
   const int some = reverse ? kSomeReverseLanes : kSomeLanes;
-  if (least <= kFewLanes && 6 * needed(kFewLanes) <= room) return kFewLanes;  // fewer warps would wait for memory
+  if (!kOwnLaw && least <= kFewLanes && 6 * needed(kFewLanes) <= room) return kFewLanes;  // fewer warps would wait for memory
   if (least <= some && 4 * needed(some) <= room) return some;                 // warps of a block
   return needed(kManyLanes) <= room ? kManyLanes : kSpillLanes;
 }

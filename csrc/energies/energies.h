@@ -41,6 +41,7 @@ constexpr bool kOwnLaw = false;
 template <bool exact>
 using ElasticLaw = StableNeoHookean<exact>;
 #endif
+constexpr int kAllAdjoints = kOwnLaw ? kRest : kMaterial | kRest;  // a generated law has its parameters in the rest shape
 using TetLaw = ElasticLaw<true>;  // for what both blocks share: the potential and the stiffness at rest
 constexpr int kFirstVertexBit = 3;
 
@@ -75,6 +76,8 @@ constexpr int optional_bits(EnergyList<E...>) {
   return bits;
 }
 constexpr int with_optional(int mask) { return mask | optional_bits(VertexEnergies{}); }
+// What CUDA compiles for a mask: a generated law, compiled at its first use, has half the variants so.
+constexpr int compiled_mask(int mask) { return kOwnLaw ? with_optional(mask) : mask; }
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
 
 // One block update, from the Newton step to the executed one.

@@ -34,6 +34,12 @@ class NearPairs(NamedTuple):
     offset: Tensor  # [Q] sum of the radii [m]
     measure: Tensor  # [Q] that weighs the pair (reference.distance.weight)
 
+    @classmethod
+    def of(cls, pairs: Tensor, constants: Tensor) -> NearPairs:
+        """Of the rows of a detection."""
+        rows, numbers = pairs.long(), constants.double()
+        return cls(rows[:, :4], rows[:, 4], rows[:, 5], *numbers[:, :3].unbind(1))
+
     def positions(self, points: Tensor) -> Tensor:
         """Corners [Q, 4, 3] in corner points [B, N, 3]."""
         return points[self.scene[:, None], self.corners]
@@ -98,8 +104,7 @@ def near_pairs(
             capacity = needed
         if touching:
             _raise_touching(surface, touching, key)
-        rows, numbers = pairs[:needed].long(), constants[:needed].double()
-        listed = NearPairs(rows[:, :4], rows[:, 4], rows[:, 5], *numbers[:, :3].unbind(1))
+        listed = NearPairs.of(pairs[:needed], constants[:needed])
         if radius is not None:
             return listed
         gap = distance(listed.kind, listed.positions(corner_points(x, origin, was))) - listed.offset

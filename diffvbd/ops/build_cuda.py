@@ -24,7 +24,7 @@ NVCC_FLAGS += ["-Xfatbin", "-compress-all"]
 INSTANCES = "build/instances"
 TEMPLATES = {  # by header of csrc/cuda, each for both scalars T
     "coarse_gradient": [
-        *(f"gradient_kernel_of<T, {wanted}>" for wanted in ("kForward", "kState", "kMaterial", "kMaterial | kRest"))
+        *(f"gradient_kernel_of<T, {wanted}>" for wanted in ("kForward", "kState", "kMaterial", "kAllAdjoints"))
     ],
     "contact": [
         "struct ContactPasses<T>",
@@ -35,7 +35,7 @@ TEMPLATES = {  # by header of csrc/cuda, each for both scalars T
     "scene_forward": ["run_scene_forward<T>"],
     "scene_reverse": ["run_scene_reverse<T>"],
 }
-WANTED = {"state": "kState", "material": "kMaterial", "rest": "kMaterial | kRest"}
+WANTED = {"state": "kState", "material": "kMaterial", "rest": "kAllAdjoints"}
 # The transposed sweeps take longest: few threads a vertex and many are compiled apart.
 LANES = {"few": ("kFewLanes", "kSomeReverseLanes"), "many": ("kManyLanes", "kSpillLanes")}
 
@@ -65,11 +65,13 @@ def cuda_instances() -> dict[str, str]:
 
 
 def law_instances(scalar: str, csrc: str) -> dict[str, str]:
-    """The same for the object of a generated law, which has a kernel for many threads a vertex and all adjoints."""
-    gradients = [name for name in TEMPLATES["coarse_gradient"] if "kForward" in name or "kRest" in name]
-    own = {name: TEMPLATES[name] for name in ("contact", "forward", "run")}
-    own |= {"coarse_gradient": gradients, "reverse": reverse_names("rest", "many")}
-    return {f"{header}.cu": instance(header, names, scalar, csrc) for header, names in own.items()}
+    """The same for the object of a generated law: some threads or many a vertex, and all adjoints."""
+    gradients = [name for name in TEMPLATES["coarse_gradient"] if "kForward" in name or "kAllAdjoints" in name]
+    own = {name: TEMPLATES[name] for name in ("contact", "forward", "run")} | {"coarse_gradient": gradients}
+    out = {f"{header}.cu": instance(header, names, scalar, csrc) for header, names in own.items()}
+    for share, names in {"some": reverse_names("rest", "few")[1:], "many": reverse_names("rest", "many")}.items():
+        out[f"reverse_{share}.cu"] = instance("reverse", names, scalar, csrc)
+    return out
 
 
 def write_instances(sources: dict[str, str]) -> list[str]:

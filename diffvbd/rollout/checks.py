@@ -34,6 +34,7 @@ from ..step.residual import (
     contact_of_step,
     friction_left_over,
     potential_of_step,
+    truncated_fraction,
     unsolved,
     what_helps,
 )
@@ -59,9 +60,10 @@ class Checks:
             bend. True: energy after any step, which with pairs costs about a step. None: on the CPU, of ten steps or
             more, after six of them, most of them early (with a floor 12, with contact up to 64), and that of barriers
             only where the rest is largest.
-        contact: Whether to warn where pairs truncated the motion of more than 1 % of vertices in a step, or the last
-            one left more than 5 % of what friction can bear unbalanced. None: on the CPU, after ten steps or more. A
-            look costs about a step and on CUDA waits for the device; nothing that is compiled or captured is looked at.
+        contact: Whether to warn where pairs truncated the motion of more than 1 % of vertices in a step, or one of up
+            to four, the last among them, left more than 5 % of what friction can bear unbalanced. None: on the CPU,
+            after ten steps or more. A look at friction costs about a step and on CUDA waits for the device; nothing
+            that is compiled or captured is looked at.
         errors: Also return how far from converged each step ends (:class:`diffvbd.results.ErrorEstimate`). Each step is
             swept twice for it, the second time without a tape, once under every schedule; states and gradients are the
             same.
@@ -143,12 +145,11 @@ class EndLook:
         harder = change > self.hardest[1]
         if not harder and step not in self.at:
             return
-        given = {k: t.detach() if isinstance(t, Tensor) else t for k, t in solve.given.items()}
         if harder:
             if self.hardest[0] not in self.at:
                 self.kept.pop(self.hardest[0], None)
             self.hardest = (step, change)
-        self.kept[step] = (replaced(solve, x=solve.x.detach(), v=solve.v.detach(), given=given), x.detach())
+        self.kept[step] = (_detached(solve), x.detach())
 
     def warn(self, x: Tensor, v: Tensor, gravity: Any) -> None:
         """Warns (UserWarning) of the end of a rollout."""
@@ -213,6 +214,11 @@ class EndLook:
         faster = "" if self.model.coarse is not None else ', subspace="coarse"'
         warn(f"sweeps: they leave steps unsolved{of}, and the motion may be off by some {percent(min(error, 1.0))}; "
              f"take more sweeps{faster} or a smaller time_step, and compare; {page('numerics.md')}")  # fmt: skip
+
+
+def _detached(solve: Solve) -> Solve:
+    given = {k: t.detach() if isinstance(t, Tensor) else t for k, t in solve.given.items()}
+    return replaced(solve, x=solve.x.detach(), v=solve.v.detach(), given=given)
 
 
 def look_at_end(asked: bool | None, model: System, integrator: Integrator, x: Tensor, v: Tensor, steps: int,
@@ -349,15 +355,20 @@ class EnergyLook:
 
 
 def look_at_energy(asked: bool | None, model: System, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
-                   gravity: Any) -> EnergyLook | None:  # fmt: skip
+                   gravity: Any, driving: list[str]) -> EnergyLook | None:  # fmt: skip
     """A look at a rollout of so many steps that nothing but gravity drives, or None where nobody asks for one.
 
-    prepared: Arguments that all steps share; None: there are none, and nothing is looked at.
+    prepared: Arguments that all steps share; None: there are none.  driving: Names of other inputs that drive it. With
+    either nothing is looked at, and where one asks a warning says so.
     """
-    if asked is False or is_silent() or steps == 0 or x.numel() == 0 or prepared is None:
+    if asked is False or is_silent() or steps == 0 or x.numel() == 0 or not model.energy_mask & ELASTIC:
         return None
     # springs, and what a user adds, store energy, too
-    if not model.energy_mask & ELASTIC or any(e is not model.floor for e in model.vertex_energies):
+    driving = driving + [type(e).__name__ for e in model.vertex_energies if e is not model.floor]
+    if driving or prepared is None:
+        if asked:
+            cause = ", ".join(driving) or "what changes from step to step"
+            warn(f"checks: no look at the energy, to which {cause} may add; {page('numerics.md')}")
         return None
     if asked is None and (x.is_cuda or not looks_at(x) or steps < LEAST_STEPS) or not (looks_at(x) or may_copy(x)):
         return None
@@ -453,30 +464,70 @@ def _rounding(model: System, prepared: Prepared, x: Tensor) -> Tensor:
 # --- what a rollout says of its contact -------------------------------------------------------------------------------
 
 
-def checks_contact(asked: bool | None, model: System, x: Tensor, steps: int) -> bool:
-    """Whether a rollout of so many steps ends with a look at its contact. A look reads values: never in what is
+@dataclass
+class ContactLook:
+    """Looks at the motion that pairs truncate in the steps of a rollout, and at friction in some of them."""
+
+    model: System
+    at: frozenset[int]  # numbers of steps whose friction is looked at, the last among them
+    cuts: list[Tensor] = field(default_factory=list)  # truncated_fraction() after each step
+    kept: dict[int, tuple[Solve, Tensor]] = field(default_factory=dict)
+    seen: int = 0
+
+    def see(self, step: int, solve: Solve, x: Tensor) -> None:
+        """After a step; one that runs again is not seen twice."""
+        if step <= self.seen:
+            return
+        self.seen = step
+        self.cuts.append(truncated_fraction(self.model))
+        if step in self.at:
+            self.kept[step] = (_detached(solve), x.detach())
+
+    def warn(self) -> None:
+        """Warns (UserWarning) of the steps that were seen."""
+        shares = torch.stack(self.cuts).tolist()
+        truncated = max(shares)
+        if truncated > TRUNCATED:
+            many = f"{sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than {percent(TRUNCATED)}"
+            warn(f"contact: pairs truncated {percent(truncated)} of the vertices in step {shares.index(truncated)}, "
+                 f"which went less far than they should (in {many}); {what_helps(self.model)}")  # fmt: skip
+        left = {step: unbalanced_friction(self.model, *kept) for step, kept in self.kept.items()}
+        for step in sorted(left, key=lambda step: -left[step]):
+            if not left[step] > UNBALANCED_FRICTION:
+                break
+            # does what is left over move a body, beside what forces do in a step?
+            found = unsolved(self.model, *self.kept[step], {})
+            if found is not None and found.error > UNBALANCED_FRICTION * found.forced:
+                faster = ' subspace="coarse",' if self.model.coarse is None else ""
+                warn(f"friction: {percent(left[step])} of what it can bear is not balanced after step {step}: the "
+                     "sweeps have not converged, and the motion may be far off; take more sweeps (100 are cheap in a "
+                     f"small scene),{faster} a smaller time_step or a larger Friction(velocity=); "
+                     + page("contact.md"))  # fmt: skip
+                break
+        self.kept = {}  # a segment that runs again keeps nothing
+
+
+def look_at_contact(asked: bool | None, model: System, x: Tensor, steps: int) -> ContactLook | None:
+    """A look at the contact of a rollout of so many steps; None: there is none. A look reads values: never in what is
     compiled, transformed or captured, and on CUDA, where it waits for the device, only where it is asked for."""
     if asked is False or not model.touches or steps == 0 or x.numel() == 0 or torch.compiler.is_compiling():
-        return False
+        return None
     if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
-        return False
-    if asked:
-        return not is_captured(x)
-    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and not is_silent()
+        return None
+    if is_captured(x) if asked else x.is_cuda or not looks_at(x) or steps < LEAST_STEPS or is_silent():
+        return None
+    count = min(MOST, -(-steps // LEAST_STEPS))  # a look costs about a step
+    return ContactLook(model, frozenset(round(steps * k / count) for k in range(1, count + 1)))
 
 
-def unbalanced_friction(model: System, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
-                        given: dict[str, Any]) -> float:  # fmt: skip
-    """What a step left unbalanced along the contact of a body, over the most that friction can bear there [-], the
-    largest; 0 where it cannot be told.
-
-    Args:
-        before: State (x, v) before the step.  x: Positions after it.  given: Its other arguments, as of advance().
-    """
+def unbalanced_friction(model: System, solve: Solve, x: Tensor) -> float:
+    """What a step to x left unbalanced along the contact of a body, over the most that friction can bear there [-], the
+    largest; 0 where it cannot be told."""
     if model.friction is None:
         return 0.0
+    prepared, given = solve.prepared, solve.given
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        x0, v0, x = (t.detach() for t in (*before, x))
+        x0, v0, x = (t.detach() for t in (solve.x, solve.v, x))
         begun = begin(model, x0, v0, prepared, given["force"], acceleration_of(given["gravity"], x0),
                       given["prescribed"]).detached()  # fmt: skip
         where = collider_state(model, x0, given["colliders"], given.get("colliders_before"))
@@ -487,28 +538,3 @@ def unbalanced_friction(model: System, before: tuple[Tensor, Tensor], x: Tensor,
             return float(friction_left_over(potential_of_step(model, end, begun, prepared, contact)).max())
         except ValueError:  # a state that is lost; the next step says why
             return 0.0
-
-
-def warn_of_contact(model: System, cuts: list[Tensor], before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
-                    given: dict[str, Any]) -> None:  # fmt: skip
-    """Warns (UserWarning) of the steps of a rollout.
-
-    cuts: truncated_fraction() after each step. The others: of the last step, as above.
-    """
-    shares = torch.stack(cuts).tolist()
-    truncated = max(shares)
-    left = unbalanced_friction(model, before, x, prepared, given)
-    if truncated > TRUNCATED:
-        many = f"{sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than {percent(TRUNCATED)}"
-        step = shares.index(truncated)
-        warn(f"contact: pairs truncated {percent(truncated)} of the vertices in step {step}, which lost velocity "
-             f"and momentum (in {many}); {what_helps(model)}")  # fmt: skip
-    if not left > UNBALANCED_FRICTION:
-        return
-    # does what is left over move a body, beside what forces do in a step?
-    found = unsolved(model, Solve(*before, prepared, given), x.detach(), {})
-    if found is not None and found.error > UNBALANCED_FRICTION * found.forced:
-        faster = ' subspace="coarse",' if model.coarse is None else ""
-        warn(f"friction: {percent(left)} of what it can bear is not balanced in the last step: the sweeps have not "
-             f"converged, and the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a "
-             f"smaller time_step or a larger Friction(velocity=); {page('contact.md')}")  # fmt: skip

@@ -43,9 +43,9 @@ from ..step.arguments import (
 )
 from ..step.contact import check_start as refuse_start
 from ..step.integrators import History, check_history, solves_of, take
-from ..step.residual import ErrorEstimate, error_of, of_steps, truncated_fraction
+from ..step.residual import ErrorEstimate, error_of, of_steps
 from ..step.warnings import proven, system_for, warn_of_inverted_bodies, warn_of_leaps, warn_of_sweeps
-from .checks import Checks, check_checks, checks_contact, look_at_end, look_at_energy, warn_of_contact, warn_of_last_end
+from .checks import Checks, check_checks, look_at_contact, look_at_end, look_at_energy, warn_of_last_end
 from .memory import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .refine import LOOKS, rollout_finer
 from .trajectory import PerStep, StepAverage, Trajectory, refuse_average, repeated, stacked
@@ -162,11 +162,10 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
         material, own, loads = ({k: repeated(k, v) for k, v in part.items()} for part in (material, own, loads))
     bar = _Progress(steps) if progress else None
     errors: dict[int, ErrorEstimate] = {}  # by step: a segment that runs again finds them
-    last: list[Any] = []  # what the last step went from, and to
-    cuts: list[Tensor] = []  # of each step, for the warning of contact
-    looks = checks_contact(checks.contact, model, x, steps)
-    driven = any(loads[k] is not None for k in ("force", "prescribed", "colliders")) or _changes(loads["gravity"])
-    energy = None if driven else look_at_energy(checks.energy, model, x, v, steps, fixed, loads["gravity"])
+    contact = look_at_contact(checks.contact, model, x, steps)
+    driving = [k for k in ("force", "prescribed", "colliders") if loads[k] is not None]
+    driving += ["gravity"] if _changes(loads["gravity"]) else []
+    energy = look_at_energy(checks.energy, model, x, v, steps, fixed, loads["gravity"], driving)
     warn_of_last_end(model, x)
     asked = () if torch.compiler.is_compiling() else recorders("solve")
     solves: dict[int, Any] = {}  # by step, of a few: a segment that runs again finds them
@@ -205,10 +204,8 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
                 energy.see(k + 1, x, v)
             if ending is not None:
                 ending.see(k + 1, now, given["force"], solve, v_before, x, v)
-            if looks and not last:  # not in a segment that runs again
-                cuts.append(truncated_fraction(model))
-            if looks and k + 1 == steps and not last:
-                last.extend(((solve.x, solve.v), x, solve.prepared, solve.given))
+            if contact is not None:
+                contact.see(k + 1, solve, x)
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
                 frames.append((k + 1, x, v))
             if observe is not None:
@@ -222,9 +219,8 @@ def _rollout(model: Model, x: Tensor, v: Tensor, solver: VBD, steps: int, inputs
         segment, steps, (x, v, *(history[:3] if history else ()), *begins), every if torch.is_grad_enabled() else None
     )
     _, _, *past = done.end[:-1] if moves else done.end
-    if last:
-        warn_of_contact(model, cuts, *last)
-        last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
+    if contact is not None:
+        contact.warn()
     if energy is not None:
         energy.warn()
     for found in asked:

@@ -21,7 +21,7 @@ from ..model.model import Model
 from ..model.solver import BDF2, SDIRK2, VBD, ImplicitEuler, Integrator
 from ..model.system import system_of
 from ..step.arguments import GRAVITY, MATERIAL, MODULI, OF_TETS, Prepared, check_state, given_of, material_of, prepare
-from ..step.integrators import SAME_TIME_STEP
+from ..step.integrators import SAME_TIME_STEP, Solve
 from ..step.residual import truncated_fraction
 from ..step.warnings import is_nearly_incompressible
 from .checks import NONE, mechanical_energy, unbalanced_friction
@@ -68,8 +68,8 @@ class Prediction:
         seconds: Time of one rollout over ``duration`` [s], with its backward if gradients were asked for.
         duration: [s], of motion.
         reached: Whether ``error`` is known to be at most ``asked``.
-        why: One line: why these, or why the error cannot be reached.
-        others: The runners-up, fastest first; if the error cannot be reached, the other runs with an estimate.
+        why: One line: why these, or why the error was not reached.
+        others: The runners-up, fastest first; if the error was not reached, the other runs with an estimate.
         spent: What all trial runs took [s].
         runs: How many there were.
         of: What ``error`` is an error of, in words that follow its number.
@@ -100,7 +100,7 @@ class Prediction:
         """The lines below a solver, whose text is ``line``: what they promise, why, and the runners-up."""
         verdict = f"error {self.error:.2g} {self.of}"
         if not self.reached:
-            verdict += ", not confirmed" if self.error <= self.asked else f": {self.asked:g} cannot be reached"
+            verdict += ", not confirmed" if self.error <= self.asked else f": {self.asked:g} was not reached"
         rows = [("solver", "error", "s per s of motion", "")]
         runs = [(line, self, "measured"), *((str(c.solver), c, self._status(c)) for c in self.others)]
         rows += [(text, f"{run.error:.1e}", f"{run.seconds / self.duration:.3g}", note) for text, run, note in runs]
@@ -613,7 +613,7 @@ class _Search:
                 swings = f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
                 return False, swings if unseen and self.levels else f"{MOST_STEPS} steps are not enough"
             if p.spent > self.time_budget:
-                return False, f"{self.time_budget:g} s of trial runs were not enough (time_budget)"
+                return False, f"{self.time_budget:g} s of trial runs were not enough: a larger time_budget may do"
             now = p.run(settings, steps)
             if now.failure and not self.levels and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
                 steps *= 2
@@ -1107,7 +1107,7 @@ class _Budget:
             return truncated, None
         inputs = given_of(system, p.given)
         prepared = prepare(system, tuple(p.x.shape[:-2]), inputs, time_step=settings.time_step, sweeps=settings.sweeps)
-        return truncated, unbalanced_friction(system, before[0], end.x[-1], prepared, inputs.loads)
+        return truncated, unbalanced_friction(system, Solve(*before[0], prepared, inputs.loads), end.x[-1])
 
     def _sweeps(self, run: TrialRun) -> TrialRun:
         """The same steps with sweeps enough that more change little."""

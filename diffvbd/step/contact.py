@@ -17,6 +17,7 @@ from .._common.constants import CONTACT
 from .._common.context import MorePairs, checking, in_segment, is_captured, not_compiled, recorders
 from .._contact.barrier import PairBarrier
 from .._contact.detection import intersections
+from .._contact.pair_forces import NearPairs, corner_points
 from .._contact.surface import LEAST_CAPACITY, ContactSurface, units
 from ..adjoint.contact import Pairs, floor_coefficients, friction_lag, no_pairs
 from ..adjoint.potential import IncreaseInputs, increase_inputs, of_vertices
@@ -27,6 +28,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops.autograd import no_transforms
 from ..ops.contact import Found, SubstepStart, contact_find, contact_near, start_substep, within
 from ..ops.sweep import sweep
+from ..reference.distance import distance
 from .arguments import Prepared, collider_state
 from .coarse import matrix_of
 from .contact_coarse import Corrections
@@ -346,11 +348,27 @@ class ContactStep:
                 + advice_to_part(self.x_prev, self.origin, self.barrier.dhat)
             )
         if infeasible:
+            listed = records.found[r].listed
             raise ValueError(
                 f"prescribed or colliders: expected feasible motion, got {infeasible} pairs in substep "
-                f"{r} of {self.substeps} that it would bring too close: spread a long motion over more steps "
-                "(per_step), give PairBarrier a larger number of detections, or use a smaller time_step"
+                f"{r} of {self.substeps} that it would bring too close, {self._most_closed(listed, needed)}: move it "
+                f"by less than dhat, {self.barrier.dhat:.3g} m, in a step where it meets what is free to move: take a "
+                "smaller time_step, or spread the motion over more steps (per_step)"
             )
+
+    def _most_closed(self, listed: Pairs, count: int) -> str:
+        """For a message: the pair that what is prescribed would close most, and how far that goes in the step."""
+        surface, pinned = self.surface, self.model._pinned[:, None]
+        assert surface is not None
+        with torch.no_grad():
+            origin = self.origin if self.origin.numel() else None
+            start = corner_points(self.x_prev, origin, self.before)
+            end = corner_points(torch.where(pinned, self.begun.y, self.x_prev), origin, self.colliders)
+            near = NearPairs.of(listed.pairs[:count], listed.constants[:count])
+            k = int((distance(near.kind, near.positions(end)) - near.offset).argmin())
+            way = (end - start).norm(dim=-1)[near.scene[k], near.corners[k]].max()
+            owners = surface.owners_of(*near.corners[k, [0, 3]].tolist())
+            return f"first {owners} in scene {int(near.scene[k])}, by a motion of {float(way):.3g} m"
 
     def _refuse_what_is_not_finite(self) -> None:
         """Refusal of values that are not finite; arguments.named finds the argument."""

@@ -11,6 +11,7 @@ from helpers.paths import needs_csrc
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.ops import regimes
 from diffvbd.testing import evaluate, relative_error
 from diffvbd.testing.contact_scenes import GRAVITY, SCENES
 
@@ -50,6 +51,14 @@ def test_batches_floors_anchors() -> None:
     model = model_of(dv.FloorBarrier(height=-0.03, kappa=500.0, dhat=0.05, damping=5.0), dv.Anchor(40.0), pinned=None)
     inputs = {k: v for k, v in inputs_of_law(model, 0.004, (70,)).items() if k != "stress_free"}
     same_on_both(model, dv.VBD(0.005, 2), inputs)
+
+
+def test_some_threads_a_vertex(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on meshes of more than 1,500 vertices a color."""
+    monkeypatch.setattr(regimes, "MANY_LANES_VERTICES", (0, 0))
+    test_every_input(5, 0.01, None)
+    test_batches_floors_anchors()
+    test_contact("fast", None)
 
 
 @pytest.mark.parametrize("subspace", [None, "coarse"])
