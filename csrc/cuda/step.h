@@ -222,8 +222,9 @@ int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool r
     return shared_scalars<T>(host.degree, host.valence, stages, lanes, reverse) * sizeof(T);
   };
   const int some = reverse ? kSomeReverseLanes : kSomeLanes;
-  if (!kOwnLaw && least <= kFewLanes && 6 * needed(kFewLanes) <= room) return kFewLanes;  // fewer warps would wait for memory
-  if (least <= some && 4 * needed(some) <= room) return some;                 // warps of a block
+  if (!kOwnLaw && least <= kFewLanes && 6 * needed(kFewLanes) <= room)
+    return kFewLanes;                                          // fewer warps would wait for memory
+  if (least <= some && 4 * needed(some) <= room) return some;  // warps of a block
   return needed(kManyLanes) <= room ? kManyLanes : kSpillLanes;
 }
 

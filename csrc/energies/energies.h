@@ -41,8 +41,9 @@ constexpr bool kOwnLaw = false;
 template <bool exact>
 using ElasticLaw = StableNeoHookean<exact>;
 #endif
-constexpr int kAllAdjoints = kOwnLaw ? kRest : kMaterial | kRest;  // a generated law has its parameters in the rest shape
-using TetLaw = ElasticLaw<true>;  // for what both blocks share: the potential and the stiffness at rest
+constexpr int kAllAdjoints =
+    kOwnLaw ? kRest : kMaterial | kRest;  // a generated law has its parameters in the rest shape
+using TetLaw = ElasticLaw<true>;          // for what both blocks share: the potential and the stiffness at rest
 constexpr int kFirstVertexBit = 3;
 
 // The compiled variants are numbered (elastic, the bits above): mask of the n-th, and back; and of those without

@@ -347,8 +347,8 @@ def test_gradients_are_those_without_a_look(schedule: Any) -> None:
 
 def test_a_scene_that_something_else_drives_is_named_where_one_asks() -> None:
     model, x, v = bent_bar()
-    for given, cause in (({"force": torch.ones_like(x)}, "force"),
-                         ({"mu": dv.per_step(torch.full((2, 1), 1e4, dtype=x.dtype))}, "what changes from step to step")):  # fmt: skip
+    mu = dv.per_step(torch.full((2, 1), 1e4, dtype=x.dtype))
+    for given, cause in (({"force": torch.ones_like(x)}, "force"), ({"mu": mu}, "what changes from step to step")):
         inputs = {**SOFT, **given}
         with pytest.warns(UserWarning, match=f"checks: no look at the energy, to which {cause} may add"):
             dv.rollout(model, x, v, steps=2, **inputs, checks=dv.Checks(energy=True))
@@ -401,7 +401,8 @@ def test_friction_that_has_not_converged_is_warned_of() -> None:
     assert len(said) == 2 and said[1].startswith("sweeps:") and found[0].filename == __file__
     assert messages(lambda: dv.rollout(model, x, v, dv.VBD(0.01, 1), steps=10, **stiff)) == said  # each time
     # at rest by the last of 40 steps
-    assert any("after step 10:" in m for m in messages(lambda: dv.rollout(model, x, v, dv.VBD(0.01, 1), steps=40, **stiff)))
+    said = messages(lambda: dv.rollout(model, x, v, dv.VBD(0.01, 1), steps=40, **stiff))
+    assert any("after step 10:" in message for message in said)
     soft, x, v = sliding(coefficient=0.5, velocity=0.1)
     assert not messages(lambda: dv.rollout(soft, x, v, dv.VBD(0.01, 400), steps=10, **stiff))
 
