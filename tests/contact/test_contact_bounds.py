@@ -307,6 +307,6 @@ def test_a_plane_moved_through_a_body_raises() -> None:
     plane = colliders.Plane((0.0, -0.05, 0.0))
     model = dv.Model(box(2, 0.2), energies=(dv.StableNeoHookean(), barrier()), colliders=[plane])
     x, up = model.rest_points, torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"colliders: expected feasible motion, .* body 0 and collider 0 in .* of 0.3 m"):
+    with pytest.raises(ValueError, match=r"expected feasible motion, .* body 0 and collider 0 in .* of 0.3 m"):
         dv.step(model, x, torch.zeros_like(x), dv.VBD(0.01, 1), colliders=model.collider_points + up,
                 colliders_before=model.collider_points, **MATERIAL)  # fmt: skip
