@@ -27,9 +27,11 @@ from ._common.checks import (
     check_positive,
     fail,
     init_names_checked,
+    name_value,
     refuse_gradient,
     refuse_gradients,
 )
+from ._common.context import looks_at
 from .embedding import Embedding
 from .energies import numbers_of
 from .mesh import TetMesh, cavities
@@ -519,6 +521,9 @@ class Pressure(Coupling):
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         s = self._surfaces
         volume, normal = self._faces(x)
+        if self.gas and looks_at(volume):
+            what = "cavities of positive volume [m^3], for their gas; a smaller time_step keeps them so"
+            name_value("x", what, volume.detach(), volume.detach() > 0, ("scene", "cavity"))
         gauge = self._gauge(volume, values)
         of_face, of_edge = s.of_faces.gather(gauge[..., None]), s.of_edges.gather(gauge.abs()[..., None])
         one, two = s.opposite.gather(x).unflatten(1, (2, -1)).unbind(1)

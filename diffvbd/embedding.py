@@ -107,6 +107,8 @@ class Embedding:
             raise TypeError(f"x: expected a tensor of shape [..., V, 3], got {kind_of(x)}")
         if x.dim() < 2 or x.shape[-1] != 3:
             fail("x", "shape [..., V, 3]", f"shape {list(x.shape)}")
+        if x.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"x: expected float64 or float32, got {x.dtype}")
         lead, count, key = x.shape[:-2], x.shape[-2], (x.shape[-2], x.dtype, x.device)
         if key not in self._placed:
             self.check("x: this Embedding", count)

@@ -40,7 +40,7 @@ def numbers_of(name: str, value: Any) -> Tensor:
         given = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
         if given.is_complex():  # whose real part is what .to() would take
             raise TypeError
-        out = given.detach().to(torch.float64)
+        out = given.detach().to(torch.float64, copy=isinstance(value, Tensor))  # which may change later
     except OverflowError:
         fail(name, "numbers that a float can hold", "an integer beyond 1.8e308")
     except (TypeError, ValueError, RuntimeError):

@@ -98,7 +98,8 @@ def solve_adjoint(potential: IncrementalPotential, x_bar: Tensor, adjoint: Globa
     """w with (d2G/dx2) w = x_bar at the free vertices, w = 0 at the pinned.
 
     operators: As of system().  name: Of what is differentiated.  roundings: Of a product with the Hessian, which the
-    residual may keep whatever the tolerance is.
+    residual may keep whatever the tolerance is, as long as they are of the last half of its digits: where they are
+    more, the Hessian has no inverse in these numbers.
     """
     # of order one, so that no square of it leaves the range of its numbers
     size = x_bar.abs().amax((-2, -1), keepdim=True) if x_bar.numel() else x_bar.new_ones((len(x_bar), 1, 1))
@@ -107,15 +108,17 @@ def solve_adjoint(potential: IncrementalPotential, x_bar: Tensor, adjoint: Globa
     limit = adjoint.max_iterations or min(max(10 * 3 * potential.model.num_active, 1), MAX_ITERATIONS)
     product, precondition = operators
     found = conjugate_gradients(product, b, precondition, tolerance, limit)
-    residual = float(found.residual.max()) if len(b) else 0.0
-    if roundings and not residual <= tolerance:
-        part = potential.stiffness() * found.x
-        kept = roundings * torch.finfo(b.dtype).eps * (_dot(part, part) / _dot(b, b)).sqrt().flatten()
-        tolerance = max(tolerance, float(kept[found.residual.argmax()]))
+    error, allowed = found.residual, torch.full_like(found.residual, tolerance)
+    if roundings:
+        part, eps = potential.stiffness() * found.x, torch.finfo(b.dtype).eps
+        kept = roundings * eps * (_dot(part, part) / torch.where(size == 0, 1, _dot(b, b))).sqrt().flatten()
+        error = torch.where(kept > math.sqrt(eps), torch.maximum(error, kept), error)
+        allowed = torch.maximum(allowed, kept.clamp(max=math.sqrt(eps)))
+    scene = int((error / allowed).argmax()) if len(b) else 0
+    residual, tolerance = (float(t[scene]) if len(b) else 0.0 for t in (error, allowed))
     if adjoint.report is not None:
         adjoint.report(LinearSolve(found.iterations, residual, residual <= tolerance))
     if not residual <= tolerance:
-        scene = int(found.residual.argmax())
         if not bool(torch.isfinite(size[scene])):
             text = f"{name}: expected finite adjoints of the positions, got {float(size[scene])} in scene {scene}"
         else:

@@ -5,8 +5,9 @@ sympy is imported at the first law.
 
 from __future__ import annotations
 
+import ast
 import hashlib
-import re
+import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -48,8 +49,8 @@ class Density:
     """
 
     def __init__(self, text: str) -> None:
-        self.text = text
-        self.psi, self.functions = _parsed(text)
+        self.text = " ".join(text.split()) if isinstance(text, str) else text
+        self.psi, self.functions = _parsed(self.text)
         import sympy
 
         names = {s.name for s in self.psi.free_symbols}
@@ -229,10 +230,8 @@ def _parsed(text: str) -> tuple[Any, dict[str, Any]]:
     makers = {name: getattr(sympy, name) for name in ("Integer", "Float", "Rational", "Function")}
     makers["Symbol"] = lambda name: sympy.Symbol(name, real=True)
     shown = f"an energy density of {', '.join(INVARIANTS)}, {STRETCHES} and parameters"
-    # no attributes and no names of Python's own: the text is evaluated
-    if not re.fullmatch(r"[\w\s+\-*/().,]+", text) or re.search(r"__|[A-Za-z_]\w*\s*\.|\.\s*[A-Za-z_]", text):
-        fail("expression", shown, repr(text))
     try:
+        _check_formula(ast.parse(text, mode="eval").body)
         psi = sympy.sympify(parse_expr(text, local_dict=known, global_dict={**makers, "__builtins__": {}}))
         psi = psi if isinstance(psi, sympy.Expr) else None
     except Exception as error:  # sympy raises what Python's parser and its own classes raise
@@ -242,11 +241,35 @@ def _parsed(text: str) -> tuple[Any, dict[str, Any]]:
         fail("expression", shown, repr(text))
     if unknown := sorted({f.func.__name__ for f in psi.atoms(AppliedUndef)}):
         fail("expression", f"no functions but {', '.join(FUNCTIONS)}", f"{unknown[0]}() in {text!r}")
+    if psi.has(sympy.Abs, sympy.sign):
+        fail("expression", "k in place of sqrt(k**2)", repr(text))
     if psi.has(sympy.zoo, sympy.nan, sympy.oo, sympy.I):
         fail("expression", shown, f"{text!r}, which is {psi}")
     if not psi.free_symbols & {sympy.Symbol(name, real=True) for name in INVARIANTS}:
         fail("expression", shown, f"{text!r}, which depends on none of them")
     return psi, functions
+
+
+def _check_formula(node: ast.AST) -> None:
+    """Raises for what is no formula: the text is evaluated, and Python's ``or`` or ``if`` would drop terms."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)):
+        if isinstance(node.op, ast.Pow):
+            inside = list(ast.walk(node.right))
+            if any(isinstance(n, ast.Pow) for n in inside) and not any(isinstance(n, ast.Name) for n in inside):
+                raise ValueError("a power of numbers as an exponent")
+        parts = [node.left, node.right]
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.UAdd, ast.USub)):
+        parts = [node.operand]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
+        parts = [node.func, *node.args]
+    elif isinstance(node, ast.Name) and "__" not in node.id:
+        parts = []
+    elif isinstance(node, ast.Constant) and type(node.value) in (int, float) and abs(node.value) < math.inf:
+        parts = []
+    else:
+        raise ValueError(f"{type(node).__name__}: {ast.unparse(node)}")
+    for part in parts:
+        _check_formula(part)
 
 
 def _stretches() -> Any:
@@ -301,6 +324,8 @@ def _text(e: Any, names: dict[Any, str]) -> str:
     if e in names:
         return names[e]
     if e.is_number:
+        if not (e.is_real and e.is_finite):
+            fail("expression", "an energy density with finite derivatives", f"one that is {e}")
         return f"R({float(e)!r})"
     if e.is_Add or e.is_Mul:
         joined = (" + " if e.is_Add else " * ").join(_text(a, names) for a in sorted(e.args, key=_constants_first))

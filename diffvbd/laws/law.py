@@ -15,9 +15,13 @@ from ..energies import numbers_of
 from .density import INVARIANTS, STRETCHES, Density
 
 FIBRE = "a0"
-# inputs of a step that mean something else, or that own laws do not have
+# inputs of a step that mean something else, or that own laws do not have, and other arguments of what takes inputs
 TAKEN = {"force", "gravity", "prescribed", "colliders", "colliders_before", "rest_points", "density", "drag", "young",
-         "poisson", "stress_free", "viscosity", "volume_viscosity", "below", FIBRE, STRETCHES}  # fmt: skip
+         "poisson", "stress_free", "viscosity", "volume_viscosity", "below", FIBRE, STRETCHES, "model", "x", "v",
+         "solver", "steps", "duration", "adjoint", "history", "save", "observe", "checkpoint_every", "checks",
+         "progress", "check_every", "max_sweeps", "max_iterations", "on_failure", "error", "gradient", "quantity",
+         "time_budget", "device", "before", "loss", "mesh", "previous", "warn", "fraction",
+         "tolerance"}  # fmt: skip
 RESIDUAL = 1e-6  # of the moduli: stress of a body at rest from which a law is warned of
 
 
@@ -38,7 +42,7 @@ class Law:
         self.density = Density(expression)
         names = self.density.parameters
         if wrong := sorted(set(names) & TAKEN):
-            fail("expression", "parameters with names of their own", f"{wrong[0]!r}, which is another input of a step")
+            fail("expression", "parameters with names of their own", f"{wrong[0]!r}, another argument of a step")
         if missing := sorted(set(names) - set(values)):
             known = ", ".join((*INVARIANTS, STRETCHES))
             fail(missing[0], f"a number or a tensor: {expression!r} has it, and it is none of {known}", "none")
@@ -51,6 +55,9 @@ class Law:
             if value.dim() > 1:
                 fail(name, "a number or shape [T]", f"shape {list(value.shape)}")
             self.values[name] = value
+        sizes = {name: value.numel() for name, value in self.values.items() if value.numel() != 1}
+        if len(set(sizes.values())) > 1:
+            fail("parameters", "numbers or one value a tet, as many of each", sizes)
         if (a0 is None) == self.density.fibre:
             fail(FIBRE, "directions of fibres with I4 in the expression, and only then", "none" if a0 is None else a0)
         refuse_gradient(FIBRE, a0, "pass it to a step or a rollout")
@@ -68,7 +75,9 @@ class Law:
 
     def _check_rest(self) -> None:
         """Warns where a body at rest has stress."""
-        mu, lam, stress = self.at_rest([self.values[p] for p in self.density.parameters])
+        given = [self.values[p] for p in self.density.parameters]
+        self.check_finite(given)
+        mu, lam, stress = self.at_rest(given)
         slopes = self._slopes_at_rest()
         size = mu.abs() + lam.abs()
         stress = torch.maximum(stress.abs(), 2 * slopes[3].abs())
@@ -88,6 +97,13 @@ class Law:
         mu, lam, stress = (m if isinstance(m, Tensor) else like.new_full((), float(m))
                            for m in self.density.at_rest(*parameters))  # fmt: skip
         return mu, lam, stress
+
+    def check_finite(self, parameters: Sequence[Tensor]) -> None:
+        """Raises for parameters in their order with which psi at F = I is no number: no step would find its least."""
+        one = torch.ones_like(parameters[0]) if parameters else torch.ones((), dtype=torch.float64)
+        (psi,) = self.density.value([3 * one, 3 * one, one, one], [p.detach() for p in parameters])
+        what = f"parameters with which {self.expression!r} is a finite number [Pa] at F = I"
+        name_value("law", what, psi, torch.isfinite(psi))
 
     def check_mesh(self, num_tets: int) -> None:
         """Raises where the values do not fit a mesh."""

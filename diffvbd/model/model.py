@@ -18,6 +18,7 @@ from .._common.checks import (
     check_tensor,
     fail,
     init_names_checked,
+    input_name,
     name_value,
     real_array,
     vertex_mask,
@@ -141,6 +142,10 @@ class Model:
             mask |= energy.bit
         if self.law is not None:
             self.law.check_mesh(self.mesh.num_tets)
+            others = {input_name(e, key) for e in self.parametric_energies for key in e.parameters}
+            if both := sorted(others & set(self.law.inputs)):
+                fail("energies", "a law whose parameters have names of their own",
+                     f"{both[0]!r}, which is an input of another energy")  # fmt: skip
             mask |= ops.bits_of_law(self.law.density, dtype, device)
         return mask
 

@@ -48,6 +48,7 @@ def law_inputs(model: System, given: dict[str, Any], scenes_first: ScenesFirst) 
         a0 = a0 / a0.square().sum(-1, keepdim=True).sqrt()
     mu, lam, _ = (m.reshape(1, 1) if m.dim() == 0 else m for m in law.at_rest(values))
     if looks_at(mu):
+        law.check_finite(values)
         size = LEAST * (mu.abs() + lam.abs()).detach()
         for name, modulus in (("shear", mu.detach()), ("bulk", (lam + 2 / 3 * mu).detach())):
             what = f"parameters with a {name} modulus at rest >= 0 Pa"

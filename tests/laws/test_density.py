@@ -1,6 +1,7 @@
 """Claim: a law's density is what its text says: invariants, derivatives, continuation, moduli at rest; a wrong text or
 value is named. Nothing is compiled here."""
 
+import inspect
 import math
 import pickle
 import re
@@ -13,6 +14,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd.laws import tets
 from diffvbd.laws.density import LEAST_VOLUME, Density, stretch_sum
+from diffvbd.laws.law import TAKEN
 from diffvbd.model.material import rest_metric, shape_gradients
 from diffvbd.testing import relative_error
 
@@ -175,6 +177,16 @@ def test_kinds() -> None:
                      STABLE: (True, False, False), "c*(I2 - 3)": (True, True, False)}  # fmt: skip
 
 
+def test_a_formula_may_have_several_lines() -> None:
+    assert Density("mu*(I1\n - 3)").header == Density("mu*(I1 - 3)").header
+
+
+def test_no_parameter_hides_an_argument() -> None:
+    for function in (dv.step, dv.rollout, dv.solve, dv.equilibrium, dv.advise, dv.refine, dv.diagnose, dv.error_budget):
+        known = inspect.signature(function).parameters.values()
+        assert {p.name for p in known if p.kind is not p.VAR_KEYWORD} <= TAKEN, function
+
+
 def test_pickles() -> None:
     law = make(FIBRES)
     again = pickle.loads(pickle.dumps(law))
@@ -198,6 +210,15 @@ def test_pickles() -> None:
         ("mu*(I4 - 1)**2", {"mu": 1.0, "a0": (0.0, 0.0, 0.0)}, "a0: expected directions of finite length > 0"),
         ("mu*(I4 - 1)**2", {"mu": 1.0, "a0": (1.0, 0.0)}, "a0: expected shape [3] or [T, 3]"),
         ("mu*(J - 1)**2", {"mu": float("nan")}, "mu: expected finite numbers"),
+        ("J or I1", {}, "BoolOp: J or I1"),
+        ("I1 if J else I2", {}, "IfExp: I1 if J else I2"),
+        ("1e400*J", {}, "expression: expected an energy density"),
+        ("9**9**9*J", {}, "a power of numbers as an exponent"),
+        ("sqrt(k**2)*I1", {"k": 1.0}, "expression: expected k in place of sqrt(k**2)"),
+        ("mu*sqrt(I1 - 3)", {"mu": 1.0}, "expression: expected an energy density with finite derivatives"),
+        ("steps*(I1 - 3)", {"steps": 1.0}, "'steps', another argument of a step"),
+        ("mu*(I1 - 3) + lam*(J - 1)**2", {"mu": [1.0, 2.0], "lam": [1.0, 2.0, 3.0]}, "parameters: expected numbers or"),
+        (FIBRES, {"mu": 1.0, "lam": 1.0, "k1": 1.0, "k2": 0.0, "a0": (1.0, 0.0, 0.0)}, "is a finite number [Pa] at F"),
     ],
 )
 def test_bad_laws_are_named(text: str, given: dict[str, Any], message: str) -> None:

@@ -66,6 +66,17 @@ def test_two_scenes_with_floor_and_springs() -> None:
     agrees(model, arguments, (1e-5,))
 
 
+@pytest.mark.parametrize("pinned", [[0], [0, 1]])
+def test_a_body_that_may_turn_has_no_gradient(pinned: list[int]) -> None:
+    """About a point under gravity, about an axis without: the solve meets its residual, with a solution of 1e9."""
+    model = dv.Model(dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)), pinned=pinned)
+    force = torch.zeros_like(model.rest_points).requires_grad_()
+    gravity = None if len(pinned) == 1 else (0.0, 0.0, 0.0)
+    end = dv.equilibrium(model, model.rest_points, SOLVER, mu=2e4, lam=3e4, force=force, gravity=gravity)
+    with pytest.raises(RuntimeError, match="slide or turn freely there is no derivative"):
+        (numbers(model.num_vertices, 3) * end.x).sum().backward()
+
+
 def test_young_poisson_and_prescribed() -> None:
     mesh = dv.mesh.beam(5, 2, 2, size=(0.4, 0.1, 0.1))
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9)

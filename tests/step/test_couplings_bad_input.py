@@ -89,6 +89,21 @@ def test_steps_name_what_is_wrong(inputs: dict[str, Any], message: str) -> None:
         dv.step(SCENE, x, torch.zeros_like(x), SOLVER, mu=1e4, lam=1e4, **inputs)
 
 
+def test_gas_that_is_pressed_through_nothing_is_named() -> None:
+    box = model(dv.Pressure(gas=True))
+    x = box.rest_points
+    with pytest.raises(ValueError, match=r"x: expected cavities of positive volume .*, got -.* of scene 0 \(in step"):
+        dv.rollout(box, x, -60 * (x - 0.15), dv.VBD(0.02, 20), steps=5, mu=1e3, lam=1e3)
+
+
+def test_what_was_given_may_change_later() -> None:
+    stiffness, places = torch.full((2,), 10.0, dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
+    springs = dv.Springs(TWO, places, stiffness)
+    stiffness.mul_(-1)
+    places.fill_(NAN)
+    assert springs.stiffness.tolist() == [10.0, 10.0] and not springs.points.any()
+
+
 def test_models_without_couplings_say_so() -> None:
     bare = dv.Model(CUBE)
     x = bare.rest_points
