@@ -264,7 +264,7 @@ def _check_formula(node: ast.AST) -> None:
         parts = [node.func, *node.args]
     elif isinstance(node, ast.Name) and "__" not in node.id:
         parts = []
-    elif isinstance(node, ast.Constant) and type(node.value) in (int, float) and abs(node.value) < math.inf:
+    elif isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value != math.inf:
         parts = []
     else:
         raise ValueError(f"{type(node).__name__}: {ast.unparse(node)}")
