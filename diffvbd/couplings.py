@@ -24,7 +24,7 @@ from torch import Tensor
 from ._common.checks import (
     check_bool,
     check_kind,
-    check_positive,
+    check_number,
     fail,
     init_names_checked,
     name_value,
@@ -409,7 +409,7 @@ class Pressure(Coupling):
             cavities of the mesh (:func:`diffvbd.mesh.cavities`).
         pressure: p above ambient [Pa], a number or one for each cavity, shape [C]; at least -ambient with ``gas``.
         gas: Whether the amount of gas is constant.
-        ambient: Absolute pressure outside [Pa], which only ``gas`` reads.
+        ambient: Absolute pressure outside [Pa], which only ``gas`` reads; 0 in a vacuum.
 
     Inputs: ``pressure`` [C].
 
@@ -436,7 +436,7 @@ class Pressure(Coupling):
 
     def __post_init__(self) -> None:
         check_bool("gas", self.gas)
-        object.__setattr__(self, "ambient", check_positive("ambient", self.ambient, "Pa"))
+        object.__setattr__(self, "ambient", check_number("ambient", self.ambient, "a finite number >= 0 Pa"))
         if self.triangles is not None:
             first = next(iter(self.triangles), ()) if isinstance(self.triangles, (list, tuple)) else ()
             several = np.ndim(first) == 2

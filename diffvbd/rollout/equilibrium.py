@@ -86,9 +86,9 @@ def equilibrium(
     """State of rest near x under loads, pins, floors, anchors, couplings and contact, by Newton's method.
 
     What is found is a local minimum of the potential energy, without inertia, and from x downhill: where there are
-    several, as after buckling, x decides, and a straight column under any load stays straight. Friction and damping
-    have no part in it: a body that only friction would hold slides on. The gradient is that of the equation dU/dx = 0
-    at its solution; one linear solve gives it for all inputs. Where bodies may turn or slide freely it raises.
+    several, as after buckling, x decides, and an x that is in balance is returned, be it stable or not. Friction and
+    damping have no part in it: a body that only friction would hold slides on. The gradient is that of the equation
+    dU/dx = 0 at its solution; one linear solve gives it for all inputs. It raises where a body may turn or slide.
 
     Args:
         model: The Model.
