@@ -172,11 +172,12 @@ def _minimize(model: System, x: Tensor, given: Statics, limits: Limits) -> Rest:
     while True:
         below = _decreases(best, at, best_slope, inputs)[0]
         left, residual, done = residual_of(at, limits.tolerance)
-        back = climbs & ~below & (done | (since >= WATCH))
+        far = ~((at.x - x).abs().amax((1, 2)) <= FAR * extent)
+        back = climbs & ~below & (done | far | (since >= WATCH))
         if bool(back.any()):
             climbs, at = climbs & ~back, _state(at, torch.where(back[:, None, None], best.x, at.x))
             left, residual, done = residual_of(at, limits.tolerance)
-        unbounded = ~((at.x - x).abs().amax((1, 2)) <= FAR * extent)
+        unbounded = far & ~back
         if limits.progress:
             log_progress("equilibrium: residual %.3g after %d iterations", float(residual.max()), limits.before + count)
         rests = done | unbounded | (shift[:, 0, 0] > LAST_SHIFT)

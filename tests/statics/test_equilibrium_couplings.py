@@ -98,6 +98,23 @@ def test_a_stiff_beam_between_springs() -> None:
     assert total.tolist() == pytest.approx([0.0, float(model.mass.sum()), 0.0], abs=1e-6)
 
 
+def test_parallel_springs_at_rest_let_a_beam_down() -> None:
+    """They resist no motion across them at first, so the first step of Newton's method goes far."""
+    held = dv.mesh.beam(4, 3, 3, size=(0.03, 0.02, 0.02))
+    mesh = dv.mesh.join([held, dv.mesh.beam(13, 3, 3, size=(0.1, 0.02, 0.02)).translate((0.031, 0.0, 0.0))])
+    places = [[y, z] for y in (0.002, 0.018) for z in (0.002, 0.018)]
+    ends = (dv.Embedding.of_points(mesh, [[x, *place] for place in places]) for x in (0.03, 0.031))
+    springs = dv.Springs(*ends, stiffness=600.0, rest_length=0.001)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(dv.StableNeoHookean(), springs))
+    found = []
+    for lower in (0.0, 1e-3):  # where the springs resist already
+        x = model.rest_points.clone()
+        x[len(held.points) :, 1] -= lower
+        end = dv.equilibrium(model, x, dv.VBD(1.0, 0, subspace="coarse"), young=3e5, poisson=0.35)
+        found.append(end.x)
+    assert float((found[0] - found[1]).abs().max()) < 1e-9 and float((found[0] - model.rest_points).abs().max()) > 0.01
+
+
 def test_what_only_couplings_hold() -> None:
     """Springs between free bodies hold none of them, nor does pressure; gas needs a volume."""
     cube = dv.mesh.cube(2, 0.05)
