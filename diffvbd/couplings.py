@@ -20,6 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ._common.checks import (
     check_bool,
@@ -39,6 +40,15 @@ from .mesh.arrays import IntArray, int_array
 from .ops.sums import Rows
 
 ATMOSPHERE = 101_325.0  # [Pa]
+
+
+class Curvature(NamedTuple):
+    """Of N terms of an energy by the M vectors that each depends on: sum of rate (slope . dd)^2, over all M together,
+    and of dd . across dd."""
+
+    rate: Tensor  # [B, N]
+    slope: Tensor  # [B, N, M, 3]
+    across: Tensor | None  # [B, N, M, 3, 3]; None: there is no such part
 
 
 class Coupling:
@@ -85,13 +95,22 @@ class Coupling:
         raise NotImplementedError
 
     def terms(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
-        """Terms [J] whose sum is the energy of a scene, but for a constant, [B, n]; arguments as of load()."""
+        """Terms [J] whose sum is the energy of a scene, but for a constant, [B, N]; arguments as of load()."""
         raise NotImplementedError
 
     def joins(self) -> tuple[Tensor, Tensor]:
         """Pairs of vertices [n, 2] whose bodies it joins, and vertices [m] that it ties to places; on the CPU."""
         none = torch.zeros((0, 2), dtype=torch.int64, device="cpu")
         return none, none[:, 0]
+
+    def differences(self) -> tuple[IntArray, np.ndarray]:
+        """Vertices and weights [N, M, n] of the M vectors that each of N terms of the energy depends on."""
+        raise NotImplementedError
+
+    def curvature(self, x: Tensor, values: dict[str, Tensor]) -> Curvature | None:
+        """Second derivative by these vectors, without what of it may be negative; differentiable. None: nothing is
+        left."""
+        raise NotImplementedError
 
     def _take_numbers(self) -> None:
         """The parameters as float64 tensors, checked."""
@@ -146,6 +165,11 @@ class _Differences(NamedTuple):
         moving = (w.abs() * ~pinned[vertices]).sum(-1, keepdim=True)
         return cls(Rows.of(vertices.reshape(-1), len(pinned)), w, w.abs() * moving)
 
+    @property
+    def vertices(self) -> IntArray:
+        """[N, M, n]"""
+        return self.rows.group.reshape(-1)[: self.rows.rows].reshape(self.weights.shape).cpu().numpy()
+
     def take(self, x: Tensor) -> Tensor:
         """d of x [B, V, 3], [B, N, M, 3]."""
         corners = self.rows.gather(x).unflatten(1, tuple(self.weights.shape))
@@ -156,6 +180,12 @@ class _Differences(NamedTuple):
         weight, [B, N M n, 4]; their sums by vertex are a load()."""
         weights, bounds = (t.to(pull.dtype)[..., None] for t in (self.weights, self.bounds))
         return torch.cat([weights * pull[..., None, :], bounds * stiffness[..., None]], -1).flatten(1, 3)
+
+
+def _across(force: Tensor, normal: Tensor) -> Tensor:
+    """force (1 - n n^T), [...], [..., 3] -> [..., 3, 3]."""
+    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    return force[..., None, None] * (eye - normal[..., :, None] * normal[..., None, :])
 
 
 @init_names_checked
@@ -253,6 +283,17 @@ class Springs(Coupling):
         # k / 2 |d|^2 - k L |d|, of which the second part is concave: k bounds all of it
         spread = self._ends.spread(self.pull(x, values)[:, :, None], values["stiffness"][..., None, None])
         return self._ends.rows.sum(spread)
+
+    def differences(self) -> tuple[IntArray, np.ndarray]:
+        return self._ends.vertices, self._ends.weights.cpu().numpy()
+
+    def curvature(self, x: Tensor, values: dict[str, Tensor]) -> Curvature:
+        d, rest = self._vectors(x, values), values["rest_length"]
+        length, inverse = _length(d)
+        rate = values["stiffness"].expand_as(length)
+        rate = torch.where(length < rest, 0.0, rate) if self.tension_only else rate
+        normal = inverse[..., None] * d
+        return Curvature(rate, normal[:, :, None], _across(rate * (1 - rest * inverse).clamp(min=0), normal)[:, :, None])
 
 
 class _Own(NamedTuple):
@@ -363,6 +404,16 @@ class Tendons(Coupling):
         sums = own.of_tendons.sum(size * own.moving.to(x.dtype)[:, None]) * values["stiffness"][..., None]
         pull = own.of_tendons.gather(tension[..., None]) * slope
         return own.of_vertices.sum(torch.cat([pull, size * own.of_tendons.gather(sums) + turning], -1))
+
+    def differences(self) -> tuple[IntArray, np.ndarray]:
+        return self._segments.vertices, self._segments.weights.cpu().numpy()
+
+    def curvature(self, x: Tensor, values: dict[str, Tensor]) -> Curvature:
+        d = self._segments.take(x)
+        length, inverse = _length(d)
+        tension, normal = self._tension(length, values), inverse[..., None] * d
+        rate = torch.where(tension > 0, values["stiffness"], 0.0)
+        return Curvature(rate, normal, _across(tension[..., None] * inverse, normal))
 
 
 class _Surfaces(NamedTuple):
@@ -516,7 +567,7 @@ class Pressure(Coupling):
             return -values["pressure"] * volume
         rest = self._rest_volume.to(x.dtype)
         work = (values["pressure"] + self.ambient) * rest * (volume / rest).log()  # NaN where inside out
-        return torch.cat([self.ambient * volume, -work], -1)
+        return self.ambient * volume - work
 
     def load(self, x: Tensor, values: dict[str, Tensor]) -> Tensor:
         s = self._surfaces
@@ -540,6 +591,29 @@ class Pressure(Coupling):
         faces = torch.cat([slope, bound], -1).repeat(1, 3, 1)
         edges = torch.cat([torch.zeros_like(bent).expand(-1, -1, 3), bent], -1)
         return s.corners.sum(torch.cat([faces, edges], 1))
+
+    def differences(self) -> tuple[IntArray, np.ndarray]:
+        # the corners of all triangles: a vertex may be on two cavities
+        most = max(map(len, self.surfaces))
+        index, weights = np.zeros((len(self.surfaces), 3 * most, 1), dtype=np.int64), np.zeros((len(self.surfaces), most))
+        for k, own in enumerate(self.surfaces):
+            index[k, : own.size, 0] = own.reshape(-1)
+            weights[k, : len(own)] = 1.0
+        return index, weights.repeat(3, 1)[..., None]
+
+    def curvature(self, x: Tensor, values: dict[str, Tensor]) -> Curvature | None:
+        if not self.gas:
+            return None
+        volume, normal = self._faces(x)
+        rate = ((self._gauge(volume, values) + self.ambient) / volume).clamp(min=0)
+        parts, most = normal.split(list(map(len, self.surfaces)), 1), max(map(len, self.surfaces))
+        padded = torch.stack([pad(part, (0, 0, 0, most - part.shape[1])) for part in parts], 1)
+        return Curvature(rate, padded.repeat_interleave(3, 2) / 6, None)
+
+    def joins(self) -> tuple[Tensor, Tensor]:
+        corners = [torch.from_numpy(own.reshape(-1, 1).copy()) for own in self.surfaces]
+        pairs = torch.cat([torch.cat([own, own[:1].expand_as(own)], 1) for own in corners])
+        return pairs, pairs.new_zeros(0)
 
 
 COUPLINGS: tuple[type[Coupling], ...] = (Springs, Tendons, Pressure)

@@ -98,14 +98,15 @@ class CoarseGeometry(NamedTuple):
         return int(self.function_ptr[-1])
 
 
-def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label: np.ndarray, space: CoarseSpace
-                 ) -> CoarseGeometry:  # fmt: skip
-    """points [V, 3], tets [T, 4], pinned bool [V], label [V]: equal in a connected body.
+def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label: np.ndarray, space: CoarseSpace,
+                 joined: np.ndarray | None = None) -> CoarseGeometry:  # fmt: skip
+    """points [V, 3], tets [T, 4], pinned bool [V], label [V]: equal in a connected body; joined [V]: in bodies that are
+    corrected as one, None: each is by itself.
 
     Bodies of as many vertices, or tets, go through each step together: a loop over them would take longer than all of
     the rest of a Model.
     """
-    roots, body = np.unique(label, return_inverse=True)
+    roots, one, body = np.unique(label, return_index=True, return_inverse=True)
     of_body = _lists(body.reshape(-1), len(roots))
     of_tet = _lists(body.reshape(-1)[tets[:, 0]], len(roots))
     movable = np.bincount(body.reshape(-1)[~pinned], minlength=len(roots)) > 0
@@ -120,12 +121,23 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
             at, row, column = np.nonzero(np.abs(weights) > ZERO)
             entries.append((vertices[part[at], row], which[part[at]], own[at, column], weights[at, row, column]))
 
+    # bodies that are joined are one from here on: with a matrix of all their functions
+    of_root = np.unique((label if joined is None else joined)[one], return_inverse=True)[1].reshape(-1)
+    sort = np.argsort(of_root, kind="stable")
+    offset, own_counts = np.zeros(len(roots), dtype=np.int64), counts
+    counts = np.bincount(of_root, own_counts).astype(np.int64)
+    offset[sort] = np.cumsum(own_counts[sort]) - own_counts[sort]
+    offset -= (np.cumsum(counts) - counts)[of_root]
+    if counts.max(initial=0) > MOST_FUNCTIONS:
+        fail("subspace", f"at most {MOST_FUNCTIONS} functions of bodies that springs or tendons join: use a CoarseSpace "
+             "with fewer", f"{counts.max()}")  # fmt: skip
+
     # those of the smallest matrix first
     small = np.array((0, 1, 2, 4, 4))[np.minimum(counts, 4)]
     size = np.where(counts <= 4, small, -(-counts // PACK) * PACK)
     listed = np.argsort(size, kind="stable")
     listed = listed[counts[listed] > 0]
-    rank = np.full(len(roots), -1)
+    rank = np.full(len(counts), -1)
     rank[listed] = np.arange(len(listed))
     function_ptr = np.concatenate(([0], np.cumsum(size[listed])))
     filling = np.arange(function_ptr[-1]) - np.repeat(function_ptr[:-1], size[listed])
@@ -133,17 +145,21 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
     entries.append((np.zeros(0, dtype=np.int64),) * 3 + (np.zeros(0),))
     vertex, of, own, weight = (np.concatenate(part) for part in zip(*entries, strict=True))
     sort = np.argsort(vertex, kind="stable")
-    vertex, function, weight = vertex[sort], (own + function_ptr[rank[of]])[sort], weight[sort]
+    vertex, weight = vertex[sort], weight[sort]
+    function = (own + offset[of] + function_ptr[rank[of_root[of]]])[sort]
 
-    number = -(-counts // PER_GROUP) if space.groups == "auto" else np.full(len(roots), space.groups)
+    number = -(-own_counts // PER_GROUP) if space.groups == "auto" else np.full(len(roots), space.groups)
     number = np.minimum(number, of_tet.number)
-    group_body = np.repeat(np.arange(len(listed)), number[listed])
-    first = np.cumsum(number[listed]) - number[listed]
+    moving = np.flatnonzero(own_counts)
+    moving = moving[np.argsort(rank[of_root[moving]], kind="stable")]
+    group_body = np.repeat(rank[of_root[moving]], number[moving])
+    first = np.zeros(len(roots), dtype=np.int64)
+    first[moving] = np.cumsum(number[moving]) - number[moving]
     tet_group, axes = np.full(len(tets), -1), points.T.copy()
-    for which, members in _alike(of_tet, listed, _AT_ONCE // 16, number):
+    for which, members in _alike(of_tet, moving, _AT_ONCE // 16, number):
         corners = [axis[tets[members]] for axis in axes]
         centers = np.stack([(c[..., 0] + c[..., 1] + c[..., 2] + c[..., 3]) / 4 for c in corners], 1)
-        tet_group[members] = first[rank[which]][:, None] + _groups(centers, int(number[which[0]]))
+        tet_group[members] = first[which][:, None] + _groups(centers, int(number[which[0]]))
     groups = _functions_of_groups(tets, tet_group, len(group_body), vertex, function, len(points))
     return CoarseGeometry(function_ptr, vertex, function, weight, tet_group, group_body, groups, filling)
 
@@ -349,11 +365,11 @@ class CoarsePlan(NamedTuple):
 
 
 def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, rest: Tensor, plan: Tensor,
-            device: str) -> tuple[CoarseGeometry, CoarsePlan]:  # fmt: skip
+            device: str, joined: Tensor | None) -> tuple[CoarseGeometry, CoarsePlan]:  # fmt: skip
     """The space on a mesh in float64, on the CPU; rest [1, T, 7]; plan: of the sweeps on a device, itself on the
-    CPU."""
-    arrays = points.numpy(), tets.numpy()
-    geometry = build_coarse(*arrays, pinned.numpy(), connected(tets, len(points)).numpy(), space)
+    CPU; joined [V]: as of build_coarse()."""
+    arrays, label = (points.numpy(), tets.numpy()), connected(tets, len(points)).numpy()
+    geometry = build_coarse(*arrays, pinned.numpy(), label, space, None if joined is None else joined.numpy())
     order = ops.plan_order(plan, ops.LANES[device]).numpy()
     return geometry, arrange_coarse(geometry, space.every, *arrays, mass.numpy(), rest[0].numpy(), order)
 

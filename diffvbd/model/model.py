@@ -34,7 +34,7 @@ from ..energies import VERTEX_ENERGIES, Anchor, FloorBarrier, StableNeoHookean, 
 from ..laws import Law
 from ..mesh import TetMesh
 from .arguments import ELASTIC_LAWS, Energy, check_isolated, checked_device, checked_energies, per_tet_density, warn_of
-from .bodies import Bodies, OtherBodies, find_bodies, first_of_body
+from .bodies import Bodies, OtherBodies, connected, find_bodies, first_of_body
 from .inputs import Inputs, inputs_of
 from .material import lumped_mass, rest_metric
 from .moving import moving_bodies
@@ -216,6 +216,16 @@ class Model:
     def _find_rest_scalars(self) -> Tensor:
         points = torch.from_numpy(self.mesh.points.copy())[None].to(self.device)
         return rest_metric(ops.tet_gather(points, *self._topology))[0].to(self.dtype)
+
+    @property
+    def joined(self) -> Tensor:
+        """Group of each vertex, of bodies that couplings join, counted from 0, int64 [V] on the CPU."""
+        pairs = [energy.joins()[0] for energy in self.couplings]
+        body = self.body.cpu()
+        if not pairs or not body.numel():
+            return body
+        roots = connected(body[torch.cat(pairs)], int(body.max()) + 1)[body]
+        return torch.unique(roots, return_inverse=True)[1]
 
     @property
     def touches(self) -> bool:

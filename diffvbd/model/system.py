@@ -82,7 +82,7 @@ class System(Model):
         rest, volume = rest_metric(ops.tet_gather(points[None], tets, *star))
         mass = lumped_mass(self._density.cpu().double()[None], volume, tets, *star)[0]
         given = (points, tets, pinned, mass, rest, self._plan.cpu())
-        self.coarse_geometry, plan = plan_of(self.coarse, *given, device.type)
+        self.coarse_geometry, plan = plan_of(self.coarse, *given, device.type, None if self.touches else self.joined)
         check_coupled(self.coarse_geometry, self.touches)
         self._coarse_plan = plan.to(device, self.dtype)
         if self.touches and self.contact is None:  # with pairs the Model has them

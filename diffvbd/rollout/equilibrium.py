@@ -22,7 +22,6 @@ from .._common.messages import page, warn
 from ..adjoint.implicit import solve_adjoint
 from ..adjoint.routes import GlobalAdjoint
 from ..adjoint.statics import StaticPotential, Statics, newton_operators
-from ..model.bodies import connected
 from ..model.inputs import parameter_of
 from ..model.model import Model
 from ..model.solver import VBD
@@ -247,9 +246,8 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
         return  # which may come to hold a body
     labels, holds, blocks = model.body, model._pinned, at.vertex_blocks()
     if model.couplings and labels.numel():
-        pairs, tied = (torch.cat(parts) for parts in zip(*(energy.joins() for energy in model.couplings), strict=True))
-        own = connected(labels.cpu()[pairs], int(labels.max()) + 1).to(labels.device)
-        labels, holds = own[labels], holds.index_fill(0, tied.to(labels.device), True)
+        tied = torch.cat([energy.joins()[1] for energy in model.couplings])
+        labels, holds = model.joined.to(labels.device), holds.index_fill(0, tied.to(labels.device), True)
     holds = holds.expand(len(x), -1) if blocks is None else holds | (blocks != 0).any(-1).any(-1)
     sums = x.new_zeros((len(x), int(labels.max()) + 1, 4)) if labels.numel() else x.new_zeros((len(x), 0, 4))
     size = given.load.norm(dim=-1, keepdim=True)

@@ -33,8 +33,9 @@ from .arguments import (
 )
 from .coarse import lengths_of, with_corrections
 from .contact import run_contact
-from .couplings import row_of, sweep_renewed
+from .couplings import row_of
 from .predict import Begun, begin, energy_data
+from .renewed import sweep_renewed
 
 TAPED = TapedSweep()
 
@@ -110,8 +111,7 @@ def swept(
 def _run(model: System, begun: Begun, prepared: Prepared, fields: ops.SweepFields, policy: int, debug_step: int
          ) -> Tensor:  # fmt: skip
     if begun.renews:
-        end, found = sweep_renewed(model, begun.renewed, fields, prepared.settings, policy, debug_step,
-                                   lambda x: begun.corrected(x, model, prepared))  # fmt: skip
+        end, found = sweep_renewed(model, begun, prepared, fields, policy, debug_step)
         corrections = torch.cat([end.new_empty((len(end), 0, 0)), *found][bool(found) :], 1)
     else:
         end, _, corrections = sweep(fields, model._packed_rest, model._plan, prepared.settings, tape_policy=policy,

@@ -68,6 +68,7 @@ _mass = ops.Differentiable(lambda mass, plan: ops.direct.coarse_mass(mass, plan.
 
 # --- corrections of a step --------------------------------------------------------------------------------------------
 
+COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 _TENSORS = 3  # differentiable fields
 _FIELDS = len(ops.CoarseFields._fields)
 
@@ -149,7 +150,7 @@ def _fibre_stiffness(model: System, modulus: Tensor, a0: Tensor, corners: Tensor
     # a row of zeros stands for no tet
     left, right = (torch.cat([t, t.new_zeros(scenes, 1, t.shape[-1])], 1)[:, index.members]
                    for t in (size[..., None] * right, right))  # fmt: skip
-    return _products(left, right).unflatten(-1, (3, -1)).unflatten(-3, (3, -1)).transpose(-3, -2)
+    return products(left, right).unflatten(-1, (3, -1)).unflatten(-3, (3, -1)).transpose(-3, -2)
 
 
 def _run_products(a: Tensor, b: Tensor) -> Tensor:
@@ -164,7 +165,7 @@ def _products_reverse(bars: Sequence[Any], saved: Sequence[Any], rest: tuple, ne
         return b @ bars[0].mT, a @ bars[0]
 
 
-_products = ops.Differentiable(_run_products, _products_reverse, arguments=2, inputs=2, vmap=NO_VMAP, batched=True)
+products = ops.Differentiable(_run_products, _products_reverse, arguments=2, inputs=2, vmap=NO_VMAP, batched=True)
 
 
 def in_lanes(model: System, rest: Tensor) -> Tensor:

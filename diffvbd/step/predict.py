@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,10 @@ from ..model.system import System
 from ..ops import STARTS, distinct
 from ..ops.contact import join_data
 from .arguments import LOOKBACK, Prepared, broadcastable
-from .couplings import Law, Record, record_of
+from .couplings import Coupled, coupled_of
+
+
+Law = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]  # of a state: mu, lam [B, T], rest scalars [B, T, 7]
 
 
 def energy_data(model: System, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -48,26 +51,30 @@ class Begun(NamedTuple):
     data: Tensor  # [1 | B, n], of the energies
     origin: Tensor | None
     h2a: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
-    record: Record | None = None  # of a Model with couplings: data with their bound about a state
+    coupled: Coupled | None = None  # of a Model with couplings
     law: Law | None = None  # of a Model with patches: the bound of their energy about a state
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
-                     self.h2a.detach(), self.record, self.law)  # fmt: skip
+                     self.h2a.detach(), self.coupled, self.law)  # fmt: skip
 
     def at(self, x: Tensor) -> Begun:
         """The same with the bound of couplings about a state x [B, V, 3]."""
-        return self if self.record is None else replaced(self, data=self.record(x))
+        return self if self.coupled is None else replaced(self, data=self.coupled.bound(x))
 
     @property
     def renews(self) -> bool:
-        return self.record is not None or self.law is not None
+        return self.coupled is not None or self.law is not None
 
     def renewed(self, x: Tensor) -> dict[str, Tensor]:
         """Fields of the sweeps that are bounds about a state x [B, V, 3]."""
-        out = {} if self.record is None else {"energy_data": self.record(x)}
-        return out if self.law is None else out | dict(zip(("mu", "lam", "rest"), self.law(x), strict=True))
+        out = {} if self.coupled is None else {"energy_data": self.coupled.bound(x)}
+        return out | self.renewed_law(x)
+
+    def renewed_law(self, x: Tensor) -> dict[str, Tensor]:
+        """The same of patches alone."""
+        return {} if self.law is None else dict(zip(("mu", "lam", "rest"), self.law(x), strict=True))
 
     def fields(self, model: System, prepared: Prepared) -> ops.SweepFields:
         """Fields of the sweeps, without contact."""
@@ -122,17 +129,17 @@ def begin(
         prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
-    record = record_of(model, prepared.parameters, data, origin, flat[0]) if model.couplings else None
+    coupled = coupled_of(model, prepared.parameters, data, origin, flat[0]) if model.couplings else None
     law, moduli, at = None, (prepared.mu, prepared.lam, prepared.rest), start
     if prepared.averaged is not None:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest
         law = partial(law_at, model, prepared.averaged, prepared.mu, prepared.lam, rest)
-    if record is not None or law is not None:
+    if coupled is not None or law is not None:
         # at the predictor a body that flies or falls as a whole has the right forces
         held = start if prescribed is None else prescribed
         at = torch.where(model._pinned[:, None], held, start + h * velocity + (h * h) * acceleration)
-    if record is not None:
-        data = record(at)
+    if coupled is not None:
+        data = coupled.bound(at)
     filters = model.floor is not None and model.contact is None
     # one sweep would not bring the vertices of a body together again
     sweeps = prepared.settings.sweeps * min(model.relaxation, 1.0)
@@ -149,11 +156,11 @@ def begin(
     x_start, y = begins(lookback=prepared.lookback)
     if prepared.euler is not None:
         x_start = torch.where(prepared.euler[..., None], begins(lookback=LOOKBACK)[0], x_start)
-    begun = Begun(x_start, start, y, data, origin, (h * h) * acceleration, record, law)
+    begun = Begun(x_start, start, y, data, origin, (h * h) * acceleration, coupled, law)
     if (rigid := model.rigid_bodies) is None or not model.corrects:
         return begun
     # from the shape that they have: a fraction of an extrapolation would change it
-    whole = replaced(begun, record=None).corrected(start, model, prepared)
+    whole = replaced(begun, coupled=None).corrected(start, model, prepared)
     return replaced(begun, x_start=torch.where(rigid.mask[:, None], whole, x_start))
 
 

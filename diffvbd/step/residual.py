@@ -21,9 +21,8 @@ from ..model.system import System
 from ..ops.sums import Rows, segment_sum
 from ..ops.sweep import sweep
 from .arguments import Prepared, acceleration_of, collider_state
-from .coarse import lengths_of, with_corrections
+from .coarse import COARSE_FIELDS, lengths_of, with_corrections
 from .contact import outcomes
-from .couplings import COARSE_FIELDS
 from .integrators import Solve
 from .predict import Begun, begin
 
