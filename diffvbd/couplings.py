@@ -293,7 +293,9 @@ class Springs(Coupling):
         rate = values["stiffness"].expand_as(length)
         rate = torch.where(length < rest, 0.0, rate) if self.tension_only else rate
         normal = inverse[..., None] * d
-        return Curvature(rate, normal[:, :, None], _across(rate * (1 - rest * inverse).clamp(min=0), normal)[:, :, None])
+        return Curvature(
+            rate, normal[:, :, None], _across(rate * (1 - rest * inverse).clamp(min=0), normal)[:, :, None]
+        )
 
 
 class _Own(NamedTuple):
@@ -595,7 +597,10 @@ class Pressure(Coupling):
     def differences(self) -> tuple[IntArray, np.ndarray]:
         # the corners of all triangles: a vertex may be on two cavities
         most = max(map(len, self.surfaces))
-        index, weights = np.zeros((len(self.surfaces), 3 * most, 1), dtype=np.int64), np.zeros((len(self.surfaces), most))
+        index, weights = (
+            np.zeros((len(self.surfaces), 3 * most, 1), dtype=np.int64),
+            np.zeros((len(self.surfaces), most)),
+        )
         for k, own in enumerate(self.surfaces):
             index[k, : own.size, 0] = own.reshape(-1)
             weights[k, : len(own)] = 1.0

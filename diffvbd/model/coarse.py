@@ -25,6 +25,7 @@ from ..ops.fields import TILE
 from .bodies import connected
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
+MOST_COUPLED = 512  # of bodies that couplings or contact couple: one dense system of three times as many unknowns
 MOST_FUNCTIONS, MOST_OF_ANY = 3840, 2**20  # that a CoarseSpace may ask for
 PER_FUNCTION = 25  # vertices of a large body for each function
 PER_FUNCTION_SMALL = 6  # and of a small one
@@ -107,14 +108,17 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
     the rest of a Model.
     """
     roots, one, body = np.unique(label, return_index=True, return_inverse=True)
+    of_root = np.unique((label if joined is None else joined)[one], return_inverse=True)[1].reshape(-1)
     of_body = _lists(body.reshape(-1), len(roots))
     of_tet = _lists(body.reshape(-1)[tets[:, 0]], len(roots))
     movable = np.bincount(body.reshape(-1)[~pinned], minlength=len(roots)) > 0
 
+    has_some = movable & (of_tet.number > 0)
+    most = np.minimum(MOST, MOST_COUPLED // np.maximum(np.bincount(of_root, has_some), 1).astype(np.int64))[of_root]
     counts = np.zeros(len(roots), dtype=np.int64)
     entries: list[tuple[np.ndarray, ...]] = []
-    for which, vertices in _alike(of_body, np.flatnonzero(movable & (of_tet.number > 0)), _AT_ONCE // MOST):
-        for part, weights, kept in _functions(points[vertices], ~pinned[vertices], space):
+    for which, vertices in _alike(of_body, np.flatnonzero(has_some), _AT_ONCE // MOST, most):
+        for part, weights, kept in _functions(points[vertices], ~pinned[vertices], space, int(most[which[0]])):
             counts[which[part]] = kept.sum(1)
             own = np.cumsum(kept, axis=1) - 1
             weights *= kept[:, None]
@@ -122,15 +126,14 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
             entries.append((vertices[part[at], row], which[part[at]], own[at, column], weights[at, row, column]))
 
     # bodies that are joined are one from here on: with a matrix of all their functions
-    of_root = np.unique((label if joined is None else joined)[one], return_inverse=True)[1].reshape(-1)
     sort = np.argsort(of_root, kind="stable")
     offset, own_counts = np.zeros(len(roots), dtype=np.int64), counts
     counts = np.bincount(of_root, own_counts).astype(np.int64)
     offset[sort] = np.cumsum(own_counts[sort]) - own_counts[sort]
     offset -= (np.cumsum(counts) - counts)[of_root]
-    if counts.max(initial=0) > MOST_FUNCTIONS:
-        fail("subspace", f"at most {MOST_FUNCTIONS} functions of bodies that springs or tendons join: use a CoarseSpace "
-             "with fewer", f"{counts.max()}")  # fmt: skip
+    if (several := counts[of_root] > np.maximum(own_counts, MOST_COUPLED)).any():
+        fail("subspace", f"at most {MOST_COUPLED} functions of bodies that springs or tendons join: use a CoarseSpace "
+             "with fewer, or None", f"{counts[of_root][several].max()}")  # fmt: skip
 
     # those of the smallest matrix first
     small = np.array((0, 1, 2, 4, 4))[np.minimum(counts, 4)]
@@ -189,10 +192,10 @@ def _alike(lists: _Lists, bodies: np.ndarray, limit: int, other: np.ndarray | No
                 yield part, lists.order[lists.start[part][:, None] + np.arange(entries)]
 
 
-def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace
+def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace, most: int
                ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:  # fmt: skip
     """Of bodies [n, V, 3] those with the same splines: which they are [m], functions at their vertices [m, V, f], zero
-    where these are pinned, and which of them are independent [m, f]."""
+    where these are pinned, and which of them are independent [m, f]. most: of them under "auto"."""
     local = _in_its_box(points)
     extent = np.ptp(local, axis=1)
     long = np.argsort(-extent, axis=1)
@@ -200,7 +203,7 @@ def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace
     sheet = ordered[:, 2] < SHEET * ordered[:, 1]
     if space.functions == "auto":
         target = np.maximum(free.sum(1) // np.where(sheet, PER_FUNCTION_SHEET, PER_FUNCTION), FEWEST)
-        target = np.minimum(target, min(MOST, max(1, points.shape[1] // PER_FUNCTION_SMALL)))
+        target = np.minimum(target, max(1, min(most, points.shape[1] // PER_FUNCTION_SMALL)))
     else:
         target = np.full(len(points), space.functions)
     # affine functions, or splines of a degree on so many cells
@@ -340,7 +343,6 @@ def _pairs(one: np.ndarray, two: np.ndarray, count: int) -> tuple[np.ndarray, np
 
 # --- the coarse space of a model as tensors ---------------------------------------------------------------------------
 
-MOST_COUPLED = 512  # functions of all bodies beside contact: one dense system of three times as many unknowns
 PART = 32  # most blocks of a part of a body
 
 

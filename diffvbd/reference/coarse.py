@@ -32,9 +32,10 @@ class Coarse:
     ``scene.model.coarse_geometry`` says which functions and groups there are.
     """
 
-    def __init__(self, scene: Scene, energies: list[Any], forces: list[Any] | tuple = ()) -> None:
+    def __init__(self, scene: Scene, energies: list[Any], forces: list[Any] | tuple = (),
+                 couplings: list[Any] | tuple = ()) -> None:  # fmt: skip
         geometry, tets = scene.model.coarse_geometry, scene.layout.tets
-        self.scene, self.energies = scene, [*energies, *forces]
+        self.scene, self.energies, self.couplings = scene, [*energies, *forces], couplings
         self.of_vertices = [e for e in energies if not isinstance(e, StableNeoHookean)]
 
         def index(values: Any) -> Tensor:
@@ -146,6 +147,10 @@ class Coarse:
         xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
         rows = [torch.stack(r, -2) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
         out = torch.einsum("vf,...ijv,vg->...figj", self.weight, torch.stack(rows, -3), self.weight)
+        for energy in self.couplings:
+            whole = self.scene.time_step**2 * energy.curvature(state)
+            whole = whole.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
+            out = out + torch.einsum("vf,...viuj,ug->...figj", self.weight, whole, self.weight)
         return out.flatten(-4, -3).flatten(-2, -1)
 
     def _gradient(self, state: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
@@ -154,6 +159,8 @@ class Coarse:
         for k, color in enumerate(self.scene.layout.colors):
             for energy in self.energies:
                 total = total.index_add(-1, color.vertices, energy.block(k, state, x_prev)[..., :3, :])
+        for energy in self.couplings:
+            total = total + energy.gradient(state)
         return total
 
     def _of_vertices(self, values: Tensor) -> Tensor:
@@ -164,6 +171,7 @@ class Coarse:
         """The terms of G, but for constants, and the body of each, in several parts [..., n], [n]."""
         inertia = self.scene.mass / 2 * dot(z - y, z - y)
         parts = [energy.terms(z, x_prev) for energy in self.energies]
+        parts += [(self.scene.time_step**2 * energy.own(z), energy.vertices) for energy in self.couplings]
         return [(inertia, self.body), *((terms, self.body[vertex]) for terms, vertex in parts)]
 
     def _search(

@@ -1,8 +1,9 @@
 """Springs, tendons and pressure: energies of several vertices, and the bound that stands for them within a sweep.
 
-Each energy offers `energy(x, x_prev)` -> [...], h^2-scaled, of a state [..., 3, V], and `bound(x)` -> [..., V], the
-stiffness s_i of a vertex for which E(x0) + sum_i g_i . (x_i - x0_i) + s_i / 2 |x_i - x0_i|^2 bounds E. Points are dense
-matrices here, one column a vertex.
+Each energy offers `own(x)` -> [..., N], the energies of its N springs, tendons or cavities in a state [..., 3, V], and
+`bound(x)` -> [..., V], the stiffness s_i of a vertex for which E(x0) + sum_i g_i . (x_i - x0_i) + s_i / 2 |x_i - x0_i|^2
+bounds E. Coarse corrections take `curvature(x)` -> [..., 3 V, 3 V], the second derivative without what of it may be
+negative. Points are dense matrices here, one column a vertex.
 """
 
 from typing import Any
@@ -33,7 +34,37 @@ def _norm(d: Tensor) -> Tensor:
     return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
 
 
-class Springs:
+class Coupling:
+    scene: Scene
+
+    def own(self, x: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        return self.scene.time_step**2 * self.own(x).sum(-1)
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Of energy() [..., 3, V]; differentiable in x."""
+        with torch.enable_grad():
+            at = x if x.requires_grad else x.detach().requires_grad_()
+            (out,) = torch.autograd.grad(self.energy(at, at).sum(), at, create_graph=True)
+        return out if torch.is_grad_enabled() else out.detach()
+
+
+def _along(rate: Tensor, slope: Tensor) -> Tensor:
+    """sum of rate s s^T of N slopes [..., N, V, 3]."""
+    flat = slope.flatten(-2)
+    return torch.einsum("...n,...ni,...nj->...ij", rate, flat, flat)
+
+
+def _across(force: Tensor, normal: Tensor, weights: Tensor) -> Tensor:
+    """sum of w w^T force (1 - n n^T) of vectors [..., 3, M] with weights [M, V]."""
+    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    block = force * (eye[..., None] - normal[..., :, None, :] * normal[..., None, :, :])
+    return torch.einsum("...ijm,mv,mu->...viuj", block, weights, weights).flatten(-4, -3).flatten(-2)
+
+
+class Springs(Coupling):
     """k / 2 (|d|^2 - 2 L |d| + L^2), d = p - q; with tension_only k / 2 max(0, |d| - L)^2."""
 
     def __init__(self, energy: Any, scene: Scene) -> None:
@@ -46,21 +77,37 @@ class Springs:
             self.places = scene.parameter(energy, "points").transpose(-1, -2)
         self.k, self.rest = (scene.parameter(energy, key) for key in ("stiffness", "rest_length"))
 
-    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+    def _vectors(self, x: Tensor) -> Tensor:
         d = x @ self.weights.mT
-        d = d if self.places is None else d - self.places
+        return d if self.places is None else d - self.places
+
+    def own(self, x: Tensor) -> Tensor:
+        d = self._vectors(x)
         length = _norm(d)
         own = dot(d, d) - 2 * self.rest * length + self.rest**2
         if self.tension_only:
             own = (length - self.rest).clamp(min=0) ** 2
-        return self.scene.time_step**2 * (self.k / 2 * own).sum(-1)
+        return self.k / 2 * own
+
+    def curvature(self, x: Tensor) -> Tensor:
+        d = self._vectors(x)
+        length = _norm(d)
+        some = torch.where(length > 0, length, 1.0)
+        normal, stretch = d / some.unsqueeze(-2), torch.where(length > 0, 1 - self.rest / some, 1.0)
+        k = self.k * (length >= self.rest) if self.tension_only else self.k.expand_as(length)
+        along = torch.einsum("...in,nv->...nvi", normal, self.weights)
+        return _along(k, along) + _across(k * stretch.clamp(min=0), normal, self.weights)
+
+    @property
+    def vertices(self) -> Tensor:
+        return self.weights.abs().argmax(-1)
 
     def bound(self, x: Tensor) -> Tensor:
         k = self.k.expand(*self.k.shape[:-1], len(self.weights)) if self.k.dim() else self.k.expand(len(self.weights))
         return k @ _rows_of_products(self.weights, self.scene)
 
 
-class Tendons:
+class Tendons(Coupling):
     """k / 2 max(0, l - L)^2, l the length of a route."""
 
     def __init__(self, energy: Any, scene: Scene) -> None:
@@ -71,9 +118,24 @@ class Tendons:
         values = [scene.parameter(energy, key) for key in keys]
         self.k, self.rest = (v.expand(*v.shape[:-1], count) if v.dim() else v.expand(count) for v in values)
 
-    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+    def own(self, x: Tensor) -> Tensor:
         lengths = torch.stack([_norm(x @ route.mT).sum(-1) for route in self.routes], -1)
-        return self.scene.time_step**2 * (self.k / 2 * (lengths - self.rest).clamp(min=0) ** 2).sum(-1)
+        return self.k / 2 * (lengths - self.rest).clamp(min=0) ** 2
+
+    def curvature(self, x: Tensor) -> Tensor:
+        total = x.new_zeros(())
+        for n, route in enumerate(self.routes):
+            d = x @ route.mT
+            lengths = _norm(d)
+            normal, longer = d / lengths.unsqueeze(-2), lengths.sum(-1, keepdim=True) - self.rest[..., n, None]
+            rate = self.k[..., n, None] * (longer > 0)
+            slope = (normal @ route).transpose(-1, -2).unsqueeze(-3)
+            total = total + _along(rate, slope) + _across(rate * longer / lengths, normal, route)
+        return total
+
+    @property
+    def vertices(self) -> Tensor:
+        return torch.stack([route[0].abs().argmax() for route in self.routes])
 
     def bound(self, x: Tensor) -> Tensor:
         total, moving = torch.zeros_like(x[..., 0, :]), (~self.scene.model.pinned).to(x)
@@ -87,7 +149,7 @@ class Tendons:
         return total
 
 
-class Pressure:
+class Pressure(Coupling):
     """-p V of closed surfaces, or that of an amount of gas at constant temperature."""
 
     def __init__(self, energy: Any, scene: Scene) -> None:
@@ -106,12 +168,27 @@ class Pressure:
         a, b, c = (x[..., corner] for corner in triangles.T)
         return dot(a, cross(b, c)).sum(-1) / 6
 
-    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+    def own(self, x: Tensor) -> Tensor:
         volume = torch.stack([self._volume(x, t) for t in self.surfaces], -1)
-        own = -self.pressure * volume
-        if self.gas:
-            own = self.ambient * volume - (self.pressure + self.ambient) * self.rest * torch.log(volume / self.rest)
-        return self.scene.time_step**2 * own.sum(-1)
+        if not self.gas:
+            return -self.pressure * volume
+        return self.ambient * volume - (self.pressure + self.ambient) * self.rest * torch.log(volume / self.rest)
+
+    def curvature(self, x: Tensor) -> Tensor:
+        """Of gas what is of rank one; of a given pressure nothing."""
+        total = x.new_zeros((*x.shape[:-2], 3 * x.shape[-1], 3 * x.shape[-1]))
+        for n, triangles in enumerate(self.surfaces if self.gas else ()):
+            a, b, c = (x[..., corner] for corner in triangles.T)
+            normal = cross(b - a, c - a) / 6
+            slope = sum(torch.zeros_like(x).index_add(-1, corner, normal) for corner in triangles.T)
+            assert isinstance(slope, Tensor)
+            rate = (self.pressure[..., n] + self.ambient) * self.rest[n] / self._volume(x, triangles) ** 2
+            total = total + _along(rate[..., None], slope.transpose(-1, -2).unsqueeze(-3))
+        return total
+
+    @property
+    def vertices(self) -> Tensor:
+        return torch.stack([triangles[0, 0] for triangles in self.surfaces])
 
     def bound(self, x: Tensor) -> Tensor:
         count, moving = x.shape[-1], (~self.scene.model.pinned).to(x)
@@ -149,11 +226,7 @@ class Bound(Anchor):
 
     def renew(self, x: Tensor) -> None:
         """Take the bound about x [..., 3, V]; differentiable in x."""
-        with torch.enable_grad():
-            at = x if x.requires_grad else x.detach().requires_grad_()
-            total = torch.stack([energy.energy(at, at).sum() for energy in self.energies]).sum()
-            (gradient,) = torch.autograd.grad(total / self.scene.time_step**2, at, create_graph=True)
-        gradient = gradient if torch.is_grad_enabled() else gradient.detach()
+        gradient = torch.stack([energy.gradient(x) for energy in self.energies]).sum(0) / self.scene.time_step**2
         self.stiffness = torch.stack([energy.bound(x).expand_as(x[..., 0, :]) for energy in self.energies]).sum(0)
         some = (self.stiffness > 0).unsqueeze(-2)
         step = gradient / torch.where(some, self.stiffness.unsqueeze(-2), 1.0)

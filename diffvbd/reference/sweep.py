@@ -143,7 +143,11 @@ def stepper(
     correct, rigid = Correction(scene, energies), getattr(model, "rigid_bodies", None)
     shear, bulk = rates(scene)
     stiffer = replace(scene, mu=scene.mu + shear, lam=scene.lam + bulk)
-    coarse = Coarse(stiffer, energies) if getattr(model, "coarse", None) is not None else None
+    couplings = bound.couplings if bound is not None else None
+    coarse = None
+    if getattr(model, "coarse", None) is not None:  # which has the couplings themselves, not their bound
+        coarse = Coarse(stiffer, [e for e in energies if e is not couplings],
+                        couplings=() if couplings is None else couplings.energies)  # fmt: skip
     last = min(model.relaxation, 1.0) if correct.bodies or coarse is not None else model.relaxation
 
     def advance(
@@ -177,7 +181,8 @@ def stepper(
         if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):
             state = _apart(scene, energies, state, _start(scene, energies, x_prev, y), y, x_prev, correct.bodies, held)
 
-        begun_sweeps: list[bool] = []  # with couplings free bodies are corrected before each sweep but the first
+        # with couplings free bodies are corrected before each sweep but the first, unless coarsely
+        begun_sweeps, between = [], couplings is not None and (coarse is None or rigid is not None)
 
         def swept(state: Tensor, count: int, ends: bool) -> Tensor:
             if bound is not None and count > 1:
@@ -186,7 +191,7 @@ def stepper(
                 return state
             if bound is not None and count:
                 renew(state)
-                state = correct(state, y, x_prev) if begun_sweeps and bound.couplings is not None else state
+                state = correct(state, y, x_prev) if begun_sweeps and between else state
                 begun_sweeps.append(True)
             renew(state)
             usual = max(count - 1, 0) if ends else count

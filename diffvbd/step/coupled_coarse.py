@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._common.context import not_compiled, replaced
+from .._common.context import looks_at, not_compiled, replaced
 from ..adjoint.potential import IncreaseInputs, bodies_of, increase_of_bodies
 from ..couplings import Coupling
 from ..model.system import System
@@ -94,11 +94,13 @@ def _stiffness(model: System, coupled: Coupled, x: Tensor, like: Tensor) -> Tens
 
 
 class _Joined(NamedTuple):
-    """Groups of joined bodies: rows are bodies that move, terms of all couplings, vertices."""
+    """Groups of joined bodies: those of bodies that move, of terms of all couplings, of vertices and of the bodies of
+    the coarse space."""
 
     of_bodies: Rows
     of_terms: Rows
     of_vertices: Tensor  # int64 [V]
+    of_corrected: Tensor  # int64 [bodies]
 
 
 @not_compiled
@@ -112,13 +114,16 @@ def _joined(model: System) -> _Joined:
         some = np.take_along_axis(index.reshape(len(index), -1),
                                   (weights != 0).reshape(len(index), -1).argmax(1)[:, None], 1)[:, 0]  # fmt: skip
         vertices.append(torch.from_numpy(some))
-    of_terms = Rows.of(labels[torch.cat(vertices)], count)
-    return _Joined(Rows.of(labels[first], count).to(model.device), of_terms.to(model.device), labels.to(model.device))
+    of_terms, geometry = Rows.of(labels[torch.cat(vertices)], count), model.coarse_geometry
+    corrected = labels.new_zeros(geometry.bodies)
+    body = np.searchsorted(geometry.function_ptr, geometry.function, side="right") - 1
+    corrected[body] = labels[torch.from_numpy(geometry.vertex)]
+    return _Joined(*(t.to(model.device) for t in (Rows.of(labels[first], count), of_terms, labels, corrected)))
 
 
 def corrected(model: System, coupled: Coupled, inputs: IncreaseInputs, fields: ops.SweepFields, x: Tensor,
-              run: Callable[[Tensor, ops.SweepFields], Tensor]) -> Tensor:  # fmt: skip
-    """Positions after a correction from x [B, V, 3].
+              run: Callable[[Tensor, ops.SweepFields], tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Positions after a correction from x [B, V, 3], and what it did.
 
     inputs, fields: Of the step without the couplings.  run: The operator, from a state with such fields.
     """
@@ -127,17 +132,20 @@ def corrected(model: System, coupled: Coupled, inputs: IncreaseInputs, fields: o
     pull = coupled.load(x)[..., :3]
     mass = torch.where(fields.mass != 0, fields.mass, 1.0)[..., None]  # a vertex without mass does not move
     matrix = fields.coarse_factor + h2 * _stiffness(model, coupled, x, fields.coarse_factor)
-    end = run(x, replaced(fields, y=fields.y - h2 * pull / mass, coarse_factor=matrix, energy_data=coupled.data))
-    with torch.no_grad():
-        lengths = _lengths(model, coupled, inputs, x.detach(), end.detach())
-    return torch.where(lengths == 1, end, x + lengths * (end - x))
-
-
-def _lengths(model: System, coupled: Coupled, inputs: IncreaseInputs, x: Tensor, end: Tensor) -> Tensor:
-    """The share of the step from x to ``end`` that lowers the potential of joined bodies: the first of 1, 1/2, ... or
-    0, of each vertex [B, V, 1]. All but the couplings counts as convex along it."""
-    before, h2 = coupled.terms(x).double(), inputs.time_step**2
+    end, done = run(x, replaced(fields, y=fields.y - h2 * pull / mass, coarse_factor=matrix, energy_data=coupled.data))
     joined: _Joined = model.derived("joined", lambda: _joined(model))
+    with torch.no_grad():
+        share, done = _share(coupled, inputs, joined, x.detach(), end.detach()), done.clone()
+        lengths = done.narrow(-1, 3 * model.coarse_geometry.functions, model.coarse_geometry.bodies)
+        lengths *= share[:, joined.of_corrected].mT
+    lengths = share[:, joined.of_vertices]
+    return torch.where(lengths == 1, end, x + lengths * (end - x)), done
+
+
+def _share(coupled: Coupled, inputs: IncreaseInputs, joined: _Joined, x: Tensor, end: Tensor) -> Tensor:
+    """The first of 1, 1/2, ... of the step from x to ``end`` that lowers the potential of each group of joined bodies,
+    or 0 [B, groups, 1]. All but the couplings counts as convex along it."""
+    before, h2 = coupled.terms(x).double(), inputs.time_step**2
     others, size = joined.of_bodies.sum(increase_of_bodies(inputs, x, end)).split(1, -1)
     size = size + joined.of_terms.sum(h2 * before.abs()[..., None])
     slack = ROUNDINGS * torch.finfo(x.dtype).eps * size
@@ -147,4 +155,6 @@ def _lengths(model: System, coupled: Coupled, inputs: IncreaseInputs, x: Tensor,
         change = joined.of_terms.sum(h2 * (coupled.terms(there).double() - before)[..., None])
         found = found | (share * others + change <= slack)
         share = torch.where(found, share, share / 2)
-    return torch.where(found, share, 0.0)[:, joined.of_vertices].to(x.dtype)
+        if looks_at(found) and bool(found.all()):
+            break
+    return torch.where(found, share, 0.0).to(x.dtype)

@@ -22,7 +22,6 @@ from ..ops.contact import join_data
 from .arguments import LOOKBACK, Prepared, broadcastable
 from .couplings import Coupled, coupled_of
 
-
 Law = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]  # of a state: mu, lam [B, T], rest scalars [B, T, 7]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -21,20 +19,22 @@ from .predict import Begun
 def sweep_renewed(model: System, begun: Begun, prepared: Prepared, fields: ops.SweepFields, policy: int,
                   debug_step: int) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
     """Positions after the sweeps and their corrections, each with fields that are renewed at the state that it begins
-    at; and what the coarse ones did. Free bodies that couplings may pull together are corrected before each sweep but
-    the first."""
+    at; and what the coarse ones did. Free bodies that couplings may pull together, and that no coarse correction moves,
+    are corrected before each sweep but the first."""
     settings = prepared.settings
     numbers, coarse = settings.numbers, () if fields.coarse_plan is None else settings.coarse
     last = replaced(settings, coarse=(), sweeps=1)
     within = replaced(last, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     plain = replaced(fields, **dict.fromkeys(COARSE_FIELDS))
+    rigidly = bool(model.couplings) and (not coarse or model.rigid_bodies is not None)
     x, corrections = begun.x_start, []
     inputs = None
     if coarse and begun.coupled is not None:
         others = replaced(begun.fields(model, prepared), energy_data=begun.coupled.data)
         inputs = increase_inputs(model, others, numbers.time_step, prepared.averaged, settings.energies)
 
-    def run(x: Tensor, fields: ops.SweepFields, settings: ops.SweepSettings, changes: dict[str, Tensor]) -> Tensor:
+    def run(x: Tensor, fields: ops.SweepFields, settings: ops.SweepSettings, changes: dict[str, Tensor]
+            ) -> tuple[Tensor, Tensor]:  # fmt: skip
         first = x is begun.x_start  # looks at the values that all others have, too
         if fields.coarse_rest is not None and "rest" in changes:
             changes["coarse_rest"] = in_lanes(model, changes["rest"])
@@ -47,21 +47,23 @@ def sweep_renewed(model: System, begun: Begun, prepared: Prepared, fields: ops.S
             first = False
         end, _, done = sweep(now, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step,
                              checked=first)  # fmt: skip
-        corrections.extend([done] if done.numel() else [])
-        return end
+        return end, done
 
     def coarsely(x: Tensor) -> Tensor:
         now = replaced(within, sweeps=0, coarse=replaced(coarse, begun=1))
         if begun.coupled is None:
-            return run(x, fields, now, begun.renewed(x))
-        law = begun.renewed_law(x)
-        return corrected_coarsely(model, begun.coupled, inputs, fields, x, lambda x, f: run(x, f, now, law))
+            x, done = run(x, fields, now, begun.renewed(x))
+        else:
+            law = begun.renewed_law(x)
+            x, done = corrected_coarsely(model, begun.coupled, inputs, fields, x, lambda x, f: run(x, f, now, law))
+        corrections.extend([done] if done.numel() else [])
+        return x
 
     for n in range(settings.sweeps):
         if coarse and n and (n - 1) % coarse.every == 0:
             x = coarsely(x)
-        x = begun.corrected(x, model, prepared) if n and model.couplings else x
-        x = run(x, plain, last if n + 1 == settings.sweeps else within, begun.renewed(x))
+        x = begun.corrected(x, model, prepared) if n and rigidly else x
+        x, _ = run(x, plain, last if n + 1 == settings.sweeps else within, begun.renewed(x))
     if coarse and settings.sweeps <= 1:
         x = coarsely(x)
     return x, corrections

@@ -23,6 +23,7 @@ from ..ops.sweep import sweep
 from .arguments import Prepared, acceleration_of, collider_state
 from .coarse import COARSE_FIELDS, lengths_of, with_corrections
 from .contact import outcomes
+from .couplings import Coupled
 from .integrators import Solve
 from .predict import Begun, begin
 
@@ -144,10 +145,11 @@ def friction_left_over(at: IncrementalPotential) -> Tensor:
 DEPENDENT = 1e-9  # of the largest singular value: below it a polynomial is a combination of the others
 NO_MATTER = 0.01  # of what forces did in the step: below it, it is not asked whether rounding left the error
 CHUNK = 2000  # tets that are summed at once
+MOST_JOINED = 64  # bodies that one solve takes; farther ones count as held
 
 
 class Unsolved(NamedTuple):
-    """Of the body that a step left least balanced; root mean squares over its mass [m]."""
+    """Of the body that a step left least balanced, or of one joined with it; root mean squares over its mass [m]."""
 
     scene: int
     body: int
@@ -227,59 +229,119 @@ def unsolved(model: System, solve: Solve, x: Tensor, known: dict[tuple[int, int]
             scene, body = divmod(int(ratio.argmax()), bodies)
         carried = prepared.settings.numbers.time_step * solve.v.reshape(end.shape)[scene]
         forced = end[scene] - begun.x_prev[scene] - carried
-        found = _of_body(model, at, prepared, scene, body, left, forced, bool((forces != elastic).any()), known)
+        members = model.derived(f"joined with body {body}", lambda: _joined_with(model, body))
+        found = _of_bodies(model, at, prepared, begun.coupled, scene, members, left, forced,
+                           bool((forces != elastic).any()), known)  # fmt: skip
         if found.error <= NO_MATTER * found.forced:
             return found
         return found if float(norm(left)[scene, body]) > float(rounding(at, norm)[scene, body]) else None
 
 
-def _of_body(model: System, at: IncrementalPotential, prepared: Prepared, scene: int, body: int, left: Tensor,
-             forced: Tensor, pushed: bool, known: dict[tuple[int, int], np.ndarray]) -> Unsolved:  # fmt: skip
-    of = model.derived(f"smooth functions of body {body}", lambda: _functions(model, body))
-    rows, q, count = of.vertices, of.values, of.values.shape[1]
+def _joined_with(model: System, body: int) -> list[int]:
+    """A body and those that couplings join with it, nearest ones first, at most MOST_JOINED."""
+    found = [body]
+    if model.couplings:
+        pairs = model.body.cpu()[torch.cat([energy.joins()[0] for energy in model.couplings])].unique(dim=0).numpy()
+        pairs = np.concatenate([pairs, pairs[:, ::-1]])
+        for one in found:  # which grows
+            found += sorted(set(pairs[pairs[:, 0] == one, 1].tolist()) - set(found))
+            if len(found) >= MOST_JOINED:
+                break
+    return found[:MOST_JOINED]
 
-    def own(value: Tensor) -> Tensor:
-        return value[min(scene, len(value) - 1)]
 
-    def array(value: Tensor) -> np.ndarray:
-        return own(value)[rows].double().cpu().numpy()
+def _stiffness_of(model: System, of: _Functions, body: int, mu: Tensor, lam: Tensor) -> np.ndarray:
+    """As _stiffness(), from moduli of a scene [1 | T]."""
+    if len(mu) == len(lam) == 1:
+        one, none = torch.ones_like(mu), torch.zeros_like(mu)
+        of_mu, of_lam = model.derived(f"unit stiffness of body {body}", lambda: (
+            _stiffness(model, of, one, none), _stiffness(model, of, none, one)))  # fmt: skip
+        return float(mu) * of_mu + float(lam) * of_lam
+    return _stiffness(model, of, *(m if len(m) == 1 else m[of.tets] for m in (mu, lam)))
 
-    weight, now, residual = array(at.mass), array(at.x), -array(left)
-    mass = weight * array(at.free[None])
-    total = max(float(mass.sum()), 1e-300)
-    if (scene, body) not in known:
-        mu, lam = (own(m).double() for m in (prepared.mu, prepared.lam))
-        if len(mu) == len(lam) == 1:
-            one, none = torch.ones_like(mu), torch.zeros_like(mu)
-            of_mu, of_lam = model.derived(f"unit stiffness of body {body}", lambda: (
-                _stiffness(model, of, one, none), _stiffness(model, of, none, one)))  # fmt: skip
-            known[scene, body] = float(mu) * of_mu + float(lam) * of_lam
-        else:
-            mu, lam = (m if len(m) == 1 else m[of.tets] for m in (mu, lam))
-            known[scene, body] = _stiffness(model, of, mu, lam)
-    matrix = at.h**2 * known[scene, body].reshape(3, count, 3, count)
-    gram = q.T @ (mass * q)
-    for c in range(3):
-        matrix[c, :, c] += gram
-    elastic = matrix.copy().reshape(3 * count, -1)
 
-    arms = [a - (weight * a).sum(0) / weight.sum() for a in (now, of.rest)]
-    u, _, vt = np.linalg.svd(arms[0].T @ (weight * arms[1]))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    added = [energy.blocks(at.x, at.x_prev, data, at.h, at.origin) for energy, data in at._vertex_energies(at.data)]
-    if isinstance(at, ContactPotential):  # as stiff along a surface as across it
+def _of_bodies(model: System, at: IncrementalPotential, prepared: Prepared, coupled: Coupled | None, scene: int,
+               members: list[int], left: Tensor, forced: Tensor, pushed: bool,
+               known: dict[tuple[int, int], np.ndarray]) -> Unsolved:  # fmt: skip
+    """What one linear solve says of bodies that couplings join, and of them the one that is farthest off."""
+
+    def own(value: Tensor) -> np.ndarray:
+        return value[min(scene, len(value) - 1)].double().cpu().numpy()
+
+    weight, now, residual, moved = (own(t) for t in (at.mass, at.x, -left, forced[None]))
+    mass = weight * own(at.free[None])
+    # as stiff along a surface as across it; couplings by themselves, below
+    data = at.data if coupled is None else coupled.data
+    added = [energy.blocks(at.x, at.x_prev, part, at.h, at.origin) for energy, part in at._vertex_energies(data)]
+    if isinstance(at, ContactPotential):
         trace = at.h**2 * at.step_contact.stiffness(at.contact)
         added.append(trace[..., None, None] * torch.eye(3, dtype=trace.dtype, device=trace.device))
-    for blocks in map(array, added if pushed else ()):
-        acts = blocks.any((1, 2)) & (mass[:, 0] > 0)
-        if acts.any():
-            matrix += np.einsum("nf,ncd,ng->cfdg", q[acts], turn.T @ blocks[acts] @ turn, q[acts], optimize=True)
-    force = (q.T @ (residual @ turn)).T.reshape(-1)
-    displacement = np.linalg.solve(matrix.reshape(3 * count, -1), force).reshape(3, count)
-    kept = np.linalg.solve(elastic, (displacement @ gram).reshape(-1)).reshape(3, count)
-    error = (kept @ gram * kept).sum()
-    return Unsolved(scene, body, float(max(error, 0.0) / total) ** 0.5,
-                    float((mass * array(forced[None]) ** 2).sum() / total) ** 0.5)  # fmt: skip
+    added = [own(blocks) for blocks in added] if pushed else []
+    functions = [model.derived(f"smooth functions of body {body}", lambda body=body: _functions(model, body))
+                 for body in members]  # fmt: skip
+    count = sum(of.values.shape[1] for of in functions)
+    # by component in the frame of each body, then function
+    elastic, gram, force = np.zeros((3, count, 3, count)), np.zeros((count, count)), np.zeros((3, count))
+    shapes, turns, parts, first = np.zeros((len(now), count)), np.zeros((len(now), 3, 3)), [], 0
+    blocks = np.zeros_like(elastic)
+    for body, of in zip(members, functions, strict=True):
+        rows, q, part = of.vertices.cpu().numpy(), of.values, slice(first, first + of.values.shape[1])
+        first = part.stop
+        parts.append(part)
+        if (scene, body) not in known:
+            mu, lam = (m[min(scene, len(m) - 1)].double() for m in (prepared.mu, prepared.lam))
+            known[scene, body] = _stiffness_of(model, of, body, mu, lam)
+        elastic[:, part, :, part] += at.h**2 * known[scene, body].reshape(3, q.shape[1], 3, q.shape[1])
+        gram[part, part] = q.T @ (mass[rows] * q)
+        arms = [a - (weight[rows] * a).sum(0) / weight[rows].sum() for a in (now[rows], of.rest)]
+        u, _, vt = np.linalg.svd(arms[0].T @ (weight[rows] * arms[1]))
+        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        force[:, part] = (q.T @ (residual[rows] @ turn)).T
+        shapes[rows, part], turns[rows] = q, turn
+        for block in (b[rows] for b in added):
+            acts = block.any((1, 2)) & (mass[rows, 0] > 0)
+            if acts.any():
+                blocks[:, part, :, part] += np.einsum("nf,ncd,ng->cfdg", q[acts], turn.T @ block[acts] @ turn, q[acts],
+                                                      optimize=True)  # fmt: skip
+    for c in range(3):
+        elastic[c, :, c] += gram
+    if coupled is not None:
+        elastic += at.h**2 * _stiffness_of_couplings(model, at, coupled, scene, shapes, turns)
+    matrix = (elastic + blocks).reshape(3 * count, -1)
+    displacement = np.linalg.solve(matrix, force.reshape(-1)).reshape(3, count)
+    kept = np.linalg.solve(elastic.reshape(3 * count, -1), (displacement @ gram).reshape(-1)).reshape(3, count)
+
+    def rms(square: float, body: int) -> float:
+        return (max(square, 0.0) / max(float(mass[functions[body].vertices.cpu().numpy()].sum()), 1e-300)) ** 0.5
+
+    errors = [rms((kept[:, p] @ gram[p, p] * kept[:, p]).sum(), n) for n, p in enumerate(parts)]
+    worst = int(np.argmax(errors))
+    rows = functions[worst].vertices.cpu().numpy()
+    return Unsolved(scene, members[worst], errors[worst], rms((mass[rows] * moved[rows] ** 2).sum(), worst))
+
+
+def _stiffness_of_couplings(model: System, at: IncrementalPotential, coupled: Coupled, scene: int, shapes: np.ndarray,
+                            turns: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Second derivative of couplings by functions [V, f] in frames [V, 3, 3] of vertices [N/m], [3, f, 3, f]."""
+    count = shapes.shape[1]
+    out = np.zeros((3 * count, 3 * count))
+    for energy, values in zip(model.couplings, coupled.values, strict=True):
+        found = energy.curvature(coupled.place(at.x), values)
+        if found is None:
+            continue
+        (index, weights), (rate, slope, across) = energy.differences(), found
+        rate, slope = (t[scene].double().cpu().numpy() for t in (rate, slope))
+        # of the vectors by the coefficients [N, M, 3, 3 f]
+        rows = sum(weights[..., j, None, None, None] * turns[index[..., j]][..., None]
+                   * shapes[index[..., j]][..., None, None, :] for j in range(index.shape[-1]))  # fmt: skip
+        rows = rows.reshape(*slope.shape, 3 * count)
+        along = np.einsum("nmd,nmdk->nk", slope, rows)
+        out += along.T @ (rate[:, None] * along)
+        if across is not None:
+            part = rows.reshape(-1, 3, 3 * count)
+            turned = across[scene].double().cpu().numpy().reshape(-1, 3, 3) @ part
+            out += part.reshape(-1, 3 * count).T @ turned.reshape(-1, 3 * count)
+    return out.reshape(3, count, 3, count)
 
 
 # --- motion that pairs have held up -----------------------------------------------------------------------------------
