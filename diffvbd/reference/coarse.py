@@ -171,7 +171,9 @@ class Coarse:
         """The terms of G, but for constants, and the body of each, in several parts [..., n], [n]."""
         inertia = self.scene.mass / 2 * dot(z - y, z - y)
         parts = [energy.terms(z, x_prev) for energy in self.energies]
-        parts += [(self.scene.time_step**2 * energy.own(z), energy.vertices) for energy in self.couplings]
+        for energy in self.couplings:
+            some = (energy.acts_on & (self.body < self.bodies)).int().argmax(-1)
+            parts.append((self.scene.time_step**2 * energy.own(z), some))
         return [(inertia, self.body), *((terms, self.body[vertex]) for terms, vertex in parts)]
 
     def _search(

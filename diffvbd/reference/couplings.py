@@ -1,9 +1,12 @@
 """Springs, tendons and pressure: energies of several vertices, and the bound that stands for them within a sweep.
 
 Each energy offers `own(x)` -> [..., N], the energies of its N springs, tendons or cavities in a state [..., 3, V], and
-`bound(x)` -> [..., V], the stiffness s_i of a vertex for which E(x0) + sum_i g_i . (x_i - x0_i) + s_i / 2 |x_i - x0_i|^2
+`bound(x)` -> [..., V], the stiffness s_i of a vertex for which
+
+    E(x0) + sum_i g_i . (x_i - x0_i) + s_i / 2 |x_i - x0_i|^2
+
 bounds E. Coarse corrections take `curvature(x)` -> [..., 3 V, 3 V], the second derivative without what of it may be
-negative. Points are dense matrices here, one column a vertex.
+negative, and `acts_on` [N, V]. Points are dense matrices here, one column a vertex.
 """
 
 from typing import Any
@@ -99,8 +102,8 @@ class Springs(Coupling):
         return _along(k, along) + _across(k * stretch.clamp(min=0), normal, self.weights)
 
     @property
-    def vertices(self) -> Tensor:
-        return self.weights.abs().argmax(-1)
+    def acts_on(self) -> Tensor:
+        return self.weights != 0
 
     def bound(self, x: Tensor) -> Tensor:
         k = self.k.expand(*self.k.shape[:-1], len(self.weights)) if self.k.dim() else self.k.expand(len(self.weights))
@@ -134,8 +137,8 @@ class Tendons(Coupling):
         return total
 
     @property
-    def vertices(self) -> Tensor:
-        return torch.stack([route[0].abs().argmax() for route in self.routes])
+    def acts_on(self) -> Tensor:
+        return torch.stack([(route != 0).any(0) for route in self.routes])
 
     def bound(self, x: Tensor) -> Tensor:
         total, moving = torch.zeros_like(x[..., 0, :]), (~self.scene.model.pinned).to(x)
@@ -177,7 +180,9 @@ class Pressure(Coupling):
     def curvature(self, x: Tensor) -> Tensor:
         """Of gas what is of rank one; of a given pressure nothing."""
         total = x.new_zeros((*x.shape[:-2], 3 * x.shape[-1], 3 * x.shape[-1]))
-        for n, triangles in enumerate(self.surfaces if self.gas else ()):
+        for n, triangles in enumerate(self.surfaces):
+            if not self.gas:
+                break
             a, b, c = (x[..., corner] for corner in triangles.T)
             normal = cross(b - a, c - a) / 6
             slope = sum(torch.zeros_like(x).index_add(-1, corner, normal) for corner in triangles.T)
@@ -187,8 +192,9 @@ class Pressure(Coupling):
         return total
 
     @property
-    def vertices(self) -> Tensor:
-        return torch.stack([triangles[0, 0] for triangles in self.surfaces])
+    def acts_on(self) -> Tensor:
+        vertices = torch.arange(self.scene.rest_points.shape[-1])
+        return torch.stack([torch.isin(vertices, triangles) for triangles in self.surfaces])
 
     def bound(self, x: Tensor) -> Tensor:
         count, moving = x.shape[-1], (~self.scene.model.pinned).to(x)

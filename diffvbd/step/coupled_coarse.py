@@ -118,7 +118,8 @@ def _joined(model: System) -> _Joined:
     corrected = labels.new_zeros(geometry.bodies)
     body = np.searchsorted(geometry.function_ptr, geometry.function, side="right") - 1
     corrected[body] = labels[torch.from_numpy(geometry.vertex)]
-    return _Joined(*(t.to(model.device) for t in (Rows.of(labels[first], count), of_terms, labels, corrected)))
+    of_bodies, device = Rows.of(labels[first], count), model.device
+    return _Joined(of_bodies.to(device), of_terms.to(device), labels.to(device), corrected.to(device))
 
 
 def corrected(model: System, coupled: Coupled, inputs: IncreaseInputs, fields: ops.SweepFields, x: Tensor,

@@ -51,7 +51,7 @@ def sweep_renewed(model: System, begun: Begun, prepared: Prepared, fields: ops.S
 
     def coarsely(x: Tensor) -> Tensor:
         now = replaced(within, sweeps=0, coarse=replaced(coarse, begun=1))
-        if begun.coupled is None:
+        if begun.coupled is None or inputs is None:
             x, done = run(x, fields, now, begun.renewed(x))
         else:
             law = begun.renewed_law(x)

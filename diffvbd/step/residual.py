@@ -332,8 +332,7 @@ def _stiffness_of_couplings(model: System, at: IncrementalPotential, coupled: Co
         (index, weights), (rate, slope, across) = energy.differences(), found
         rate, slope = (t[scene].double().cpu().numpy() for t in (rate, slope))
         # of the vectors by the coefficients [N, M, 3, 3 f]
-        rows = sum(weights[..., j, None, None, None] * turns[index[..., j]][..., None]
-                   * shapes[index[..., j]][..., None, None, :] for j in range(index.shape[-1]))  # fmt: skip
+        rows = np.einsum("nmj,nmjde,nmjf->nmdef", weights, turns[index], shapes[index], optimize=True)
         rows = rows.reshape(*slope.shape, 3 * count)
         along = np.einsum("nmd,nmdk->nk", slope, rows)
         out += along.T @ (rate[:, None] * along)
