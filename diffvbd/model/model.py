@@ -219,13 +219,12 @@ class Model:
 
     @property
     def joined(self) -> Tensor:
-        """Group of each vertex, of bodies that couplings join, counted from 0, int64 [V] on the CPU."""
-        pairs = [energy.joins()[0] for energy in self.couplings]
-        body = self.body.cpu()
-        if not pairs or not body.numel():
-            return body
-        roots = connected(body[torch.cat(pairs)], int(body.max()) + 1)[body]
-        return torch.unique(roots, return_inverse=True)[1]
+        """Group of each vertex, of connected bodies that couplings join, counted from 0, int64 [V] on the CPU."""
+        label = connected(self.tets.cpu(), self.num_vertices)
+        if self.couplings:
+            pairs = torch.cat([energy.joins()[0] for energy in self.couplings])
+            label = connected(label[pairs], self.num_vertices)[label]
+        return torch.unique(label, return_inverse=True)[1]
 
     @property
     def touches(self) -> bool:

@@ -245,7 +245,7 @@ def _check_start(model: System, x: Tensor, given: Statics) -> None:
     if model.floor is not None or model.contact is not None:
         return  # which may come to hold a body
     labels, holds, blocks = model.body, model._pinned, at.vertex_blocks()
-    if model.couplings and labels.numel():
+    if model.couplings:
         tied = torch.cat([energy.joins()[1] for energy in model.couplings])
         labels, holds = model.joined.to(labels.device), holds.index_fill(0, tied.to(labels.device), True)
     holds = holds.expand(len(x), -1) if blocks is None else holds | (blocks != 0).any(-1).any(-1)
