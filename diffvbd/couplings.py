@@ -40,6 +40,7 @@ from .mesh.arrays import IntArray, int_array
 from .ops.sums import Rows
 
 ATMOSPHERE = 101_325.0  # [Pa]
+STRAIGHT = 1e-3  # derivative of a tendon's length by a vertex, below which the bound's size is smooth
 
 
 class Curvature(NamedTuple):
@@ -304,6 +305,7 @@ class _Own(NamedTuple):
     of_entries: Rows  # entries of segments, by such a vertex
     of_tendons: Rows  # U, by tendon
     of_vertices: Rows  # U, by vertex of the mesh
+    acts: Tensor  # [U] 1 where it has weight
     moving: Tensor  # [U] 1 where it is not pinned
 
 
@@ -375,8 +377,9 @@ class Tendons(Coupling):
         entry = segments.rows.group.reshape(-1)[: segments.rows.rows].reshape(shape[0], -1)
         own, of = torch.unique(entry + torch.arange(shape[0])[:, None] * mesh.num_vertices, return_inverse=True)
         tendon, vertex = own // mesh.num_vertices, own % mesh.num_vertices
+        acts = torch.zeros_like(own, dtype=torch.float64).index_fill(0, of[segments.weights.flatten(1) != 0], 1.0)
         own = _Own(Rows.of(of.reshape(-1), len(own)), Rows.of(tendon, shape[0]), Rows.of(vertex, mesh.num_vertices),
-                   (~pinned[vertex]).double())  # fmt: skip
+                   acts, (~pinned[vertex]).double())  # fmt: skip
         return self._with(_segments=segments, _own=own)
 
     def joins(self) -> tuple[Tensor, Tensor]:
@@ -402,8 +405,10 @@ class Tendons(Coupling):
         turns = (tension[..., None] * inverse)[..., None]
         parts = own.of_entries.sum(self._segments.spread(inverse[..., None] * d, turns))
         slope, turning = parts.split((3, 1), -1)
-        size = _length(slope)[0][..., None]
-        sums = own.of_tendons.sum(size * own.moving.to(x.dtype)[:, None]) * values["stiffness"][..., None]
+        # smooth where a route is straight, and no less
+        acts, moving = (t.to(x.dtype)[:, None] for t in (own.acts, own.moving))
+        size = acts * (slope.square().sum(-1, keepdim=True) + STRAIGHT**2).sqrt()
+        sums = own.of_tendons.sum(size * moving) * values["stiffness"][..., None]
         pull = own.of_tendons.gather(tension[..., None]) * slope
         return own.of_vertices.sum(torch.cat([pull, size * own.of_tendons.gather(sums) + turning], -1))
 

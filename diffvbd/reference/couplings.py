@@ -145,7 +145,8 @@ class Tendons(Coupling):
         for n, route in enumerate(self.routes):
             d = x @ route.mT
             lengths, k = _norm(d), self.k[..., n, None]
-            slope = _norm((d / lengths.unsqueeze(-2)) @ route)  # |dl / dx_i|
+            slope = (d / lengths.unsqueeze(-2)) @ route
+            slope = (dot(slope, slope) + STRAIGHT**2).sqrt() * (route != 0).any(0)  # |dl / dx_i|
             tension = k * (lengths.sum(-1, keepdim=True) - self.rest[..., n, None]).clamp(min=0)
             total = total + k * slope * (slope * moving).sum(-1, keepdim=True)
             total = total + (tension / lengths) @ _rows_of_products(route, self.scene)
@@ -221,6 +222,7 @@ class Pressure(Coupling):
         return total
 
 
+STRAIGHT = 1e-3  # smooths |dl / dx_i| where it is 0
 ENERGIES |= {"spring": Springs, "tendon": Tendons, "pressure": Pressure}
 
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
-from diffvbd.testing import contact_scenes, evaluate, relative_error, tolerance
+from diffvbd.testing import contact_scenes, evaluate, generator, relative_error, tolerance
+from diffvbd.testing.soft_scenes import finger
 
 FLOOR = dv.FloorBarrier(height=-0.01, kappa=1e4, dhat=0.03)
 STEP = 0.01
@@ -110,6 +111,22 @@ def test_a_cable_of_no_length_resists_only_without_slack() -> None:
     assert found is not None and not found.any()
     slopes = torch.autograd.grad(found[:, 0].sum(), x)[0]
     assert slopes[6:].tolist() == [[-50.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+
+
+def test_the_gradient_at_a_straight_tendon_is_smooth() -> None:
+    """At rest a route is straight but for rounding, and dl / dx of its inner points is zero."""
+    model = finger((8, 3, 3), (0.1, 0.02, 0.02), 6, 200.0)
+    x = model.rest_points
+
+    def gradient(x: Tensor) -> Tensor:
+        at = x.clone().requires_grad_()
+        end, _ = dv.step(
+            model, at, torch.zeros_like(x), dv.VBD(STEP, 4), young=1e5, poisson=0.3, tendon_rest_length=0.09
+        )
+        return torch.autograd.grad((end * torch.cos(40 * x)).sum(), at)[0]
+
+    nudged = x + 1e-16 * torch.from_numpy(generator("straight").standard_normal(x.shape))
+    assert relative_error(gradient(nudged), gradient(x)) < 1e-12
 
 
 def test_attached_bodies_touch(device: str) -> None:
