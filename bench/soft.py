@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,8 @@ from diffvbd.testing.soft_scenes import (
     Mode,
     beam,
     finger,
+    finger_on_palm,
+    hollow_finger,
     icosphere,
     pressed_sphere,
     recovered_activation,
@@ -203,6 +206,76 @@ def fingers(quick: bool) -> list[Row]:
     return rows
 
 
+# --- joined bodies ----------------------------------------------------------------------------------------------------
+
+
+def joints(quick: bool) -> list[Row]:
+    """Motions of joined bodies by few sweeps beside those by many: what is looked at over its largest change."""
+    rows = []
+    for name, scene in JOINED.items():
+        moved, model, look, inputs, h, steps, sweeps = scene()
+        exact = None
+        for subspace, count in (("coarse", 320), *((sub, k) for sub in ("rigid", "coarse") for k in sweeps)):
+            if quick and count > 40 and exact is not None:
+                continue
+            with warnings.catch_warnings(record=True) as heard, torch.no_grad():
+                warnings.simplefilter("always")
+                x, solver = model.rest_points, dv.VBD(h, count, subspace=subspace)
+                motion, seconds = spent(lambda m=model, s=solver, x=x, i=inputs, n=steps: dv.rollout(
+                    m, x, torch.zeros_like(x), s, steps=n, **i))  # fmt: skip
+            found = look(motion.x)
+            exact = found if exact is None else exact
+            error = float((found - exact).square().mean().sqrt() / (exact - exact[0]).abs().max())
+            warned = any("leave steps unsolved" in str(w.message) for w in heard)
+            rows.append({"scene": name, "looked at": moved, "vertices": model.num_vertices, "subspace": subspace,
+                         "K": count, "error": error, "warned": warned, "ms a step": 1e3 * seconds / steps})  # fmt: skip
+    return rows
+
+
+def swinging(stiffness: float) -> Any:
+    half = dv.mesh.beam(7, 3, 3, size=(0.3, 0.1, 0.1))
+    mesh = dv.mesh.join([half, half.translate((0.3, 0, 0))])
+    at = np.flatnonzero(abs(mesh.points[:, 0] - 0.3) < 1e-9)
+    ends = [dv.Embedding.of_vertices(at[(at >= half.num_vertices) == side]) for side in (False, True)]
+    springs = dv.Springs(*ends, stiffness=stiffness)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(dv.StableNeoHookean(), springs))
+    tip = model.rest_points[:, 0] > 0.599
+    return "height of the tip", model, lambda x: x[:, tip, 1].mean(1), {"young": 1e5, "poisson": 0.3}, 0.01, 60, SWEEPS
+
+
+def on_palm() -> Any:
+    model, tip = finger_on_palm()
+    inputs = {"young": 3e5, "poisson": 0.35}
+    return "height of the tip", model, lambda x: tip.at(x)[:, 0, 1], inputs, 0.02, 20, (20, 60, 200)
+
+
+def bending(stiffness: float) -> Any:
+    """Tendons of one tension at rest."""
+    model = finger((16, 4, 4), (0.1, 0.02, 0.02), 6, stiffness)
+    tip = model.rest_points[:, 0] > 0.0999
+    inputs = {"young": 1e5, "poisson": 0.4, "tendon_rest_length": 0.1 - 0.4 / stiffness, "gravity": STILL}
+    return "height of the tip", model, lambda x: x[:, tip, 1].mean(1), inputs, 0.02, 10, SWEEPS
+
+
+def inflated() -> Any:
+    model = hollow_finger()
+    tip, inputs = model.rest_points[:, 0] > 0.079, {"young": 3e4, "poisson": 0.4, "pressure": 1e4, "gravity": STILL}
+    return "height of the tip", model, lambda x: x[:, tip, 1].mean(1), inputs, 0.01, 15, SWEEPS
+
+
+SWEEPS = (10, 20, 40, 160)
+JOINED: dict[str, Callable[[], Any]] = {
+    "two beams, k of a vertex": lambda: swinging(5e3),
+    "two beams, 10 k": lambda: swinging(5e4),
+    "two beams, 100 k": lambda: swinging(5e5),
+    "finger on a palm": on_palm,
+    "tendon, 20 N/m": lambda: bending(20.0),
+    "tendon, 200 N/m": lambda: bending(200.0),
+    "tendon, 2 kN/m": lambda: bending(2e3),
+    "gas at one atmosphere": inflated,
+}
+
+
 def tension_of(model: dv.Model, x: Tensor, **inputs: Any) -> float:
     tension = dv.coupling_forces(model, x, **inputs).tendons
     assert tension is not None
@@ -224,6 +297,7 @@ GROUPS: dict[str, Callable[[Card], list[Row]]] = {
     "muscles": lambda card: muscles(card.quick),
     "spheres": lambda card: spheres(card.quick),
     "fingers": lambda card: fingers(card.quick),
+    "joints": lambda card: joints(card.quick),
 }
 TABLES = (
     Table("Rest states beside a dense Newton solver: largest difference over the largest displacement", "statics"),
@@ -233,4 +307,5 @@ TABLES = (
     Table("Muscles: activation recovered from a motion", "muscles"),
     Table("Growth of a sphere under pressure", "spheres"),
     Table("Fingers bent by a tendon", "fingers"),
+    Table("Joined bodies: motion by few sweeps beside K = 320", "joints"),
 )

@@ -90,6 +90,11 @@ class System(Model):
             self._moving = moving.to(device, self.dtype)
 
     @property
+    def corrects_each_sweep(self) -> bool:
+        """Whether couplings may pull together free bodies that no coarse correction moves."""
+        return bool(self.couplings) and self.corrects and (self.coarse is None or self.rigid_bodies is not None)
+
+    @property
     def surface_of_contact(self) -> ContactSurface | None:  # the Model may replace it, with room for more pairs
         return self.model.surface_of_contact
 

@@ -77,8 +77,8 @@ def memory(
     per_step = (5 if local else 3) * state + tape_bytes
     per_step += scenes * sum(model._data_count) * item if local else 0
     per_step += scenes * coarse_scalars(model, sweeps) * item
-    if model.couplings:  # each sweep has its own start and record, and free bodies a correction of their own
-        per_step += scenes * sweeps * (23 if model.corrects else 12) * model.num_vertices * item
+    if model.couplings:  # each sweep has its own start and record, and free bodies may have a correction of their own
+        per_step += scenes * sweeps * (23 if model.corrects_each_sweep else 12) * model.num_vertices * item
     per_step += scenes * corrections_between(model, sweeps) * item
     if model.patches is not None:  # each sweep has its own start and law
         per_step += scenes * sweeps * (9 * model.num_tets + 3 * model.num_vertices) * item
@@ -141,6 +141,9 @@ def coarse_scalars(model: System, sweeps: int) -> int:
         return 9 * plan.mass.numel() + count * (9 * geometry.functions**2 + 12 * model.num_vertices)
     positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0
     of_one = 3 * geometry.functions + geometry.bodies + positions
+    if model.couplings:  # matrices of their own, and what those are made of
+        vectors = sum(energy.differences()[0][..., 0].size for energy in model.couplings)
+        of_one += 18 * plan.mass.numel() + 15 * vectors * plan.sizes.most
     return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
 
 

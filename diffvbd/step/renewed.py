@@ -26,7 +26,6 @@ def sweep_renewed(model: System, begun: Begun, prepared: Prepared, fields: ops.S
     last = replaced(settings, coarse=(), sweeps=1)
     within = replaced(last, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     plain = replaced(fields, **dict.fromkeys(COARSE_FIELDS))
-    rigidly = bool(model.couplings) and (not coarse or model.rigid_bodies is not None)
     x, corrections = begun.x_start, []
     inputs = None
     if coarse and begun.coupled is not None:
@@ -62,7 +61,7 @@ def sweep_renewed(model: System, begun: Begun, prepared: Prepared, fields: ops.S
     for n in range(settings.sweeps):
         if coarse and n and (n - 1) % coarse.every == 0:
             x = coarsely(x)
-        x = begun.corrected(x, model, prepared) if n and rigidly else x
+        x = begun.corrected(x, model, prepared) if n and model.corrects_each_sweep else x
         x, _ = run(x, plain, last if n + 1 == settings.sweeps else within, begun.renewed(x))
     if coarse and settings.sweeps <= 1:
         x = coarsely(x)

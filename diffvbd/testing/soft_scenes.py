@@ -113,6 +113,29 @@ def hung() -> Problem:
     return problem._replace(inputs={k: v for k, v in problem.inputs.items() if k != "gravity"}, weighs=True)
 
 
+def finger_on_palm(shortened: float = 0.026) -> tuple[Model, Embedding]:
+    """A free finger that nine attachments hold on a palm and a tendon bends, and its tip."""
+    palm = meshes.beam(4, 3, 3, size=(0.03, 0.02, 0.02))
+    mesh = meshes.join([palm, meshes.beam(13, 3, 3, size=(0.1, 0.02, 0.02)).translate((0.031, 0, 0))])
+    face = [[y, z] for y in (0.002, 0.01, 0.018) for z in (0.002, 0.01, 0.018)]
+    sides = [Embedding.of_points(mesh, [[x, *at] for at in face]) for x in (0.03, 0.031)]
+    route = [[x, 0.018, 0.01] for x in (0.002, 0.02, *np.linspace(0.04, 0.128, 6))]
+    tendon = Tendons(Embedding.of_points(mesh, route), [range(8)], 100.0, 0.126 - shortened)
+    energies = (StableNeoHookean(), Springs(*sides, stiffness=600.0), tendon)
+    model = Model(mesh, density=1100.0, pinned=mesh.points[:, 0] < 1e-9, energies=energies)
+    return model, Embedding.of_points(mesh, [[0.131, 0.01, 0.01]])
+
+
+def hollow_finger() -> Model:
+    """A finger of 0.08 m whose cavity, filled with gas, is nearer to its upper side."""
+    box = meshes.box((9, 5, 5), (0.08, 0.02, 0.02))
+    middle = box.points[box.tets].mean(1)
+    hole = ((middle > (0.01, 0.01, 0.005)) & (middle < (0.07, 0.015, 0.015))).all(1)
+    used, tets = np.unique(box.tets[~hole], return_inverse=True)
+    mesh = TetMesh(box.points[used], tets.reshape(-1, 4))
+    return Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(StableNeoHookean(), Pressure(gas=True)))
+
+
 def bent_by_tendon() -> Problem:
     model = finger((16, 4, 4), (0.1, 0.02, 0.02), 6, 100.0)
     return coupled(model, {"tendon_stiffness": 100.0, "tendon_rest_length": 0.07}, young=1e5, poisson=0.3)

@@ -4,6 +4,7 @@ import gc
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.marks import slow
@@ -95,6 +96,20 @@ def test_bytes_of_one_step_with_coarse_corrections(floor: bool, wanted: str) -> 
     predicted = dv.memory(model, solver, material=wanted == "mu")
     frame = 2 * x.numel() * x.element_size()  # which a rollout returns
     assert_near(predicted["kept"] - frame, measured)
+
+
+@pytest.mark.parametrize("sweeps", [5, 20])
+def test_bytes_of_corrections_of_joined_bodies(sweeps: int) -> None:
+    half = dv.mesh.beam(17, 9, 9, size=(0.3, 0.1, 0.1))
+    mesh = dv.mesh.join([half, half.translate((0.3, 0, 0))])
+    at = np.flatnonzero(abs(mesh.points[:, 0] - 0.3) < 1e-9)
+    ends = [dv.Embedding.of_vertices(at[(at >= half.num_vertices) == side]) for side in (False, True)]
+    springs = dv.Springs(*ends, stiffness=1e3)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(dv.StableNeoHookean(), springs))
+    solver, x = dv.VBD(0.01, sweeps, subspace="coarse"), model.rest_points
+    v = torch.zeros_like(x).requires_grad_()
+    measured = saved_bytes(lambda: dv.step(model, x, v, solver, mu=1e4, lam=1e4), [x, v, *own_tensors(model, solver)])
+    assert_near(dv.memory(model, solver)["step"], measured)
 
 
 @pytest.mark.parametrize("rigid", [(1,), (0, 1)])
