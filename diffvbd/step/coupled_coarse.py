@@ -39,7 +39,6 @@ class _Functions(NamedTuple):
 def _functions_of(model: System, energy: Coupling) -> _Functions:
     geometry, (index, weights) = model.coarse_geometry, energy.differences()
     shape, counts = index.shape, np.diff(geometry.function_ptr)
-    start = np.searchsorted(geometry.vertex, np.arange(model.num_vertices + 1))
     body_of = np.repeat(np.arange(geometry.bodies), counts)
     of_vertex = np.full(model.num_vertices, -1)
     of_vertex[geometry.vertex] = body_of[geometry.function]
@@ -53,12 +52,11 @@ def _functions_of(model: System, energy: Coupling) -> _Functions:
 
     # of the vertices that it has, their functions counted from the first of their body
     vertices, own = np.unique(index, return_inverse=True)
-    dense = np.zeros((len(vertices), max(width, 1)))
-    for row, v in enumerate(vertices.tolist()):
-        if of_vertex[v] in bodies:
-            part = slice(start[v], start[v + 1])
-            dense[row, geometry.function[part] - geometry.function_ptr[of_vertex[v]]] = geometry.weight[part]
-    out = np.zeros((shape[0] + 1, shape[1], dense.shape[1]))
+    dense = np.zeros((len(vertices), width))
+    body, row = of_vertex[geometry.vertex], np.searchsorted(vertices, geometry.vertex).clip(max=len(vertices) - 1)
+    some = (vertices[row] == geometry.vertex) & np.isin(body, bodies)
+    dense[row[some], (geometry.function - geometry.function_ptr[body])[some]] = geometry.weight[some]
+    out = np.zeros((shape[0] + 1, shape[1], width))
     for j in range(shape[2]):
         out[:-1] += weights[..., j, None] * dense[own.reshape(shape)[..., j]]
 
@@ -67,7 +65,7 @@ def _functions_of(model: System, energy: Coupling) -> _Functions:
     inside = row < 3 * counts[bodies][:, None]
     cell = 9 * mass_ptr[bodies][:, None, None] + row[:, None] * (3 * counts[bodies][:, None, None]) + row
     cell = np.where(inside[:, :, None] & inside[:, None], cell, 9 * mass_ptr[-1])
-    placed = [torch.from_numpy(a).to(model.device) for a in (term, out[term][..., :width], cell.reshape(-1))]
+    placed = [torch.from_numpy(a).to(model.device) for a in (term, out[term], cell.reshape(-1))]
     return _Functions(placed[0], placed[1].to(model.dtype), placed[2])
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import mesh
 from diffvbd.rollout.refine import is_balanced
-from diffvbd.rollout.tune import SWINGS, TrialRuns, unseen
+from diffvbd.rollout.tune import SWINGS, TrialRun, TrialRuns, unseen
 from diffvbd.testing.tolerances import tolerance
 
 DURATION = 0.3
@@ -159,6 +159,16 @@ def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("held", [False, True])
+def test_what_springs_take_up_is_not_taken_for_lost(held: bool) -> None:
+    energies = (dv.StableNeoHookean(), *([dv.Anchor(4.0)] if held else []))
+    model = dv.Model(dv.mesh.cube(3, 0.1), energies=energies)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    trials = TrialRuns(model, x, v, 0.1, {"young": 1e5, "poisson": 0.3, "gravity": (0.0, 0.0, 0.0)})
+    slowed = TrialRun(dv.VBD(0.01, 2), 1, torch.stack([x, x + 0.05]), torch.stack([v + 1.0, v]))
+    assert (trials.lost(slowed, 0.01) > 0) != held
+
+
 def test_a_bounce_that_steps_resolve() -> None:
     """Contact converges with the second power of h once steps resolve it: 1 % can be reached."""
     body = mesh.box(2, 0.1, split="kuhn").translate((0, 4e-3, 0))
