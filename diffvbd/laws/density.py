@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import keyword
 import math
+import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -236,6 +238,9 @@ def _parsed(text: str) -> tuple[Any, dict[str, Any]]:
         psi = psi if isinstance(psi, sympy.Expr) else None
     except Exception as error:  # sympy raises what Python's parser and its own classes raise
         reason = str(error).splitlines()[-1] if str(error) else type(error).__name__
+        reserved = sorted(set(re.findall(r"\w+", text)) & set(keyword.kwlist))
+        if reserved and isinstance(error, SyntaxError):
+            reason = f"{', '.join(reserved)}: no name in Python"
         fail("expression", shown, f"{text!r} ({reason})")
     if psi is None:
         fail("expression", shown, repr(text))
@@ -267,7 +272,8 @@ def _check_formula(node: ast.AST) -> None:
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value != math.inf:
         parts = []
     else:
-        raise ValueError(f"{type(node).__name__}: {ast.unparse(node)}")
+        power = ", a power is **" if isinstance(getattr(node, "op", None), ast.BitXor) else ""
+        raise ValueError(f"{type(node).__name__}: {ast.unparse(node)}{power}")
     for part in parts:
         _check_formula(part)
 

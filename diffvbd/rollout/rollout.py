@@ -75,7 +75,8 @@ def rollout(
         steps: Number of steps >= 0.
         duration: In place of steps, the time [s]: as many equal steps as the solver's time_step asks for.
         inputs: As in step, constant in time; or wrapped in :func:`per_step` or :func:`step_average`; or a function of
-            (step, x, v) that returns the value for that step (None only for a step without ``force``).
+            (step, x, v), step = 0 ... steps - 1 and the state before it, that returns the value for that step (None
+            only for a step without ``force``).
             A function may close over tensors and modules that require grad: they get gradients under every schedule. A
             checkpointed segment calls it again in the backward, where it must return the same: no state that it keeps
             from call to call, nothing that has changed in place since. ``prescribed`` may also have the initial x where

@@ -54,6 +54,10 @@ class Solution:
     residual: float
     converged: bool
 
+    def __repr__(self) -> str:
+        return (f"Solution(x and v of shape {list(self.x.shape)}, sweeps={self.sweeps}, residual={self.residual:.3g}, "
+                f"converged={self.converged})")  # fmt: skip
+
 
 def solve(
     model: Model,

@@ -211,6 +211,8 @@ def test_pickles() -> None:
         ("mu*(I4 - 1)**2", {"mu": 1.0, "a0": (1.0, 0.0)}, "a0: expected shape [3] or [T, 3]"),
         ("mu*(J - 1)**2", {"mu": float("nan")}, "mu: expected finite numbers"),
         ("J or I1", {}, "BoolOp: J or I1"),
+        ("mu*(J - 1)^2", {"mu": 1.0}, "a power is **"),
+        ("lambda*(J - 1)**2", {}, "lambda: no name in Python"),
         ("I1 if J else I2", {}, "IfExp: I1 if J else I2"),
         ("1e400*J", {}, "expression: expected an energy density"),
         ("9**9**9*J", {}, "a power of numbers as an exponent"),
