@@ -470,7 +470,7 @@ class ContactLook:
 
     model: System
     at: frozenset[int]  # numbers of steps whose friction is looked at, the last among them
-    cuts: list[Tensor] = field(default_factory=list)  # truncated_fraction() after each step
+    truncated: list[Tensor] = field(default_factory=list)  # truncated_fraction() after each step
     kept: dict[int, tuple[Solve, Tensor]] = field(default_factory=dict)
     seen: int = 0
 
@@ -479,13 +479,13 @@ class ContactLook:
         if step <= self.seen:
             return
         self.seen = step
-        self.cuts.append(truncated_fraction(self.model))
+        self.truncated.append(truncated_fraction(self.model))
         if step in self.at:
             self.kept[step] = (_detached(solve), x.detach())
 
     def warn(self) -> None:
         """Warns (UserWarning) of the steps that were seen."""
-        shares = torch.stack(self.cuts).tolist()
+        shares = torch.stack(self.truncated).tolist()
         truncated = max(shares)
         if truncated > TRUNCATED:
             many = f"{sum(s > TRUNCATED for s in shares)} of {len(shares)} steps more than {percent(TRUNCATED)}"

@@ -29,6 +29,7 @@ CASES: dict[str, tuple[dict[str, Any], tuple[Any, ...], dict[str, Any]]] = {
     "anchor": ({}, (dv.Anchor(20.0),), {}),
     "coarse": ({}, (), {"subspace": "coarse"}),
     "free_coarse": ({"pinned": False, "places": True}, (FLOOR,), {"subspace": "coarse"}),
+    "coarse_gas": ({"gas": True}, (), {"subspace": "coarse", "integrator": dv.SDIRK2()}),
     "relaxed": ({}, (), {"relaxation": 1.5}),
     "sdirk2": ({}, (), {"integrator": dv.SDIRK2()}),
 }
