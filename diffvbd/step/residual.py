@@ -264,81 +264,90 @@ def _of_bodies(model: System, at: IncrementalPotential, prepared: Prepared, coup
                members: list[int], left: Tensor, forced: Tensor, pushed: bool,
                known: dict[tuple[int, int], np.ndarray]) -> Unsolved:  # fmt: skip
     """What one linear solve says of bodies that couplings join, and of them the one that is farthest off."""
-
-    def own(value: Tensor) -> np.ndarray:
-        return value[min(scene, len(value) - 1)].double().cpu().numpy()
-
-    weight, now, residual, moved = (own(t) for t in (at.mass, at.x, -left, forced[None]))
-    mass = weight * own(at.free[None])
-    # as stiff along a surface as across it; couplings by themselves, below
-    data = at.data if coupled is None else coupled.data
-    added = [energy.blocks(at.x, at.x_prev, part, at.h, at.origin) for energy, part in at._vertex_energies(data)]
-    if isinstance(at, ContactPotential):
-        trace = at.h**2 * at.step_contact.stiffness(at.contact)
-        added.append(trace[..., None, None] * torch.eye(3, dtype=trace.dtype, device=trace.device))
-    added = [own(blocks) for blocks in added] if pushed else []
     functions = [model.derived(f"smooth functions of body {body}", lambda body=body: _functions(model, body))
                  for body in members]  # fmt: skip
-    count = sum(of.values.shape[1] for of in functions)
-    # by component in the frame of each body, then function
+    vertices = torch.cat([of.vertices for of in functions])
+    ends = np.cumsum([[len(of.vertices), of.values.shape[1]] for of in functions], 0)
+    parts = [(slice(*r), slice(*f)) for r, f in np.stack([ends - np.diff(ends, axis=0, prepend=0), ends], -1)]
+    count = int(ends[-1, 1])
+
+    def own(value: Tensor) -> Tensor:
+        return value[min(scene, len(value) - 1)]
+
+    def array(value: Tensor) -> np.ndarray:
+        return own(value)[vertices].double().cpu().numpy()
+
+    weight, now, residual, moved = (array(t) for t in (at.mass, at.x, -left, forced[None]))
+    mass = weight * array(at.free[None])
+    added: list[np.ndarray] = []
+    if pushed:
+        data = at.data if coupled is None else coupled.data  # couplings by themselves, below
+        energies = at._vertex_energies(data)
+        added = [array(energy.blocks(at.x, at.x_prev, part, at.h, at.origin)) for energy, part in energies]
+        if isinstance(at, ContactPotential):  # as stiff along a surface as across it
+            trace = at.h**2 * at.step_contact.stiffness(at.contact)
+            added.append(array(trace[..., None, None] * torch.eye(3, dtype=trace.dtype, device=trace.device)))
+    # functions in the frame of each body, the component first
     elastic, gram, force = np.zeros((3, count, 3, count)), np.zeros((count, count)), np.zeros((3, count))
-    shapes, turns, parts, first = np.zeros((len(now), count)), np.zeros((len(now), 3, 3)), [], 0
-    blocks = np.zeros_like(elastic)
-    for body, of in zip(members, functions, strict=True):
-        rows, q, part = of.vertices.cpu().numpy(), of.values, slice(first, first + of.values.shape[1])
-        first = part.stop
-        parts.append(part)
+    blocks, shapes, turns = np.zeros_like(elastic), np.zeros((len(now), count)), np.zeros((len(now), 3, 3))
+    for body, of, (rows, part) in zip(members, functions, parts, strict=True):
+        q, m = of.values, weight[rows]
         if (scene, body) not in known:
-            mu, lam = (m[min(scene, len(m) - 1)].double() for m in (prepared.mu, prepared.lam))
-            known[scene, body] = _stiffness_of(model, of, body, mu, lam)
+            known[scene, body] = _stiffness_of(model, of, body, own(prepared.mu).double(), own(prepared.lam).double())
         elastic[:, part, :, part] += at.h**2 * known[scene, body].reshape(3, q.shape[1], 3, q.shape[1])
         gram[part, part] = q.T @ (mass[rows] * q)
-        arms = [a - (weight[rows] * a).sum(0) / weight[rows].sum() for a in (now[rows], of.rest)]
-        u, _, vt = np.linalg.svd(arms[0].T @ (weight[rows] * arms[1]))
+        arms = [a - (m * a).sum(0) / m.sum() for a in (now[rows], of.rest)]
+        u, _, vt = np.linalg.svd(arms[0].T @ (m * arms[1]))
         turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         force[:, part] = (q.T @ (residual[rows] @ turn)).T
         shapes[rows, part], turns[rows] = q, turn
-        for block in (b[rows] for b in added):
-            acts = block.any((1, 2)) & (mass[rows, 0] > 0)
+        for block in added:
+            acts = block[rows].any((1, 2)) & (mass[rows, 0] > 0)
             if acts.any():
-                blocks[:, part, :, part] += np.einsum("nf,ncd,ng->cfdg", q[acts], turn.T @ block[acts] @ turn, q[acts],
-                                                      optimize=True)  # fmt: skip
+                turned = turn.T @ block[rows][acts] @ turn
+                blocks[:, part, :, part] += np.einsum("nf,ncd,ng->cfdg", q[acts], turned, q[acts], optimize=True)
     for c in range(3):
         elastic[c, :, c] += gram
     if coupled is not None:
-        elastic += at.h**2 * _stiffness_of_couplings(model, at, coupled, scene, shapes, turns)
-    matrix = (elastic + blocks).reshape(3 * count, -1)
-    displacement = np.linalg.solve(matrix, force.reshape(-1)).reshape(3, count)
+        place = np.full(model.num_vertices, len(now))
+        place[vertices.cpu().numpy()] = np.arange(len(now))
+        of_vertices = (np.concatenate([t, np.zeros_like(t[:1])]) for t in (shapes, turns))  # the last: of other bodies
+        elastic += at.h**2 * _stiffness_of_couplings(model, at, coupled, scene, place, *of_vertices)
+    displacement = np.linalg.solve((elastic + blocks).reshape(3 * count, -1), force.reshape(-1)).reshape(3, count)
     kept = np.linalg.solve(elastic.reshape(3 * count, -1), (displacement @ gram).reshape(-1)).reshape(3, count)
 
-    def rms(square: float, body: int) -> float:
-        return (max(square, 0.0) / max(float(mass[functions[body].vertices.cpu().numpy()].sum()), 1e-300)) ** 0.5
+    def rms(square: float, rows: slice) -> float:
+        return (max(square, 0.0) / max(float(mass[rows].sum()), 1e-300)) ** 0.5
 
-    errors = [rms((kept[:, p] @ gram[p, p] * kept[:, p]).sum(), n) for n, p in enumerate(parts)]
+    errors = [rms(float((kept[:, f] @ gram[f, f] * kept[:, f]).sum()), rows) for rows, f in parts]
     worst = int(np.argmax(errors))
-    rows = functions[worst].vertices.cpu().numpy()
-    return Unsolved(scene, members[worst], errors[worst], rms((mass[rows] * moved[rows] ** 2).sum(), worst))
+    rows, _ = parts[worst]
+    return Unsolved(scene, members[worst], errors[worst], rms(float((mass[rows] * moved[rows] ** 2).sum()), rows))
 
 
-def _stiffness_of_couplings(model: System, at: IncrementalPotential, coupled: Coupled, scene: int, shapes: np.ndarray,
-                            turns: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Second derivative of couplings by functions [V, f] in frames [V, 3, 3] of vertices [N/m], [3, f, 3, f]."""
+def _stiffness_of_couplings(model: System, at: IncrementalPotential, coupled: Coupled, scene: int, place: np.ndarray,
+                            shapes: np.ndarray, turns: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Second derivative of couplings by functions [N/m], [3, f, 3, f]; functions [n, f] and frames [n, 3, 3] at the
+    place of a vertex."""
     count = shapes.shape[1]
     out = np.zeros((3 * count, 3 * count))
     for energy, values in zip(model.couplings, coupled.values, strict=True):
         found = energy.curvature(coupled.place(at.x), values)
         if found is None:
             continue
-        (index, weights), (rate, slope, across) = energy.differences(), found
-        rate, slope = (t[scene].double().cpu().numpy() for t in (rate, slope))
+        index, weights = energy.differences()
+        at_vertex = place[index]
+        some = np.flatnonzero((at_vertex < len(shapes) - 1).any((1, 2)))  # of these bodies
+        at_vertex, weights = at_vertex[some], weights[some]
+        rate, slope = (t[scene].double().cpu().numpy()[some] for t in (found.rate, found.slope))
         # of the vectors by the coefficients [N, M, 3, 3 f]
-        rows = np.einsum("nmj,nmjde,nmjf->nmdef", weights, turns[index], shapes[index], optimize=True)
+        rows = np.einsum("nmj,nmjde,nmjf->nmdef", weights, turns[at_vertex], shapes[at_vertex], optimize=True)
         rows = rows.reshape(*slope.shape, 3 * count)
         along = np.einsum("nmd,nmdk->nk", slope, rows)
         out += along.T @ (rate[:, None] * along)
-        if across is not None:
-            part = rows.reshape(-1, 3, 3 * count)
-            turned = across[scene].double().cpu().numpy().reshape(-1, 3, 3) @ part
+        if found.across is not None:
+            across, part = found.across[scene].double().cpu().numpy()[some], rows.reshape(-1, 3, 3 * count)
+            turned = across.reshape(-1, 3, 3) @ part
             out += part.reshape(-1, 3 * count).T @ turned.reshape(-1, 3 * count)
     return out.reshape(3, count, 3, count)
 
