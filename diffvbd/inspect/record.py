@@ -21,7 +21,8 @@ def record(kind: Literal["subspace", "contact", "integrator"]) -> Iterator[list[
     Args:
         kind: ``"subspace"``: the step fractions of its coarse corrections [scenes, corrections, bodies], where
             ReverseSweep differentiates it (the default): 1 is a whole correction, 0 one that was refused, because it
-            would have increased the potential or let something cross; bodies that contact joins have one fraction.
+            would have increased the potential or let something cross; bodies that contact or couplings join have one
+            fraction.
             ``"contact"``: its detections (:class:`diffvbd.contact.Detection`), which pairs were near; also those under
             torch.compile. ``"integrator"``: with SDIRK2() or BDF2() and a floor or contact, which vertices are of a
             body that may touch something which the step does not resolve, and so takes implicit Euler: bool [..., V].

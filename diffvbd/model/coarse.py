@@ -47,7 +47,8 @@ class CoarseSpace:
 
     Args:
         functions: Of each body, at most; up to 3840, one dense system. ``"auto"``: a 25th of its vertices, 32 to
-            128; small bodies fewer, down to affine functions and constants.
+            128; small bodies fewer, down to affine functions and constants. Bodies that couplings join have at most 512
+            together.
         degree: Of the splines on the body's rest box, 1 to 3. ``"auto"``: 1, in the plane of a sheet 3.
         groups: Sets of neighbouring tets of a body with one rotation each. ``"auto"``: a quarter of its functions.
         every: Sweeps after each correction. A step is: one sweep, then a correction and up to ``every`` sweeps, again
